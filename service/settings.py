@@ -82,6 +82,29 @@ class Settings(BaseSettings):
     milvus_database: str = Field(
         default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
     )
+    objects: str | None = Field(
+        default=None,
+        pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?$",
+        description="Bucket of an S3-compatible object store, and prefix in it, to which the store milvus puts new "
+        "pictures and thumbnails, such as s3://pictures/placerec; default: they are in PostgreSQL.",
+    )
+    objects_endpoint: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^\s/@]+/?$",
+        description="Address of the object store, such as http://minio:9000; https for TLS. Default: AWS's.",
+    )
+    objects_region: str = Field(
+        default="us-east-1", min_length=1, max_length=64, description="Region of the object store."
+    )
+    objects_access_key: str = Field(
+        default="", description="Access key of the object store; by default what the machine's role is given."
+    )
+    objects_secret_key: SecretStr = Field(default=SecretStr(""), description="Secret key that belongs to it.")
+    objects_certificate: Path | None = Field(
+        default=None,
+        description="File with the certificate of the authority that the object store's certificate is checked by, "
+        "besides those of the system.",
+    )
     models_dir: Path | None = Field(
         default=None,
         description="Directory of encoders besides the packaged ones; default: 'models' beside the data directory.",
@@ -315,6 +338,10 @@ class Settings(BaseSettings):
             for name in ("milvus", "postgres"):
                 if getattr(self, name) is None:
                     raise ValueError(f"{PREFIX}STORE is milvus, which needs {PREFIX}{name.upper()}")
+        elif self.objects is not None:
+            raise ValueError(f"{PREFIX}OBJECTS is for {PREFIX}STORE=milvus alone")
+        if bool(self.objects_access_key) != bool(self.objects_secret_key.get_secret_value()):
+            raise ValueError(f"{PREFIX}OBJECTS_ACCESS_KEY and {PREFIX}OBJECTS_SECRET_KEY need each other")
         return self
 
     @property

@@ -42,6 +42,8 @@ PARTITIONS = 64
 _AT_ONCE = 256  # entities of one insertion: 16 MB with the default encoder; Milvus takes 64
 _PATIENCE_SECONDS = 10.0
 _CONNECTING_SECONDS = 3.0
+_PROBING_SECONDS = 1.0
+_SEARCH = "Milvus's search"
 # A Milvus that was gone is asked again within two seconds; by default gRPC would wait for up to two minutes.
 _AGAIN_SOON = {"grpc.initial_reconnect_backoff_ms": 200, "grpc.max_reconnect_backoff_ms": 2000}
 
@@ -70,15 +72,39 @@ def collection_name(encoder: str, dimension: int) -> str:
 
 @contextmanager
 def milvus_errors(action: str) -> Iterator[None]:
-    """Turn what Milvus refuses into a StoreUnavailable."""
+    """Turn what Milvus refuses into an Unreachable that says why in plain words."""
     try:
         yield
     except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through
-        raise Unreachable("Milvus", f"cannot be reached, or refuses to {action}: {_first_line(error)}") from error
+        raise Unreachable("Milvus", _reason(error, action)) from error
+    except OSError as error:  # it reads the certificate's file at every connection
+        raise Unreachable("Milvus", f"cannot be asked: {error}") from error
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [""])[0][:300]
+def _reason(error: MilvusException | grpc.RpcError, action: str) -> str:
+    """What follows the name of Milvus."""
+    said = error if isinstance(error, grpc.RpcError) else error.__cause__
+    if not isinstance(said, grpc.RpcError):
+        return f"refuses to {action}: {_in_one_line(str(getattr(error, 'message', error)))}"
+    code, details = said.code(), _in_one_line((said.details() or "").rpartition("last error: ")[2])
+    if code == grpc.StatusCode.UNAUTHENTICATED:
+        return f"refuses the token: {details}"
+    if code == grpc.StatusCode.PERMISSION_DENIED:
+        return f"refuses to {action}, for the token's user has no right to: {details}"
+    if code == grpc.StatusCode.DEADLINE_EXCEEDED:
+        return f"takes too long to {action}"
+    if "CERTIFICATE_VERIFY_FAILED" in details or "Verification Check failed" in details:
+        return f"has a certificate that cannot be trusted: {details}"
+    if "handshake" in details:
+        return f"cannot be spoken to by TLS: {details}"
+    if "Socket closed" in details:
+        return f"closes the connection, as one does that wants TLS (https) or is ending: {details}"
+    verdict = "cannot be reached" if code == grpc.StatusCode.UNAVAILABLE else f"refuses to {action}"
+    return f"{verdict}: {details or code}"
+
+
+def _in_one_line(text: str) -> str:
+    return " ".join(text.split())[:300]
 
 
 class Connection:
@@ -91,19 +117,29 @@ class Connection:
         self._name = f"placerec-{uuid.uuid4().hex}"
         self._making = threading.Lock()
         self._made = False
-        self._outage = Outage("Milvus")
+        # After a kill it takes writes before it searches.
+        self._outages = {False: Outage("Milvus", probe=self._probe), True: Outage("Milvus", _SEARCH, self._probe)}
 
     @contextmanager
-    def using(self, action: str) -> Iterator[str]:
+    def using(self, action: str, searching: bool = False) -> Iterator[str]:
         """The name of the connection, by which pymilvus knows it.
+
+        Args:
+            searching: whether it is asked for what is loaded.
 
         Raises:
             StoreUnavailable: Milvus cannot be reached, or refuses.
         """
-        with self._outage.noticed(), milvus_errors(action):
+        with self._outages[searching].noticed(), milvus_errors(action):
             if not self._made:
                 self._connect()
             yield self._name
+
+    def _probe(self) -> None:
+        """Raise Unreachable unless Milvus answers soon; whatever else it is asked, pymilvus repeats for long."""
+        with milvus_errors("answer"):
+            if self._made:
+                utility.get_server_version(using=self._name, timeout=_PROBING_SECONDS)
 
     def _connect(self) -> None:
         with self._making:
@@ -147,8 +183,8 @@ class Collection:
         self._collection: Connected | None = None
 
     @contextmanager
-    def _using(self, action: str) -> Iterator[Connected]:
-        with self._connection.using(action) as name:
+    def _using(self, action: str, searching: bool = True) -> Iterator[Connected]:
+        with self._connection.using(action, searching) as name:
             if self._collection is None:
                 self._make(name)
             yield self._collection
@@ -171,12 +207,12 @@ class Collection:
                     consistency_level="Bounded",
                 )  # fmt: skip
             if not made.has_index():
-                made.create_index("descriptor", dict(chosen.index))
+                made.create_index("descriptor", dict(chosen.index), timeout=_PATIENCE_SECONDS)
             # A collection stays as it was made when its server becomes a newer one.
             types = {field.name: field.dtype for field in made.schema.fields}
             self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
             self.index_type = str(made.index().params["index_type"])
-            made.load()
+            made.load(timeout=_PATIENCE_SECONDS)
             self._collection = made
 
     def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
@@ -186,7 +222,7 @@ class Collection:
             From which timestamp on a search sees them.
         """
         seen_from = 0
-        with self._using("store descriptors") as collection:
+        with self._using("store descriptors", searching=False) as collection:
             for start in range(0, len(entities), _AT_ONCE):
                 some = [self._record(map_number, one) for one in entities[start : start + _AT_ONCE]]
                 seen_from = int(collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
@@ -199,7 +235,7 @@ class Collection:
 
     def delete(self, keys: Sequence[int]) -> None:
         """Delete entities."""
-        with self._using("delete descriptors") as collection:
+        with self._using("delete descriptors", searching=False) as collection:
             collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
 
     def keys_between(self, first: int, end: int) -> list[int]:

@@ -63,7 +63,7 @@ class Importing(Unpacking):
         with self._map.writing() as write:
             for line, kept, content in zip(lines, frames, contents, strict=True):
                 descriptor, local = self._form.divided(kept.tobytes())
-                picture = None if content.picture is None else content.picture[0]
+                picture = write.kept(None if content.picture is None else content.picture[0])
                 try:
                     write.put_new(self._entry(write, line), Frame(descriptor, local, content.keypoints, picture))
                 except refusals.UniqueViolation:

@@ -6,8 +6,7 @@ Every function takes a connection of its caller, within the transaction to which
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from math import nan
@@ -17,20 +16,20 @@ from typing import Any
 import numpy as np
 import psycopg
 from psycopg import Connection
-from psycopg_pool import PoolTimeout
 
-from core.errors import MapExists, StorageFailure, StorageFull, StoreUnavailable, UnknownMap
+from core.errors import MapExists, UnknownMap
 from core.maps.counterparts import Standing
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import KeptFrame, MapRecord, Outline, SequenceSummary
-from core.milvus.outage import Unreachable
+from core.milvus.pictures import Kept, StoredObject
 from core.milvus.tokens import tokens_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
 
 TABLES = (Path(__file__).parent / "tables.sql").read_text()
 
-VERSION = 1
-"""Of the tables; it grows when a placerec that knows only the former ones could not use them."""
+VERSION, OLDEST_VERSION = 2, 1
+"""Of the tables; it grows when a placerec that knows only the former ones could not use them.  Those of the oldest
+version on are made into those of this one."""
 
 WAIT_SECONDS = 10
 """A write that waits for others to the same map is refused after so long."""
@@ -38,30 +37,13 @@ WAIT_SECONDS = 10
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
 
+EXPORTING = 7063
+"""The kind of the lock of the database that exports share, and that who deletes objects has alone."""
+
 LEFT_SECONDS = 60
 """What no place names any more is deleted after so many seconds; a query that still needs it has ended by then."""
 
 LEAVINGS_AT_ONCE = 1000
-
-
-@contextmanager
-def postgres_errors(action: str) -> Iterator[None]:
-    """Turn what PostgreSQL refuses into our errors."""
-    try:
-        yield
-    except psycopg.errors.DiskFull as error:
-        raise StorageFull(f"PostgreSQL has no room left to {action}.") from error
-    except psycopg.errors.LockNotAvailable as error:
-        raise StoreUnavailable(
-            f"PostgreSQL refuses to {action}: others are writing to the map for too long."
-        ) from error
-    except (psycopg.OperationalError, psycopg.InterfaceError) as error:
-        if isinstance(error, PoolTimeout):
-            raise
-        text = str(error).strip().splitlines()
-        raise Unreachable("PostgreSQL", f"cannot be reached, or refuses: {' '.join(text)[:300]}") from error
-    except psycopg.Error as error:
-        raise StorageFailure(f"PostgreSQL refuses to {action}: {str(error).strip()[:300]}") from error
 
 
 @dataclass(frozen=True)
@@ -125,7 +107,7 @@ class Frame:
     descriptor: bytes
     local: bytes
     keypoints: bytes | None
-    picture: bytes | None
+    picture: Kept
 
 
 def whereabouts_of(entries: Sequence[PlaceEntry]) -> Whereabouts:
@@ -456,9 +438,12 @@ def oldest_of_last(connection: Connection[Any], map_number: int, code: int, fram
 
 def put_frame(connection: Connection[Any], map_number: int, row: int, frame: Frame) -> None:
     """Store a frame."""
-    query = "INSERT INTO frames (map, row, descriptor, local, keypoints, picture) VALUES (%s, %s, %s, %s, %s, %s)"
-    values = (map_number, row, frame.descriptor, frame.local, frame.keypoints, frame.picture)
-    connection.execute(query, values)
+    query = (
+        "INSERT INTO frames (map, row, descriptor, local, keypoints, picture, object, object_size, object_digest)"
+        " VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s)"
+    )
+    values = (map_number, row, frame.descriptor, frame.local, frame.keypoints)
+    connection.execute(query, (*values, *columns_of(frame.picture)))
 
 
 def put_keypoints(connection: Connection[Any], map_number: int, row: int, keypoints: bytes) -> bool:
@@ -472,8 +457,8 @@ def without_keypoints(connection: Connection[Any], map_number: int, after: int, 
     query = (
         "SELECT p.number, p.id, p.digest, p.camera, p.picture FROM places p"
         " JOIN frames f ON f.map = p.map AND f.row = p.row"
-        " WHERE p.map = %s AND p.number > %s AND f.picture IS NOT NULL AND f.keypoints IS NULL"
-        " ORDER BY p.number LIMIT %s"
+        " WHERE p.map = %s AND p.number > %s AND (f.picture IS NOT NULL OR f.object IS NOT NULL)"
+        " AND f.keypoints IS NULL ORDER BY p.number LIMIT %s"
     )
     return [KeptFrame(*values) for values in connection.execute(query, (map_number, after, limit))]
 
@@ -486,10 +471,11 @@ def count_without_image(connection: Connection[Any], map_number: int) -> int:
 
 
 def room(connection: Connection[Any], map_number: int) -> tuple[int, int, int, int]:
-    """The bytes of descriptors, of other content, of keypoints, and of how many frames these are."""
+    """The bytes of descriptors, of pictures wherever they are, of keypoints, and of how many frames these are."""
     query = (
         "SELECT coalesce(sum(octet_length(descriptor) + octet_length(local)), 0),"
-        " coalesce(sum(octet_length(picture)), 0), coalesce(sum(octet_length(keypoints)), 0), count(keypoints)"
+        " coalesce(sum(coalesce(octet_length(picture), object_size)), 0),"
+        " coalesce(sum(octet_length(keypoints)), 0), count(keypoints)"
         " FROM frames WHERE map = %s"
     )
     (sizes,) = connection.execute(query, (map_number,)).fetchall()
@@ -501,6 +487,70 @@ def of_frames(connection: Connection[Any], map_number: int, column: str, rows: S
     """A column of frames by row; rows that are gone are left out."""
     query = f"SELECT row, {column} FROM frames WHERE map = %s AND row = ANY(%s)"
     return dict(connection.execute(query, (map_number, list(rows))).fetchall())
+
+
+def pictures_of(connection: Connection[Any], map_number: int, rows: Sequence[int]) -> dict[int, Kept]:
+    """What is kept of frames to be looked at, by row; rows that are gone are left out."""
+    query = "SELECT row, picture, object, object_size, object_digest FROM frames WHERE map = %s AND row = ANY(%s)"
+    found = connection.execute(query, (map_number, list(rows)))
+    return {row: kept_of(*picture) for row, *picture in found}
+
+
+def columns_of(kept: Kept) -> tuple[bytes | None, str | None, int | None, bytes | None]:
+    """The columns of a picture."""
+    return (None, kept.name, kept.size, kept.digest) if isinstance(kept, StoredObject) else (kept, None, None, None)
+
+
+def kept_of(picture: bytes | None, name: str | None, size: int | None, digest: bytes | None) -> Kept:
+    """A picture from its columns."""
+    return picture if name is None or size is None or digest is None else StoredObject(name, size, digest)
+
+
+# Objects
+
+
+def objects_folder(connection: Connection[Any]) -> str:
+    """The folder of the database's pictures in an object store, which no other database has."""
+    ((folder,),) = connection.execute("SELECT objects FROM placerec").fetchall()
+    return str(folder)
+
+
+def new_object_key(connection: Connection[Any]) -> tuple[str, int]:
+    """That folder, and a number that was never used before."""
+    ((folder, key),) = connection.execute("SELECT objects, nextval('keys') FROM placerec").fetchall()
+    return folder, int(key)
+
+
+def dead_objects(connection: Connection[Any]) -> list[str]:
+    """The names of some objects whose row is deleted; none while a map is exported, which may still see the row."""
+    if connection.execute("SELECT pg_try_advisory_xact_lock(%s::int, 0)", (EXPORTING,)).fetchone() != (True,):
+        return []
+    return [name for (name,) in connection.execute("SELECT name FROM dead_objects LIMIT %s", (LEAVINGS_AT_ONCE,))]
+
+
+def clear_objects(connection: Connection[Any], names: Sequence[str]) -> None:
+    """Forget dead objects, which are deleted."""
+    connection.execute("DELETE FROM dead_objects WHERE name = ANY(%s)", (list(names),))
+
+
+def known_objects(connection: Connection[Any], names: Sequence[str]) -> set[str]:
+    """Those of some objects that a row names, or named."""
+    columns = ("object", "frames"), ("object", "review_frames"), ("name", "dead_objects")
+    query = " UNION ".join(f"SELECT {column} FROM {table} WHERE {column} = ANY(%(names)s)" for column, table in columns)
+    return {name for (name,) in connection.execute(query, {"names": list(names)})}
+
+
+def swept_objects(connection: Connection[Any], whole_seconds: float) -> int:
+    """The key from which on objects may be litter; 0 if all were not listed for so long."""
+    query = "SELECT swept FROM placerec WHERE listed > now() - make_interval(secs => %s)"
+    found = connection.execute(query, (whole_seconds,)).fetchone()
+    return 0 if found is None else int(found[0])
+
+
+def note_swept_objects(connection: Connection[Any], key: int, whole: bool) -> None:
+    """Note that there is no litter up to a key, and whether all objects were listed for that."""
+    query = "UPDATE placerec SET swept = %s, listed = CASE WHEN %s THEN now() ELSE listed END"
+    connection.execute(query, (key, whole))
 
 
 # What is left over

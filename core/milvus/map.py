@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from psycopg import Connection
 
@@ -17,6 +17,7 @@ from core.errors import (
     RevisionMismatch,
     StorageFailure,
     TooManyToForget,
+    UnknownPlace,
     UnknownSequence,
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
@@ -44,11 +45,16 @@ from core.milvus.parts.exporter import MilvusExporter
 from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
+from core.milvus.pictures import read_pictures
+from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
 from core.places import Place, PlaceFields
 from core.storage.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.storage.writing import check_enrolment
+
+if TYPE_CHECKING:
+    from core.milvus.objects import Objects
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +69,15 @@ class MilvusMap:
     cannot be reached) and UnknownMap; methods that write may also raise StorageFull.
     """
 
-    def __init__(self, database: Database, collection: Collection, state: MapState) -> None:
-        """The map that was found in this state."""
+    def __init__(
+        self, database: Database, collection: Collection, state: MapState, objects: Objects | None = None
+    ) -> None:
+        """The map that was found in this state.
+
+        Args:
+            objects: where new pictures are put; None: in PostgreSQL.
+        """
+        self.objects = objects
         self._database, self.collection, self._state = database, collection, state
         self._last: MilvusSnapshot | None = None
         self._room: tuple[int, StorageStatus] | None = None
@@ -72,9 +85,9 @@ class MilvusMap:
         self.cameras = MilvusCameras(state.number, self._reading, self._locked)
         self.transfer = MilvusTransfer(state.number, self._reading, self.writing, self.paused_writes)
         self.counterparts = MilvusCounterparts(state.number, self._reading, self.writing)
-        self.review = MilvusReview(state.number, self._reading, database)
+        self.review = MilvusReview(state.number, self._reading, database, objects)
         self.plan = MilvusPlan(state.number, self._reading)
-        self.exporter = MilvusExporter(self.viewing, lambda: self.state)
+        self.exporter = MilvusExporter(self.viewing, lambda: self.state, database, objects)
 
     @property
     def record(self) -> MapRecord:
@@ -242,11 +255,12 @@ class MilvusMap:
         Raises:
             UnknownPlace: there is no such place.
             NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            StorageFailure: the picture is missing or damaged.
             MemoryError: its pixels do not fit into memory.
         """
-        with self._reading() as connection:
-            entry = expect_place(connection, self.number, place_id)
-            kept: bytes | None = ledger.of_frames(connection, self.number, "picture", [entry.row]).get(entry.row)
+        entry, kept = self._picture_of(place_id)
+        if entry is None:
+            raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
         if kept is None:
             raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
         if entry.place.picture == "thumbnail":
@@ -308,13 +322,28 @@ class MilvusMap:
             return self._room[1]
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none."""
-        with self._reading() as connection:
-            entry = ledger.find(connection, self.number, place_id)
-            if entry is None:
-                return None
-            found: bytes | None = ledger.of_frames(connection, self.number, "picture", [entry.row]).get(entry.row)
-            return found
+        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+
+        Raises:
+            StorageFailure: the picture is missing or damaged.
+        """
+        return self._picture_of(place_id)[1]
+
+    def _picture_of(self, place_id: str) -> tuple[PlaceEntry | None, bytes | None]:
+        """A place and its picture; None for what there is not."""
+        before: int | None = None
+        while True:
+            with self._reading() as connection:
+                entry = ledger.find(connection, self.number, place_id)
+                if entry is None:
+                    return None, None
+                kept = ledger.pictures_of(connection, self.number, [entry.row])
+            found = read_pictures(self.objects, kept)
+            if entry.row in found or entry.row not in kept:
+                return entry, found.get(entry.row)
+            if entry.row == before:
+                raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
+            before = entry.row  # or the place got another frame meanwhile
 
     # Writing
 
@@ -346,7 +375,7 @@ class MilvusMap:
         """A transaction in which this thread may write to the map."""
         paused: Connection[Any] | None = getattr(self._paused, "connection", None)
         if paused is not None:
-            with ledger.postgres_errors("write to a map"), paused.transaction():
+            with postgres_errors("write to a map"), paused.transaction():
                 paused.execute("SET LOCAL synchronous_commit TO on")
                 yield paused
             return
@@ -358,9 +387,8 @@ class MilvusMap:
     def writing(self) -> Iterator[Write]:
         """Collect the changes of one write, which are stored whole at the end of the block, or not at all."""
         with self._transaction() as connection:
-            write = Write(
-                connection, self.collection, ledger.state_of(connection, self.record.id, self.number, locked=True)
-            )
+            state = ledger.state_of(connection, self.record.id, self.number, locked=True)
+            write = Write(connection, self.collection, state, self.objects)
             yield write
             write.finish()
         self.note(write.state)

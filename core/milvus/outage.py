@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from core.errors import StoreUnavailable
@@ -29,14 +29,17 @@ class Unreachable(StoreUnavailable):
 
 
 class Outage:
-    """Whether one server can be reached.  Any thread may use it.
+    """Whether one server can be reached, or does one thing.  Any thread may use it.
 
     Args:
         name: of the server, as its :class:`Unreachable` names it.
+        thing: what it is about, as the log shall name it; by default the server.
+        probe: asks a server that was gone in little time whether it is back, before it is asked for more; raises
+            Unreachable if it is not.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, thing: str | None = None, probe: Callable[[], None] = lambda: None) -> None:
+        self._name, self._thing, self._probe = name, thing or name, probe
         self._lock = threading.Lock()
         self._reason: str | None = None
         self._ask_at = 0.0
@@ -48,8 +51,10 @@ class Outage:
         Raises:
             Unreachable: it could not be reached a moment ago, and the block is not run; or the block raises it.
         """
-        self._expect_up()
+        asked_again = self._expect_up()
         try:
+            if asked_again:
+                self._probe()
             yield
         except BaseException as error:
             down = isinstance(error, Unreachable) and error.server == self._name
@@ -57,14 +62,17 @@ class Outage:
             raise
         self._note(None)
 
-    def _expect_up(self) -> None:
+    def _expect_up(self) -> bool:
+        """Whether it is asked again after an outage."""
         if self._reason is None:
-            return
+            return False
         with self._lock:
-            if self._reason is not None:
-                if time.monotonic() < self._ask_at:
-                    raise Unreachable(self._name, self._reason.removeprefix(f"{self._name} "))
-                self._ask_at = time.monotonic() + 60  # others are refused until this request knows more
+            if self._reason is None:
+                return False
+            if time.monotonic() < self._ask_at:
+                raise Unreachable(self._name, self._reason.removeprefix(f"{self._name} "))
+            self._ask_at = time.monotonic() + 60  # others are refused until this request knows more
+            return True
 
     def _note(self, reason: str | None) -> None:
         if reason is None and self._reason is None:
@@ -73,6 +81,6 @@ class Outage:
             before, self._reason = self._reason, reason
             self._ask_at = time.monotonic() + ASKED_AGAIN_SECONDS
         if reason is not None and before is None:
-            log.error("%s is unavailable: %s", self._name, reason)
+            log.error("%s is unavailable: %s", self._thing, reason)
         elif reason is None and before is not None:
-            log.info("%s is available again", self._name)
+            log.info("%s is available again", self._thing)

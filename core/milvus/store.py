@@ -9,21 +9,26 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.maps.archives.reading import Archive
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.milvus import ledger
+from core.milvus.bucket import Bucket
 from core.milvus.collection import Collection, Connection
 from core.milvus.database import Database
 from core.milvus.importing import Importing
 from core.milvus.map import MilvusMap
-from core.milvus.sweep import sweep
+from core.milvus.sweep import sweep, sweep_objects
 from core.milvus.verification import inspect
 from core.places import check_map_id
 from core.storage.archives.unpacking import check_sizes, layout_of
 from core.storage.pagination import Listing, decode_name, one_more, page_of
+
+if TYPE_CHECKING:
+    from core.milvus.objects import Objects
 
 MOST_MAPS = 1000
 """Maps of which an object is kept, so that whoever asks for a map twice gets the same one."""
@@ -44,7 +49,13 @@ class MilvusStore:
     """Maps by id.  Any thread may call any method, and any number of processes may use the same maps."""
 
     def __init__(
-        self, milvus: str, postgres: str, token: str = "", database: str = "", certificate: str | None = None
+        self,
+        milvus: str,
+        postgres: str,
+        token: str = "",
+        database: str = "",
+        certificate: str | None = None,
+        bucket: Bucket | None = None,
     ) -> None:
         """Remember where both are; they are connected to when they are first used.
 
@@ -55,6 +66,7 @@ class MilvusStore:
             postgres: the address, such as ``postgresql://placerec@localhost/placerec``.
             token, database: of Milvus, ``user:password`` and the name of the database there.
             certificate: path of the file of the authority that Milvus's certificate is checked by.
+            bucket: where new pictures are put; None: in PostgreSQL.
         """
         self._collections: dict[str, Collection] = {}
         self._maps: OrderedDict[int, MilvusMap] = OrderedDict()
@@ -63,6 +75,7 @@ class MilvusStore:
         self._sweeper: threading.Thread | None = None
         self._database = Database(postgres)
         self._milvus = Connection(milvus, token, database, certificate)
+        self._objects = None if bucket is None else _objects_of(bucket)
 
     def create(
         self,
@@ -158,7 +171,7 @@ class MilvusStore:
         with self._making:
             found = self._maps.get(state.number)
             if found is None:
-                found = MilvusMap(self._database, self._collection(state.record), state)
+                found = MilvusMap(self._database, self._collection(state.record), state, self._objects)
                 self._maps[state.number] = found
                 while len(self._maps) > MOST_MAPS:
                     self._maps.popitem(last=False)
@@ -233,6 +246,25 @@ class MilvusStore:
         for collection in list(self._collections.values()):
             collection.check()
 
+    def check_pictures(self) -> None:
+        """Raise unless pictures could be stored now, if they are stored elsewhere than the rest.
+
+        Raises:
+            StoreUnavailable, StorageFull.
+        """
+        self._expect_open()
+        if self._objects is not None:
+            self._objects.check()
+
+    def sweep_objects(self) -> int:
+        """Delete pictures that nothing names any more from the object store; returns how many that were.
+
+        Raises:
+            StoreUnavailable, StorageFailure.
+        """
+        self._expect_open()
+        return 0 if self._objects is None else sweep_objects(self._database, self._objects)
+
     def sweep(self) -> int:
         """Delete what writes that came to no end have left; returns how many descriptors that were.
 
@@ -252,18 +284,20 @@ class MilvusStore:
     def start_sweeping(self) -> None:
         """Sweep now and from time to time, in a thread of its own, until the store is closed."""
 
+        def swept(sweep: Callable[[], int]) -> float:
+            try:
+                sweep()
+            except StorageFailure as error:
+                log.debug("what is left over stays for now: %s", error)
+                return AGAIN_SECONDS
+            except Exception:  # a defect, which must not end the thread
+                log.exception("what is left over stays for now")
+            return SWEEP_SECONDS
+
         def run() -> None:
             wait = 0.0
             while not self._closed.wait(wait):
-                try:
-                    self.sweep()
-                    wait = SWEEP_SECONDS
-                except StorageFailure as error:
-                    wait = AGAIN_SECONDS
-                    log.debug("what is left over stays for now: %s", error)
-                except Exception:  # a defect, which must not end the thread
-                    wait = SWEEP_SECONDS
-                    log.exception("what is left over stays for now")
+                wait = min(swept(self.sweep), swept(self.sweep_objects))
 
         self._sweeper = threading.Thread(target=run, name="sweep", daemon=True)
         self._sweeper.start()
@@ -319,8 +353,16 @@ class MilvusStore:
         """Close the connections, and refuse further reads and writes."""
         self._closed.set()
         self._milvus.close()
+        if self._objects is not None:
+            self._objects.close()
         self._database.close()
 
     def _expect_open(self) -> None:
         if self._closed.is_set():
             raise StorageFailure("The store is closed.")
+
+
+def _objects_of(bucket: Bucket) -> Objects:
+    from core.milvus.objects import Objects  # with it comes what speaks S3
+
+    return Objects(bucket)

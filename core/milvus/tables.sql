@@ -1,7 +1,11 @@
 -- What PostgreSQL has of the maps (core.milvus.ledger has the statements).
 
 CREATE TABLE IF NOT EXISTS placerec (single boolean PRIMARY KEY DEFAULT true CHECK (single), version integer NOT NULL);
-INSERT INTO placerec (version) VALUES (1) ON CONFLICT DO NOTHING;
+INSERT INTO placerec (version) VALUES (2) ON CONFLICT (single) DO UPDATE SET version = 2;
+ALTER TABLE placerec
+    ADD COLUMN IF NOT EXISTS objects text NOT NULL DEFAULT gen_random_uuid()::text, -- the folder of its pictures
+    ADD COLUMN IF NOT EXISTS swept bigint NOT NULL DEFAULT 0, -- no object with a smaller key is litter,
+    ADD COLUMN IF NOT EXISTS listed timestamptz;    -- as it was when all objects were last listed
 
 CREATE TABLE IF NOT EXISTS maps (
     number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -60,9 +64,13 @@ CREATE TABLE IF NOT EXISTS frames (
     descriptor bytea NOT NULL,          -- [D], in the map's precision
     local bytea NOT NULL,               -- [C, L], likewise
     keypoints bytea,
-    picture bytea,
+    picture bytea,                      -- unless it is in an object store
     PRIMARY KEY (map, row)
 );
+ALTER TABLE frames
+    ADD COLUMN IF NOT EXISTS object text COLLATE "C" UNIQUE, -- the name of its picture there
+    ADD COLUMN IF NOT EXISTS object_size bigint,
+    ADD COLUMN IF NOT EXISTS object_digest bytea;   -- SHA-256
 ALTER TABLE frames ALTER COLUMN descriptor SET STORAGE EXTERNAL; -- compressing them would only take time
 
 -- What no place names any more; it is deleted a while later, for a query may still need it.
@@ -100,3 +108,18 @@ CREATE TABLE IF NOT EXISTS review_pictures (
     PRIMARY KEY (map, number),
     FOREIGN KEY (map, number) REFERENCES review_frames ON DELETE CASCADE
 );
+ALTER TABLE review_frames ADD COLUMN IF NOT EXISTS object text COLLATE "C" UNIQUE; -- of the store, instead of that
+
+-- The objects whose row is deleted; a sweep deletes them.
+CREATE TABLE IF NOT EXISTS dead_objects (name text COLLATE "C" PRIMARY KEY);
+CREATE OR REPLACE FUNCTION note_dead_object() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    INSERT INTO dead_objects (name) VALUES (OLD.object) ON CONFLICT DO NOTHING;
+    RETURN NULL;
+END $$;
+DROP TRIGGER IF EXISTS frame_deleted ON frames;
+CREATE TRIGGER frame_deleted AFTER DELETE ON frames
+    FOR EACH ROW WHEN (OLD.object IS NOT NULL) EXECUTE FUNCTION note_dead_object();
+DROP TRIGGER IF EXISTS review_frame_deleted ON review_frames;
+CREATE TRIGGER review_frame_deleted AFTER DELETE ON review_frames
+    FOR EACH ROW WHEN (OLD.object IS NOT NULL) EXECUTE FUNCTION note_dead_object();

@@ -16,6 +16,7 @@ from core.milvus import ledger
 from core.milvus.forms import Form
 from core.milvus.ledger import PlaceEntry
 from core.milvus.map import MilvusMap
+from core.milvus.pictures import read_pictures
 
 AT_ONCE = 128
 """Places that are read together; Milvus waits up to 0.2 s for the next tick of its clock each time."""
@@ -27,8 +28,8 @@ def inspect(map_: MilvusMap, progress: Progress) -> VerifyReport:
     """Read all places of a map, and compare their descriptors with those that Milvus has.
 
     A place that is written meanwhile is left out.  PostgreSQL has checksums of its own pages (``initdb
-    --data-checksums``), so this checks only what it cannot know: that pictures are those of their digests, that
-    keypoints can be read, and that Milvus finds what PostgreSQL has.
+    --data-checksums``), so this checks only what it cannot know: that pictures are those of their digests, also where
+    they are in the object store, that keypoints can be read, and that Milvus finds what PostgreSQL has.
 
     Raises:
         UnknownMap, StoreUnavailable, StorageFailure.
@@ -40,8 +41,10 @@ def inspect(map_: MilvusMap, progress: Progress) -> VerifyReport:
             entries = ledger.entries_after(connection, map_.number, after, AT_ONCE, EVERY_PLACE)
             rows = [entry.row for entry in entries]
             kept = {name: ledger.of_frames(connection, map_.number, name, rows) for name in _COLUMNS}
+            pictures = ledger.pictures_of(connection, map_.number, rows)
         if not entries:
             break
+        kept["picture"] = read_pictures(map_.objects, pictures)
         there = map_.collection.descriptors_of([entry.key for entry in entries])
         damaged = [(entry, why) for entry in entries if (why := _damage(entry, kept, there, Form(state.record)))]
         if damaged:
@@ -64,7 +67,7 @@ def inspect(map_: MilvusMap, progress: Progress) -> VerifyReport:
     )
 
 
-_COLUMNS = ("descriptor", "local", "keypoints", "picture")
+_COLUMNS = ("descriptor", "local", "keypoints")
 
 
 class _Report:
@@ -82,6 +85,8 @@ def _damage(
         return f"PostgreSQL: place {name} has no frame"
     if len(kept["descriptor"][row]) + len(kept["local"][row]) != form.frame_bytes:
         return f"PostgreSQL: the descriptors of place {name} have another length than they must have"
+    if row not in kept["picture"]:
+        return f"object store: the picture of place {name} is missing, or is not the one that was stored"
     picture, keypoints = kept["picture"][row], kept["keypoints"][row]
     if (picture is None) != (entry.place.picture == "none"):
         return f"PostgreSQL: place {name} is recorded to keep {entry.place.picture}, which is not true"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psycopg import Connection
 
@@ -17,21 +17,35 @@ from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
 from core.milvus.ledger import Frame, MapState, PlaceEntry
+from core.milvus.pictures import Kept, new_object
 from core.milvus.tokens import tokens_of
 from core.places import Place, PlaceFields, Pose
 from core.storage.database.ledger import metadata_text, picture_of, same_fields
+
+if TYPE_CHECKING:
+    from core.milvus.objects import Objects
 
 
 class Write:
     """Collects what one transaction changes of a map, whose row it has locked."""
 
-    def __init__(self, connection: Connection[Any], collection: Collection, state: MapState) -> None:
+    def __init__(
+        self, connection: Connection[Any], collection: Collection, state: MapState, objects: Objects | None
+    ) -> None:
+        """Begin a write.
+
+        Args:
+            objects: where pictures are put; None: in PostgreSQL.
+        """
         self.state = state
+        self._objects = objects
+        self._pictures: dict[str, bytes] = {}  # by the names of their objects
         self.connection, self._collection = connection, collection
         self._before, self._form = state, Form(state.record)
         self._entities: dict[int, Callable[[], Entity]] = {}  # by the number of the place
         self._changed = False
         self._now = datetime.now(UTC)
+        self._object_key: tuple[str, int] | None = None
 
     def expect(self, place_id: str) -> PlaceEntry:
         """A place.
@@ -60,7 +74,7 @@ class Write:
         metadata_text(item.fields.metadata)  # raises InvalidField
         row, kept = self.state.rows, picture_of(item, self.state.record.keep if keep is None else keep)
         descriptor, local = self._form.packed(item.descriptor, item.local)
-        frame = Frame(descriptor, local, keypoints, kept[1])
+        frame = Frame(descriptor, local, keypoints, self.kept(kept[1]))
         ledger.put_frame(self.connection, self.state.number, row, frame)
         self.state = replace(self.state, rows=row + 1)
         place = Place(
@@ -184,17 +198,38 @@ class Write:
         self.state = replace(self.state, rows=entry.row + 1, places=self.state.places + 1)
         self._put(entry, frame.descriptor)
 
+    def kept(self, picture: bytes | None) -> Kept:
+        """A picture as its row has it; what is to be an object is stored at the end of the write."""
+        if picture is None or self._objects is None:
+            return picture
+        if self._object_key is None:
+            self._object_key = ledger.new_object_key(self.connection)
+        made = new_object(*self._object_key, picture)
+        self._pictures[made.name] = picture
+        return made
+
     def _let_go(self, stored: PlaceEntry, row: int | None) -> None:
         """Note that a place's former entity, and its former frame, are not used any more."""
         ledger.leave(self.connection, self.state.number, stored.key, row)
         ledger.drop_if_empty(self.connection, self.state.number, stored.sequence)
 
     def finish(self) -> None:
-        """Give Milvus what is new, before the COMMIT that makes it count.
+        """Give the object store and Milvus what is new, before the COMMIT that makes it count.
 
         Raises:
-            StorageFailure: Milvus refuses; nothing counts of what it may have taken.
+            StorageFull, StorageFailure: one of them refuses; nothing counts of what they may have taken.
         """
+        if self._objects is None or not self._pictures:
+            self._insert()
+            return
+        try:
+            self._objects.put(self._pictures)
+            self._insert()
+        except BaseException:
+            self._objects.discard(list(self._pictures))
+            raise
+
+    def _insert(self) -> None:
         if self._entities:
             inserted = self._collection.insert(self.state.number, [made() for made in self._entities.values()])
             self.state = replace(self.state, inserted=max(self.state.inserted, inserted))

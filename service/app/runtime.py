@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import Callable
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
     from service.shared.state import SharedState
 
 DISK_CHECK_SECONDS = 1.0
-"""The disk is checked at most this often; a readiness probe that comes sooner gets the last result."""
+PICTURES_CHECK_SECONDS = 5.0
+"""The disk and the object store are checked at most this often; a probe that comes sooner gets the last result."""
 
 log = logging.getLogger("placerec.runtime")
 
@@ -81,6 +83,9 @@ class Runtime:
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
         self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
+        self._not_ready = ""
+        self._pictures_check: asyncio.Task[str] | None = None
+        self._pictures_checked = 0.0
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -150,7 +155,7 @@ class Runtime:
         await to_thread.run_sync(self.engine.close)
 
     async def check_readiness(self) -> dict[str, str]:
-        """The outcome of each check by its name; each is "ok".
+        """The outcome of each check by its name; each is "ok", but for pictures, which queries do without.
 
         Raises:
             NotReady: at least one is not "ok".
@@ -167,9 +172,31 @@ class Runtime:
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
+        self._note_readiness("; ".join(bad))
+        if self.settings.objects is not None:
+            checks["pictures"] = await self._check_pictures()
         if bad:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks
+
+    def _note_readiness(self, bad: str) -> None:
+        """Log when it becomes another one; that the encoder is being loaded is no news."""
+        if bad == "encoder: loading":
+            return
+        before, self._not_ready = self._not_ready, bad
+        if bad and bad != before:
+            log.warning("the service is not ready: %s", bad)
+        elif before and not bad:
+            log.info("the service is ready")
+
+    async def _check_pictures(self) -> str:
+        """The state of the object store; queries do without it, so nobody waits long for it here."""
+        check = self._pictures_check
+        if check is None or (check.done() and time.monotonic() - self._pictures_checked > PICTURES_CHECK_SECONDS):
+            self._pictures_checked = time.monotonic()
+            check = self._pictures_check = asyncio.create_task(in_thread(_outcome, self.engine.maps.check_pictures))
+        await asyncio.wait({check}, timeout=1.0)
+        return check.result() if check.done() else "The object store does not answer."
 
     def _check_store(self) -> tuple[str, str]:
         """The states of the servers that have the maps, if there are such, and of the disk."""

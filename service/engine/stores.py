@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from core.disk.files import FolderLock, disk_errors, make_folder
 from core.maps import Store
-from core.milvus import open_store
+from core.milvus import Bucket, open_store
 from core.storage import Atlas
 from service.settings import Settings
 
@@ -37,6 +37,7 @@ class OpenStore:
                 settings.milvus_token.get_secret_value(),
                 settings.milvus_database,
                 None if certificate is None else str(certificate),
+                _bucket(settings),
             )
         except BaseException:
             self._lock.release()
@@ -49,3 +50,17 @@ class OpenStore:
         self.maps.close()
         if self._lock is not None:
             self._lock.release()
+
+
+def _bucket(settings: Settings) -> Bucket | None:
+    if settings.objects is None:
+        return None
+    certificate = settings.objects_certificate
+    return Bucket(
+        settings.objects,
+        settings.objects_endpoint,
+        settings.objects_region,
+        settings.objects_access_key,
+        settings.objects_secret_key.get_secret_value(),
+        None if certificate is None else str(certificate),
+    )

@@ -10,11 +10,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import psycopg
-
 from core.disk.files import disk_errors, write_file
 from core.errors import StorageFailure
-from service.shared.database import SETTINGS, SharedDatabase
+from service.shared.database import SharedDatabase
 
 FILE = "replica"
 
@@ -157,7 +155,7 @@ class Replica:
                 self._stopping.wait(RECONNECT_SECONDS)
 
     def _listen(self) -> None:
-        with psycopg.connect(self.database.address, **SETTINGS) as connection:
+        with self.database.alone("listen") as connection:
             connection.execute(f"LISTEN {CHANNEL}")
             for heard in self._heard.values():
                 heard(None)

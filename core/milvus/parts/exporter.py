@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psycopg import Connection
 
 from core.disk.files import disk_errors
+from core.errors import StorageFailure
 from core.geometry.keypoints import count_of
 from core.maps.archives.lines import written_line
 from core.maps.archives.manifest import ArchivedRecord
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.maps.cameras import CameraRecord
 from core.milvus import ledger
+from core.milvus.database import Database
 from core.milvus.forms import Form
 from core.milvus.ledger import MapState
+from core.milvus.pictures import Kept, digest_of, read_pictures, size_of
 from core.places import Pose
 from core.storage.database.ledger import metadata_text, moment_text
+
+if TYPE_CHECKING:
+    from core.milvus.objects import Objects
 
 READ_AT_ONCE = 16
 """Frames whose descriptors, pictures or keypoints are read together."""
@@ -35,10 +40,14 @@ class MilvusExporter:
     Args:
         viewing: begins a transaction that reads the map, whose state comes with it.
         state: a value that is the same as long as nothing is written to the map.
+        database: in which the map is.
+        objects: where pictures may be besides; None: nowhere.
     """
 
-    def __init__(self, viewing: Viewing, state: Callable[[], object]) -> None:
-        self._viewing, self.state = viewing, state
+    def __init__(
+        self, viewing: Viewing, state: Callable[[], object], database: Database, objects: Objects | None
+    ) -> None:
+        self._viewing, self.state, self._database, self._objects = viewing, state, database, objects
 
     def write(
         self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
@@ -49,16 +58,22 @@ class MilvusExporter:
             UnknownMap: the map was deleted before it was read.
             StorageFull, StorageFailure.
         """
-        with disk_errors(f"write {path}"), self._viewing() as (connection, state):
-            source = _Source(connection, state)
+        with disk_errors(f"write {path}"), self._keeping_objects(), self._viewing() as (connection, state):
+            source = _Source(connection, state, self._objects)
             return write_archive(source, path, advance, expect)
+
+    def _keeping_objects(self) -> AbstractContextManager[object]:
+        """Have no objects deleted during the block: its transaction still sees rows that are deleted meanwhile."""
+        if self._objects is None:
+            return nullcontext()
+        return self._database.locked("export a map", ledger.EXPORTING, 0, shared=True)
 
 
 class _Source:
     """A map as one transaction sees it (:class:`core.maps.archives.writing.ArchiveSource`)."""
 
-    def __init__(self, connection: Connection[Any], state: MapState) -> None:
-        self._connection, self._map = connection, state.number
+    def __init__(self, connection: Connection[Any], state: MapState, objects: Objects | None) -> None:
+        self._connection, self._map, self._objects = connection, state.number, objects
         self.record = ArchivedRecord.model_validate(state.record.model_dump())
         self.frame_bytes = Form(state.record).frame_bytes
 
@@ -76,15 +91,17 @@ class _Source:
     def places(self) -> Iterator[ArchivedPlace]:
         query = (
             "SELECT p.number, p.row, p.key, p.digest, p.sequence, p.ordinal, p.place, p.track, p.station, t.name,"
-            " f.picture, octet_length(f.keypoints) FROM places p JOIN frames f ON f.map = p.map AND f.row = p.row"
+            " f.picture, f.object, f.object_size, f.object_digest, octet_length(f.keypoints)"
+            " FROM places p JOIN frames f ON f.map = p.map AND f.row = p.row"
             " LEFT JOIN sequences t ON t.map = p.map AND t.code = p.track AND t.name IS NOT NULL"
             " WHERE p.map = %s ORDER BY p.number"
         )
         lost: dict[int, int] = {}
         with self._connection.cursor(name="placerec_export") as cursor:
             cursor.itersize = READ_AT_ONCE
-            for *columns, track, picture, keypoints in cursor.execute(query, (self._map,)):
-                yield _place(ledger.entry_of(tuple(columns)), track, picture, keypoints, lost)
+            for *columns, track, picture, name, size, digest, keypoints in cursor.execute(query, (self._map,)):
+                kept = ledger.kept_of(picture, name, size, digest)
+                yield _place(ledger.entry_of(tuple(columns)), track, kept, keypoints, lost)
 
     def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         for some in _in_pieces(group):
@@ -95,7 +112,16 @@ class _Source:
             yield b"".join(descriptors[row] + local[row] for row in rows)
 
     def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
-        return self._column("picture", [place for place in group if place.picture_bytes])
+        for some in _in_pieces([place for place in group if place.picture_bytes]):
+            kept = ledger.pictures_of(self._connection, self._map, [place.row for place in some])
+            found = read_pictures(self._objects, kept)
+            for place in some:
+                picture = found.get(place.row)
+                if picture is None:
+                    raise StorageFailure(
+                        f"The picture of place {place.id!r} is missing in the object store, or damaged."
+                    )
+                yield picture
 
     def keypoints(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         return self._column("keypoints", [place for place in group if place.keypoints_bytes])
@@ -116,7 +142,7 @@ def _in_pieces(group: Sequence[ArchivedPlace]) -> Iterator[Sequence[ArchivedPlac
 
 
 def _place(
-    entry: ledger.PlaceEntry, track: str | None, picture: bytes | None, keypoints: int | None, lost: dict[int, int]
+    entry: ledger.PlaceEntry, track: str | None, picture: Kept, keypoints: int | None, lost: dict[int, int]
 ) -> ArchivedPlace:
     """The line of a place.
 
@@ -128,7 +154,7 @@ def _place(
     place = entry.place
     kept = None
     if picture is not None:
-        kept = {"kind": place.picture, "bytes": len(picture), "sha256": hashlib.sha256(picture).hexdigest()}
+        kept = {"kind": place.picture, "bytes": size_of(picture), "sha256": digest_of(picture).hex()}
     text = written_line(
         {
             "id": place.id,
@@ -149,9 +175,7 @@ def _place(
             "updated_at": moment_text(place.updated_at),
         }
     )
-    return ArchivedPlace(
-        place.id, text, entry.number, entry.row, 0, 0 if picture is None else len(picture), keypoints or 0
-    )
+    return ArchivedPlace(place.id, text, entry.number, entry.row, 0, size_of(picture), keypoints or 0)
 
 
 def _pose(pose: Pose | None) -> dict[str, float] | None:

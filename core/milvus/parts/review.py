@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psycopg import Connection
 
@@ -18,6 +18,10 @@ from core.maps.review import ReviewFrame, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
+from core.milvus.pictures import new_object, read_pictures
+
+if TYPE_CHECKING:
+    from core.milvus.objects import Objects
 
 _COLUMNS = "number, at, digest, size, answer, label"
 
@@ -31,10 +35,11 @@ class MilvusReview:
         map_number: of the map.
         reading: begins a transaction that reads the map, and raises if the map is gone.
         database: in which they are.
+        objects: where new pictures are put; None: in PostgreSQL.
     """
 
-    def __init__(self, map_number: int, reading: Access, database: Database) -> None:
-        self._map, self._reading, self._database = map_number, reading, database
+    def __init__(self, map_number: int, reading: Access, database: Database, objects: Objects | None) -> None:
+        self._map, self._reading, self._database, self._objects = map_number, reading, database, objects
         self._held: set[int] = set()
 
     @contextmanager
@@ -54,16 +59,23 @@ class MilvusReview:
             return False
         digest = hashlib.sha256(data).digest()
         with self._writing() as connection:
-            number = ledger.new_key(connection)
+            # Before a number is drawn, so that a sweep, which takes each map's lock, knows when the write has ended.
+            connection.execute("SELECT 1 FROM maps WHERE number = %s FOR KEY SHARE", (self._map,))
+            folder, number = ledger.new_object_key(connection)
+            made = None if self._objects is None else new_object(folder, number, data)
             query = (
-                "INSERT INTO review_frames (map, number, at, digest, size, answer) SELECT %s, %s, %s, %s, %s, %s"
+                "INSERT INTO review_frames (map, number, at, digest, size, answer, object)"
+                " SELECT %s, %s, %s, %s, %s, %s, %s"
                 " WHERE EXISTS (SELECT 1 FROM maps WHERE number = %s) ON CONFLICT DO NOTHING"
             )
             at, text = datetime.now(UTC), json.dumps(answer)
-            values = (self._map, number, at, digest, len(data), text, self._map)
+            values = (self._map, number, at, digest, len(data), text, None if made is None else made.name, self._map)
             if not connection.execute(query, values).rowcount:
                 return False
-            connection.execute("INSERT INTO review_pictures VALUES (%s, %s, %s)", (self._map, number, data))
+            if self._objects is None or made is None:
+                connection.execute("INSERT INTO review_pictures VALUES (%s, %s, %s)", (self._map, number, data))
+            else:
+                self._objects.put({made.name: data})
             self._drop_oldest(connection, setting)
         return True
 
@@ -130,11 +142,15 @@ class MilvusReview:
         """
         with self._reading() as connection:
             frame = self._expect(connection, number)
-            query = "SELECT bytes FROM review_pictures WHERE map = %s AND number = %s"
-            found = connection.execute(query, (self._map, number)).fetchone()
-        if found is None or hashlib.sha256(found[0]).digest() != frame.digest:
+            query = (
+                "SELECT p.bytes, f.object FROM review_frames f LEFT JOIN review_pictures p USING (map, number)"
+                " WHERE f.map = %s AND f.number = %s"
+            )
+            ((near, name),) = connection.execute(query, (self._map, number)).fetchall()
+        kept = ledger.kept_of(near, name, frame.size, frame.digest)
+        data = read_pictures(self._objects, {number: kept}).get(number)
+        if data is None or hashlib.sha256(data).digest() != frame.digest:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
-        data: bytes = found[0]
         return data
 
     @contextmanager

@@ -1,6 +1,6 @@
 """Clients of the store that do what a load asks: in this process, and in one of their own that may be killed.
 
-python -m tests.core.milvus.clients MILVUS POSTGRES    # a line of JSON for each request, and one for each answer
+python -m tests.core.milvus.clients MILVUS POSTGRES BUCKET   # a line of JSON for each request, and one for each answer
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import logging
 import subprocess
 import sys
 import threading
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from core.errors import StorageFailure, UnknownPlace
-from core.milvus import open_store
+from core.milvus import Bucket, open_store
 from core.milvus.store import MilvusStore
 from tests.core.storage.frames import descriptor_of, frame
 
@@ -43,6 +44,10 @@ class Client:
         ((rows, _),) = lab.scope().search(descriptor_of(picture)[np.newaxis])
         return [place.id for place in lab.places_at(rows[:2].tolist()) if place is not None]
 
+    def picture(self, name: str) -> str:
+        """What is kept of a place's frame."""
+        return (self._store.get("lab").picture(name) or b"").decode()
+
     def close(self) -> None:
         """Leave the store to whoever opened it."""
 
@@ -50,8 +55,9 @@ class Client:
 class ProcessClient:
     """The same in a process of its own, which is started when it is asked and not there.  One call at a time."""
 
-    def __init__(self, milvus: str, postgres: str) -> None:
-        self._command = [sys.executable, "-W", "ignore", "-m", "tests.core.milvus.clients", milvus, postgres]
+    def __init__(self, milvus: str, postgres: str, bucket: Bucket) -> None:
+        where = [milvus, postgres, json.dumps(asdict(bucket))]
+        self._command = [sys.executable, "-W", "ignore", "-m", "tests.core.milvus.clients", *where]
         self._process: subprocess.Popen[str] | None = None
         self._starting = threading.Lock()
 
@@ -63,6 +69,10 @@ class ProcessClient:
 
     def first(self, picture: str) -> list[str]:
         found: list[str] = self._call("first", picture)
+        return found
+
+    def picture(self, name: str) -> str:
+        found: str = self._call("picture", name)
         return found
 
     def kill(self) -> None:
@@ -105,14 +115,14 @@ class ProcessClient:
         return answer
 
 
-def main(milvus: str, postgres: str) -> None:
+def main(milvus: str, postgres: str, bucket: str) -> None:
     """Serve until there are no more requests."""
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
     client: Client | None = None
     for line in sys.stdin:
         method, *arguments = json.loads(line)
         try:
-            client = client or Client(open_store(milvus, postgres))
+            client = client or Client(open_store(milvus, postgres, bucket=Bucket(**json.loads(bucket))))
             answer = ["done", getattr(client, method)(*arguments)]
         except UnknownPlace as error:
             answer = ["unknown", str(error)]

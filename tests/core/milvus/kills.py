@@ -1,4 +1,4 @@
-"""Kills of Milvus, PostgreSQL and a client under a load: nothing is lost, nothing half-written, no answer is wrong.
+"""Kills of the parts of a cluster under a load: nothing is lost, nothing half-written, no answer is wrong.
 
     scripts/soak cluster --kills 100 --seed 7 [--minutes 15]
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import random
 import secrets
-import signal
 import statistics
 import sys
 import threading
@@ -29,16 +29,16 @@ from core.errors import StorageFailure, UnknownMap, UnknownPlace
 from core.milvus import open_store
 from core.milvus.map import MilvusMap
 from tests.core.milvus.clients import Client, ProcessClient
+from tests.core.milvus.parts import PARTS, Part
 from tests.core.milvus.servers import Servers, running_servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of
 
-PARTS = ("milvus", "postgres", "client")
 MOST_SECONDS = 30.0
-"""From the start of a server until both clients are served again; a client takes as long as Python does to start."""
+"""From the start of a server until both clients are served again."""
 IDS = 12
 SERVED = 5
 """Writes and queries of each client after which it is served again."""
-_GIVEN_UP = 120.0
+GIVEN_UP = 120.0
 
 May = dict[str, set[str | None]]
 """By id, the pictures that the place may show, None for no place: one, unless a write got no answer."""
@@ -58,9 +58,9 @@ class Load(threading.Thread):
         self._over.set()
         self.join()
 
-    def served(self, since: tuple[int, int]) -> bool:
-        """Whether it was served some more since ``done`` was so."""
-        return all(now >= then + SERVED for now, then in zip(self.done, since, strict=True))
+    def served(self, since: tuple[int, int], times: int) -> bool:
+        """Whether it had so many writes and so many queries answered since ``done`` was so."""
+        return all(now >= then + times for now, then in zip(self.done, since, strict=True))
 
     @property
     def done(self) -> tuple[int, int]:
@@ -99,7 +99,7 @@ class Load(threading.Thread):
                 time.sleep(0.05)
 
     def _query(self) -> None:
-        """A place whose picture is known is found first by it."""
+        """A place whose picture is known is found first by it, and what is kept of it shows it."""
         known = [name for name, shows in self.may.items() if len(shows) == 1 and None not in shows]
         if known:
             name = self._random.choice(known)
@@ -109,6 +109,8 @@ class Load(threading.Thread):
             if name not in first:
                 self.wrong.append(f"{name} with {picture} is not among {first}")
             self.queries += 1
+            if self._random.random() < 0.3 and (kept := self._client.picture(name)) != f"thumbnail of {picture}":
+                self.wrong.append(f"{name} with {picture} keeps {kept!r}")
 
 
 @contextmanager
@@ -145,36 +147,60 @@ def check(lab: MilvusMap, may: May) -> None:
 
 
 @dataclass
+class Recovery:
+    """Seconds from the start of a part: until it answered at all, did its work for somebody who asks it directly, both
+    clients had a write and a query answered, and ``SERVED`` of each; and the load of the machine then."""
+
+    answered: float
+    worked: float
+    first: float
+    served: float
+    load: float
+
+    def __str__(self) -> str:
+        times = f"answered {self.answered:.1f} s, worked {self.worked:.1f} s, first served {self.first:.1f} s"
+        return f"{times}, {SERVED} times {self.served:.1f} s after its start, load {self.load:.0f}"
+
+
+@dataclass
 class Tally:
-    """What a campaign did.  seconds: by part, from its start after each kill until both clients were served again."""
+    """What a campaign did; ``recoveries`` by part."""
 
     answered: int = 0
     refused: int = 0
-    seconds: dict[str, list[float]] = field(default_factory=dict)
+    recoveries: dict[str, list[Recovery]] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        times = [
-            f"{part} {len(these)} kills, served again after {statistics.median(these):.1f} s (at most {max(these):.1f})"
-            for part, these in self.seconds.items()
-        ]
-        kills = sum(map(len, self.seconds.values()))
-        return f"{kills} kills, {self.answered} answered, {self.refused} refused; {'; '.join(times)}"
+        kills = sum(map(len, self.recoveries.values()))
+        return f"{kills} kills, {self.answered} answered, {self.refused} refused" + "".join(
+            f"\n  {part}, {len(these)} kills: answers after {_middle([one.answered for one in these])}, works after"
+            f" {_middle([one.worked for one in these])}, clients are first served"
+            f" {_middle([max(0.0, one.first - one.worked) for one in these])} later, and {SERVED} times after"
+            f" {_middle([one.served for one in these])} in all, under a load of"
+            f" {statistics.median(one.load for one in these):.0f}"
+            for part, these in self.recoveries.items()
+        )
+
+
+def _middle(seconds: Sequence[float]) -> str:
+    return f"{statistics.median(seconds):.1f} s (at most {max(seconds):.1f})"
 
 
 class Campaign:
     """A map ``lab`` in a store, its model, and two clients."""
 
     def __init__(self, servers: Servers, seed: str) -> None:
-        self._servers, self._seed = servers, seed
-        self._store = open_store(servers.milvus_address, servers.postgres_address)
+        self._seed = seed
+        self._store = open_store(servers.milvus_address, servers.postgres_address, bucket=servers.bucket)
         with suppress(UnknownMap):
             self._store.delete("lab")
         self._lab = self._store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-        self._client = ProcessClient(servers.milvus_address, servers.postgres_address)
+        self._client = ProcessClient(servers.milvus_address, servers.postgres_address, servers.bucket)
         self._may: list[May] = [{f"{letter}{number}": {None} for number in range(IDS)} for letter in "pq"]
+        self.parts = {name: made(servers, self._client) for name, made in PARTS.items()}
         self.tally, self._kills = Tally(), Counter[str]()
 
-    def kill(self, part: str) -> None:
+    def kill(self, part: str) -> Recovery:
         """Kill a part under the load, start it again, wait until both are served, and compare."""
         number = sum(self._kills.values())
         self._kills[part] += 1
@@ -185,23 +211,20 @@ class Campaign:
         ]
         with running(loads):
             time.sleep(random.Random(seed).uniform(0.2, 2.0))
-            if part == "client":
-                self._client.kill()
-                began = time.monotonic()
-            else:
-                server = getattr(self._servers, part)
-                server.end(signal.SIGKILL)
-                time.sleep(1.0)
-                began = time.monotonic()
-                server.start()
+            killed = self.parts[part]
+            self._store.sweep_objects()  # must not take anything that counts
+            killed.kill()
+            began = time.monotonic()
+            killed.start()
+            answered = time.monotonic() - began
             before = [load.done for load in loads]
-            while not all(load.served(then) for load, then in zip(loads, before, strict=True)):
-                late = time.monotonic() - began
-                assert late < _GIVEN_UP and all(load.is_alive() for load in loads), (
-                    f"{late:.0f} s after {part} returned"
-                )
-                time.sleep(0.02)
-            self.tally.seconds.setdefault(part, []).append(time.monotonic() - began)
+            worked: list[float] = []
+            asking = threading.Thread(target=lambda: worked.append(_works_at(killed) - began))
+            asking.start()
+            first, served = (_served_at(loads, before, times, began + GIVEN_UP, part) - began for times in (1, SERVED))
+            asking.join()
+            recovery = Recovery(answered, min(worked[0], first), first, served, os.getloadavg()[0])
+            self.tally.recoveries.setdefault(part, []).append(recovery)
         for load in loads:
             assert not load.wrong, load.wrong
             self.tally.answered += sum(load.done)
@@ -210,6 +233,7 @@ class Campaign:
         check(self._lab, whole)
         for may in self._may:
             may.update({name: whole[name] for name in may})
+        return recovery
 
     def close(self) -> None:
         """Delete the map and end the clients."""
@@ -219,12 +243,34 @@ class Campaign:
         self._store.close()
 
 
+def _served_at(loads: Sequence[Load], before: Sequence[tuple[int, int]], times: int, until: float, part: str) -> float:
+    """When all clients have been served so many times."""
+    while not all(load.served(then, times) for load, then in zip(loads, before, strict=True)):
+        assert all(load.is_alive() for load in loads), "a client is gone"
+        assert time.monotonic() < until, f"{part} is back, but clients are not served"
+        time.sleep(0.02)
+    return time.monotonic()
+
+
+def _works_at(part: Part) -> float:
+    """When a part does its work again."""
+    until = time.monotonic() + GIVEN_UP
+    while time.monotonic() < until:
+        try:
+            part.ask()
+            break
+        except StorageFailure:
+            time.sleep(0.2)
+    return time.monotonic()
+
+
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
     parser = argparse.ArgumentParser(prog="scripts/soak cluster", description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", default=None)
     parser.add_argument("--minutes", type=float, default=None, help="begin no further kill after so long")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="which to kill")
     chosen = parser.parse_args(arguments)
     seed = chosen.seed or secrets.token_hex(4)
     print(f"seed {seed}", flush=True)
@@ -234,17 +280,18 @@ def main(arguments: Sequence[str]) -> int:
         campaign = Campaign(servers, seed)
         try:
             for number in range(1, chosen.kills + 1):
-                campaign.kill(draw.choice(PARTS))
+                part = draw.choice(chosen.parts)
+                print(number, part, campaign.kill(part), flush=True)
                 if number % 5 == 0:
                     print(campaign.tally, flush=True)
                 if chosen.minutes is not None and time.monotonic() - began > 60 * chosen.minutes:
                     break
         finally:
             campaign.close()
-    of_servers = [these for part, these in campaign.tally.seconds.items() if part != "client"]
-    slowest = max((second for these in of_servers for second in these), default=0.0)
+    of_servers = [these for part, these in campaign.tally.recoveries.items() if campaign.parts[part].is_server]
+    slowest = max((one.served for these in of_servers for one in these), default=0.0)
     kept = "kept" if slowest <= MOST_SECONDS else "MISSED"
-    print(f"{campaign.tally}: nothing lost, nothing half-written, no wrong answer")
+    print(f"{campaign.tally}\nnothing lost, nothing half-written, no wrong answer")
     print(f"served again within {MOST_SECONDS:g} s of a server's start: {kept}")
     return 0 if slowest <= MOST_SECONDS else 1
 

@@ -1,9 +1,10 @@
-"""A real PostgreSQL and a real Milvus on this machine, in folders of their own, for tests and trials.
+"""A real PostgreSQL, Milvus and object store on this machine, in folders of their own, for tests and trials.
 
-    scripts/cluster                  # starts both, prints their addresses, and ends them with itself
+    scripts/cluster                  # starts them, prints their addresses, and ends them with itself
 
 PostgreSQL is that of the system (Debian: ``apt-get install postgresql``).  Milvus is the server of the package
-``milvus`` in .venv-cluster, an old release.  Both run with lower priority than the tests.
+``milvus`` in .venv-cluster, an old release; the object store is SeaweedFS, there as well.  All run with lower priority
+than the tests.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -25,6 +27,7 @@ import psycopg
 
 from core.errors import StorageFailure
 from core.milvus.collection import Connection
+from tests.core.milvus.object_server import PORTS, object_store
 
 ROOT = Path(__file__).parents[3]
 MILVUS_PYTHON = ROOT / ".venv-cluster/bin/python"
@@ -91,13 +94,13 @@ initial-cluster: default=http://127.0.0.1:{peer}
 
 def fixed_ports(count: int) -> list[int]:
     """Ports that nobody listens at, and of which the system makes no use."""
-    found: list[int] = []
+    found: set[int] = set()
     while len(found) < count:
         port = random.choice(_FIXED_PORTS)
         with socket.socket() as listener, suppress(OSError):
             listener.bind(("127.0.0.1", port))
-            found.append(port)
-    return found
+            found.add(port)
+    return list(found)
 
 
 class Server:
@@ -139,8 +142,11 @@ class Server:
                 return
             except (psycopg.Error, StorageFailure) as error:
                 if time.monotonic() > until or self._process.poll() is not None:
+                    ended = self._process.poll()
                     self.end(signal.SIGKILL)
-                    raise TimeoutError(f"{self._command[0]} does not answer; see {self._folder}/output.log") from error
+                    said = (self._folder / "output.log").read_text(errors="replace")[-2000:]
+                    text = f"{self._command[0]} does not answer ({error}), or has ended ({ended}); it said: …{said}"
+                    raise TimeoutError(text) from error
                 time.sleep(0.2)
 
     def end(self, by: signal.Signals = signal.SIGTERM) -> None:
@@ -158,17 +164,17 @@ class Server:
 
 
 class Servers:
-    """Both servers, and their addresses."""
+    """The servers, and their addresses."""
 
     def __init__(self, folder: Path, milvus_settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
         programs = postgres_programs()
         if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
         user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
-        ports = fixed_ports(2)
+        ports = fixed_ports(2 + PORTS)
         self.postgres_address = f"postgresql://placerec@127.0.0.1:{ports[0]}/postgres"
         self.milvus_address = f"http://127.0.0.1:{ports[1]}"
-        data = [folder / "postgres", folder / "milvus"]
+        data = [folder / "postgres", folder / "milvus", folder / "objects"]
         for path in data:
             path.mkdir(parents=True)
         folder.chmod(0o755)
@@ -190,6 +196,8 @@ class Servers:
         serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(ports[0]), "-k", data[0]]
         self.postgres = Server(serve, data[0], self._ask_postgres, user)
         self.milvus = _milvus(data[1], ports[1], milvus_settings, self._ask_milvus)
+        keep_objects, self.bucket, ask_objects = object_store(data[2], ports[2:])
+        self.objects = Server(keep_objects, data[2], ask_objects)
 
     def _ask_postgres(self) -> None:
         psycopg.connect(self.postgres_address, connect_timeout=5).close()
@@ -222,7 +230,7 @@ def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Calla
 
 @contextmanager
 def running_servers() -> Iterator[Servers]:
-    """Both servers, as long as the block runs.
+    """The servers, as long as the block runs.
 
     Raises:
         Missing: one is not installed.
@@ -232,21 +240,27 @@ def running_servers() -> Iterator[Servers]:
     servers = None
     try:
         servers = Servers(folder)
-        servers.postgres.start()
-        servers.milvus.start()
+        with ThreadPoolExecutor() as starting:
+            list(starting.map(Server.start, (servers.postgres, servers.milvus, servers.objects)))
         yield servers
     finally:
         if servers is not None:
+            servers.objects.end()
             servers.milvus.end()
             servers.postgres.end(signal.SIGINT)
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def main() -> int:
-    """Run both servers until Ctrl+C."""
+    """Run the servers until Ctrl+C."""
     try:
         with running_servers() as servers:
             print(f"Milvus {servers.milvus_address}\nPostgreSQL {servers.postgres_address}", flush=True)
+            bucket = servers.bucket
+            print(
+                f"Object store {bucket.address} at {bucket.endpoint}, {bucket.access_key}, {bucket.secret_key}",
+                flush=True,
+            )
             with suppress(KeyboardInterrupt):
                 signal.pause()
     except (Missing, TimeoutError) as error:

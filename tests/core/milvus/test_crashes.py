@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.milvus.kills import PARTS, Campaign
+from tests.core.milvus.kills import Campaign
+from tests.core.milvus.parts import PARTS
 from tests.core.milvus.servers import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]

@@ -1,0 +1,163 @@
+"""A PostgreSQL that may be away, or refuse: connections to it, and what it says as our errors."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import psycopg
+from psycopg import Connection
+from psycopg.conninfo import conninfo_to_dict
+from psycopg_pool import ConnectionPool, PoolTimeout
+
+from core.errors import StorageFailure, StorageFull, StoreUnavailable
+from core.milvus.outage import Outage, Unreachable
+
+logging.getLogger("psycopg.pool").setLevel(logging.CRITICAL)  # it would log each attempt of an outage
+
+PATIENCE_SECONDS = 3.0
+"""How long a statement waits for a connection; PostgreSQL counts as unreachable then."""
+
+SETTINGS: Mapping[str, Any] = {
+    "application_name": "placerec",
+    "connect_timeout": 3,
+    # A machine that is gone is noticed within some ten seconds.
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,
+}
+
+# The pool waits twice as long between two attempts each time, up to minutes; after so long it gives up instead, and the
+# next request begins anew.
+_RECONNECTING_SECONDS = 1.0
+
+
+@contextmanager
+def postgres_errors(action: str) -> Iterator[None]:
+    """Turn what PostgreSQL refuses into our errors."""
+    try:
+        yield
+    except psycopg.errors.DiskFull as error:
+        raise StorageFull(f"PostgreSQL has no room left to {action}.") from error
+    except psycopg.errors.LockNotAvailable as error:
+        raise StoreUnavailable(
+            f"PostgreSQL refuses to {action}: others are writing to the map for too long."
+        ) from error
+    except psycopg.errors.InsufficientPrivilege as error:
+        text = f"refuses to {action}, for its role has no right to: {_in_one_line(error)}"
+        raise Unreachable("PostgreSQL", text) from error
+    except (psycopg.OperationalError, psycopg.InterfaceError) as error:
+        if isinstance(error, PoolTimeout):
+            raise
+        said = _in_one_line(error)
+        verdict = "cannot be reached"
+        if "FATAL" in said or "no password" in said:
+            verdict = "refuses the service"
+        elif "certificate" in said:
+            verdict = "cannot be trusted"
+        elif error.sqlstate is not None and not error.sqlstate.startswith("57P"):  # it is shutting down, or starting
+            verdict = f"refuses to {action}"
+        raise Unreachable("PostgreSQL", f"{verdict}: {said}") from error
+    except psycopg.Error as error:
+        raise StorageFailure(f"PostgreSQL refuses to {action}: {str(error).strip()[:300]}") from error
+
+
+def _in_one_line(error: psycopg.Error) -> str:
+    said = error.diag.message_primary or str(error)
+    return " ".join(said.split())[:300]
+
+
+def check_address(address: str) -> None:
+    """Raise unless libpq reads an address as it was meant.
+
+    Its own errors would show parts of a password in which special characters are not written as %40 and the like.
+
+    Raises:
+        Unreachable.
+    """
+    try:
+        read = conninfo_to_dict(address)
+        if "@" in str(read.get("host", "")) or not str(read.get("port", "0")).replace(",", "").isdigit():
+            raise psycopg.ProgrammingError("a password that is cut off")
+    except psycopg.ProgrammingError:
+        text = "has an address that cannot be read; write special characters of a password as %40 and the like."
+        raise Unreachable("PostgreSQL", text) from None
+
+
+class Postgres:
+    """Connections to a PostgreSQL, which is connected to when it is first used.  Any thread may use it.
+
+    Every method may raise StoreUnavailable (it cannot be reached, or refuses the service), StorageFull or
+    StorageFailure (it refuses).
+
+    Args:
+        address: as libpq takes it, such as ``postgresql://placerec@db/placerec``.
+        make_tables: is called once, in a transaction of its own, before anything else.
+        most_connections: at the same time.
+        settings: of its connections besides the common ones.
+        configure: is called with each new connection.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        make_tables: Callable[[Connection[Any]], None],
+        most_connections: int,
+        settings: Mapping[str, Any],
+        configure: Callable[[Connection[Any]], None] | None = None,
+    ) -> None:
+        self.address, self._make_tables, self._most = address, make_tables, most_connections
+        self._settings, self._configure = {**SETTINGS, **settings}, configure
+        self._outage = Outage("PostgreSQL")
+        self._opening = threading.Lock()
+        self._pool: ConnectionPool[Connection[Any]] | None = None
+
+    def _opened(self) -> ConnectionPool[Connection[Any]]:
+        """The pool of connections to a database whose tables are there."""
+        if (pool := self._pool) is not None:
+            return pool
+        with self._opening:
+            if self._pool is None:
+                with self.alone("make its tables") as connection, connection.transaction():
+                    self._make_tables(connection)
+                self._pool = ConnectionPool(
+                    self.address, min_size=1, max_size=self._most, timeout=PATIENCE_SECONDS, kwargs=self._settings,
+                    configure=self._configure, check=ConnectionPool.check_connection, open=True,
+                    reconnect_timeout=_RECONNECTING_SECONDS,
+                )  # fmt: skip
+            return self._pool
+
+    @contextmanager
+    def alone(self, action: str) -> Iterator[Connection[Any]]:
+        """A connection outside the pool, which says why there is none."""
+        check_address(self.address)
+        with postgres_errors(action), psycopg.connect(self.address, **self._settings) as connection:
+            yield connection
+
+    @contextmanager
+    def connection(self, action: str) -> Iterator[Connection[Any]]:
+        """A connection of the pool; what the block does not commit is undone if it raises, else committed.
+
+        Args:
+            action: what the block does, for the message of an error.
+        """
+        with self._outage.noticed():
+            pool = self._opened()
+            try:
+                with postgres_errors(action), pool.connection() as connection:
+                    yield connection
+            except PoolTimeout as error:
+                with self.alone("answer"):  # raises if it cannot be reached
+                    pass
+                raise StoreUnavailable("All connections to PostgreSQL are in use.") from error
+
+    def close(self) -> None:
+        """Close all connections."""
+        with self._opening:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.close()
