@@ -195,7 +195,10 @@ def test_what_is_being_written_stays(
 def refusing(servers: Servers) -> dict[str, tuple[Bucket, str]]:
     bucket = servers.bucket
     return {
-        "nobody there": (replace(bucket, endpoint="http://127.0.0.1:9"), "cannot be reached"),
+        "nobody there": (
+            replace(bucket, endpoint="http://127.0.0.1:9"),
+            "cannot be reached, or fails: Connection refused",
+        ),
         "wrong secret": (replace(bucket, secret_key="wrong"), "refuses the credentials.*SignatureDoesNotMatch"),
         "unknown key": (replace(bucket, access_key="nobody"), "refuses the credentials.*InvalidAccessKeyId"),
         "no bucket": (replace(bucket, address="s3://never-made"), "has no bucket 'never-made'"),
