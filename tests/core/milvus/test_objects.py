@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -256,7 +257,7 @@ def test_a_full_store(store: MilvusStore, lab: MilvusMap, servers: Servers, tmp_
             other.check_pictures()
         other.close()
     finally:
-        server.end()
+        server.end(signal.SIGKILL)  # it would take its time
 
 
 @pytest.mark.parametrize(
