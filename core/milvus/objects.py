@@ -54,6 +54,8 @@ _OF_A_FULL_STORE = re.compile(
 _FAILED = re.compile(r"non-2xx status code: 5\d\d")
 _NOT_ALLOWED = re.compile(r"\b(AccessDenied|MethodNotAllowed|AllAccessDisabled)\b")
 _CODE = re.compile(r"<Code>(\w+)</Code>(?:<Message>([^<]*)</Message>)?")
+_CAUSE = re.compile(r'(?:message|error): "([^"]{1,200})"')
+_CERTIFICATE = re.compile(r"InvalidCertificate\(\s*(\w+)")
 
 log = logging.getLogger(__name__)
 
@@ -219,6 +221,8 @@ class Objects:
             return Unreachable(SERVER, f"has no bucket {self._bucket.name!r}.")
         if isinstance(error, PermissionError) or re.search(r"status code: 40[13]", text):
             return Unreachable(SERVER, f"refuses the credentials: {_reason(text)}.")
+        if (wrong := _CERTIFICATE.search(text)) is not None:
+            return Unreachable(SERVER, f"cannot be trusted: its certificate is refused ({wrong[1]}).")
         return Unreachable(SERVER, f"cannot be reached, or fails: {_reason(text)}.")
 
 
@@ -244,7 +248,10 @@ def _reason(text: str) -> str:
     """What an error says, without addresses and identifiers of the request."""
     status = re.search(r"non-2xx status code: ([^:]+)", text)
     if status is None:
-        return " ".join(text.partition("\n")[0].rpartition(" - ")[2].split())[:200]
+        first = " ".join(text.partition("\n")[0].rpartition(" - ")[2].split())[:200]
+        late = "no answer in time" if "kind: Timeout" in text else None
+        said = _CAUSE.search(text)  # in the words of the library that was asked last
+        return late or (first if said is None else said[1])
     code = _CODE.search(text)
     said = "" if code is None else f" ({': '.join(part for part in code.groups() if part)})"
     return f"{status[1]}{said}".removesuffix(".)").strip() + (")" if said.endswith(".)") else "")

@@ -166,7 +166,7 @@ def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
 def test_the_image_of_a_cluster_has_its_packages() -> None:
     arguments = compose()["services"]["placerec-1"]["build"]["args"]
     locked = (ROOT / f"requirements/{arguments['PROFILE']}.lock").read_text()
-    assert {"psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
+    assert {"obstore", "psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
     assert set(service()["build"]["args"]) < set(arguments)
 
 

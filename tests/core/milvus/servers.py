@@ -245,7 +245,7 @@ def running_servers() -> Iterator[Servers]:
         yield servers
     finally:
         if servers is not None:
-            servers.objects.end()
+            servers.objects.end(signal.SIGKILL)  # it would take its time
             servers.milvus.end()
             servers.postgres.end(signal.SIGINT)
         shutil.rmtree(folder, ignore_errors=True)
