@@ -18,6 +18,7 @@ from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions
 from core.method.catalogue import EncoderCatalogue
 from core.milvus import open_store
+from core.milvus.ledger import VERSION
 from core.milvus.map import MilvusMap
 from core.milvus.snapshot import SHORTLIST
 from core.milvus.store import MilvusStore
@@ -157,14 +158,14 @@ def test_tables_of_another_version(servers: Servers, store: MilvusStore) -> None
         with psycopg.connect(servers.postgres_address) as connection:
             connection.execute("UPDATE placerec SET version = %s", (version,))
 
-    call_it(2)
+    call_it(99)
     later = connected(servers)
     try:
         for ask in (lambda: later.get("lab"), later.check_writable):
-            with pytest.raises(StoreOfAnotherVersion, match="version 2, which this placerec does not read"):
+            with pytest.raises(StoreOfAnotherVersion, match="version 99, which this placerec does not read"):
                 ask()
     finally:
-        call_it(1)
+        call_it(VERSION)
     assert later.get("lab").record.id == "lab"
     later.close()
 
