@@ -77,7 +77,7 @@ class Settings(BaseSettings):
     milvus_certificate: Path | None = Field(
         default=None,
         description="File with the certificate of the authority that Milvus's certificate is checked by; by default "
-        "those of the system.",
+        "by those that gRPC comes with.",
     )
     milvus_database: str = Field(
         default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."

@@ -24,7 +24,7 @@ from pymilvus import Collection as Connected
 from pymilvus import CollectionSchema, DataType, FieldSchema, connections, utility
 from pymilvus.exceptions import MilvusException
 
-from core.errors import StoreOfAnotherVersion
+from core.errors import StoreOfAnotherVersion, StoreUnavailable
 from core.milvus.expressions import NO_HEADING
 from core.milvus.indexes import indexing_for, search_settings
 from core.milvus.outage import Outage, Unreachable
@@ -175,35 +175,39 @@ class Collection:
     def __init__(self, connection: Connection, encoder: str, dimension: int) -> None:
         self._connection = connection
         self._encoder, self._dimension = encoder, dimension
-        self._name = collection_name(encoder, dimension)
+        self.name = collection_name(encoder, dimension)
         self._value: type[np.float16 | np.float32] = np.float32
         self.index_type = "FLAT"
         """How Milvus searches it, as far as it was used."""
         self._making = threading.Lock()
         self._collection: Connected | None = None
+        self._id = 0
 
     @contextmanager
     def _using(self, action: str, searching: bool = True) -> Iterator[Connected]:
-        with self._connection.using(action, searching) as name:
-            if self._collection is None:
-                self._make(name)
-            yield self._collection
+        try:
+            with self._connection.using(action, searching) as name:
+                yield self._collection or self._make(name)
+        except Unreachable as error:
+            if "not found" in str(error):
+                self._collection = None
+            raise
 
-    def _make(self, connection: str) -> None:
+    def _make(self, connection: str) -> Connected:
         with self._making:
             if self._collection is not None:
-                return
+                return self._collection
             chosen = indexing_for(utility.get_server_version(using=connection, timeout=_PATIENCE_SECONDS))
             schema = _schema(self._encoder, self._dimension, chosen.half)
-            if utility.has_collection(self._name, using=connection, timeout=_PATIENCE_SECONDS):
-                made = Connected(self._name, using=connection)
+            if utility.has_collection(self.name, using=connection, timeout=_PATIENCE_SECONDS):
+                made = Connected(self.name, using=connection)
                 if (found := made.schema.description) != schema.description:
                     raise StoreOfAnotherVersion(
-                        f"Milvus's collection {self._name} was made by another version: {found[:200]!r}."
+                        f"Milvus's collection {self.name} was made by another version: {found[:200]!r}."
                     )
             else:
                 made = Connected(
-                    self._name, schema, connection, num_partitions=PARTITIONS, shards_num=1,
+                    self.name, schema, connection, num_partitions=PARTITIONS, shards_num=1,
                     consistency_level="Bounded",
                 )  # fmt: skip
             if not made.has_index():
@@ -213,7 +217,25 @@ class Collection:
             self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
             self.index_type = str(made.index().params["index_type"])
             made.load(timeout=_PATIENCE_SECONDS)
+            self._id = _id_of(made)
             self._collection = made
+            return made
+
+    @property
+    def id(self) -> int:
+        """By which Milvus knows it; another one if it is dropped and made again, or in another Milvus or database."""
+        if self._collection is None:
+            with self._using("answer"):
+                pass
+        return self._id
+
+    def expect(self, collection: int) -> None:
+        """Raise StoreUnavailable unless this is the collection that a map's descriptors are in; 0: no one has any."""
+        if collection not in (0, self.id):
+            raise StoreUnavailable(
+                f"Milvus's collection {self.name} is not the one that has the map's descriptors. Connect to the Milvus"
+                " and the database of it that have, or rebuild the map's index if they have lost them."
+            )
 
     def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
         """Insert entities of a map; they are durable when this returns.
@@ -231,6 +253,7 @@ class Collection:
     def check(self) -> None:
         """Raise unless the collection can be searched."""
         with self._using("answer") as collection:
+            self._id = _id_of(collection)
             collection.query("key == 0", ["key"], timeout=_CONNECTING_SECONDS, consistency_level="Eventually")
 
     def delete(self, keys: Sequence[int]) -> None:
@@ -304,6 +327,10 @@ class Collection:
             "metadata": {"tokens": list(entity.tokens)},
             "descriptor": entity.descriptor.astype(self._value, copy=False),
         }
+
+
+def _id_of(collection: Connected) -> int:
+    return int(collection.describe(timeout=_CONNECTING_SECONDS)["collection_id"])
 
 
 def _schema(encoder: str, dimension: int, half: bool) -> CollectionSchema:

@@ -54,6 +54,7 @@ class MapState:
     places, rows: how many places there are; all their rows are below ``rows``.
     writes: grows with every write.
     inserted: the timestamp from which on Milvus sees all descriptors that count.
+    collection: Milvus's id of the collection that has them; 0 as long as there are none.
     """
 
     number: int
@@ -62,6 +63,7 @@ class MapState:
     rows: int
     writes: int
     inserted: int
+    collection: int
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ def state_of(connection: Connection[Any], map_id: str, number: int | None = None
     Raises:
         UnknownMap: there is none.
     """
-    query = "SELECT number, record, places, rows, writes, inserted FROM maps WHERE "
+    query = "SELECT number, record, places, rows, writes, inserted, collection FROM maps WHERE "
     query += "id = %s AND listed" if number is None else "number = %s"
     key = map_id if number is None else number
     found = connection.execute(query + (" FOR UPDATE" if locked else ""), (key,)).fetchone()
@@ -239,11 +241,17 @@ def delete(connection: Connection[Any], map_id: str, number: int | None = None) 
 def update(connection: Connection[Any], state: MapState) -> None:
     """Store what a write has changed of the map itself."""
     query = (
-        "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s, touched = now()"
-        " WHERE number = %s"
+        "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s, collection = %s,"
+        " touched = now() WHERE number = %s"
     )
-    record = state.record.model_dump_json()
-    connection.execute(query, (record, state.places, state.rows, state.writes, state.inserted, state.number))
+    kept = state.record.model_dump_json(), state.places, state.rows, state.writes, state.inserted, state.collection
+    connection.execute(query, (*kept, state.number))
+
+
+def used_collections(connection: Connection[Any]) -> dict[int, list[str]]:
+    """The ids in Milvus of the collections that have descriptors of maps, and these maps."""
+    query = "SELECT collection, array_agg(id ORDER BY id) FROM maps WHERE collection <> 0 GROUP BY collection"
+    return dict(connection.execute(query).fetchall())
 
 
 # Places

@@ -295,10 +295,12 @@ class MilvusMap:
         """
         done, after, total = 0, -1, self.count_places()
         while True:
-            with self.writing() as write:
+            with self.writing(rebuilding=True) as write:
                 entries = write.all_of(EVERY_PLACE, REBUILT_AT_ONCE, after)
                 for entry in entries:
                     write.renew_entity(entry)
+                if not entries:
+                    write.move()
             if not entries:
                 return self.index_status()
             done, after = done + len(entries), entries[-1].number
@@ -384,11 +386,11 @@ class MilvusMap:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Write]:
+    def writing(self, rebuilding: bool = False) -> Iterator[Write]:
         """Collect the changes of one write, which are stored whole at the end of the block, or not at all."""
         with self._transaction() as connection:
             state = ledger.state_of(connection, self.record.id, self.number, locked=True)
-            write = Write(connection, self.collection, state, self.objects)
+            write = Write(connection, self.collection, state, self.objects, rebuilding)
             yield write
             write.finish()
         self.note(write.state)

@@ -250,8 +250,8 @@ def _reason(text: str) -> str:
     if status is None:
         first = " ".join(text.partition("\n")[0].rpartition(" - ")[2].split())[:200]
         late = "no answer in time" if "kind: Timeout" in text else None
-        said = _CAUSE.search(text)  # in the words of the library that was asked last
-        return late or (first if said is None else said[1])
+        cause = _CAUSE.search(text)  # in the words of the library that was asked last
+        return late or (first if cause is None else cause[1])
     code = _CODE.search(text)
     said = "" if code is None else f" ({': '.join(part for part in code.groups() if part)})"
     return f"{status[1]}{said}".removesuffix(".)").strip() + (")" if said.endswith(".)") else "")

@@ -240,6 +240,7 @@ class MilvusScope:
         expression = all_of((f"map == {snapshot.state.number}", bounds, *unused, *expressions))
         limit = min(MOST_FOUND, int(_SPARE * wanted) + 10)
         while True:
+            snapshot.collection.expect(snapshot.state.collection)
             hits = snapshot.collection.search(queries, expression, limit, snapshot.state.inserted)
             rankings = self._kept(hits, keep)
             enough = all(

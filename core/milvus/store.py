@@ -11,7 +11,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from core.errors import MapExists, StorageFailure, UnknownMap
+from core.errors import MapExists, StorageFailure, StoreUnavailable, UnknownMap
 from core.maps.archives.reading import Archive
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
@@ -243,8 +243,18 @@ class MilvusStore:
         self._expect_open()
         self._database.check()
         self._milvus.check()
+        with self._database.reading() as connection:
+            used = ledger.used_collections(connection)
+        there = []
         for collection in list(self._collections.values()):
             collection.check()
+            there.append(collection.id)
+        if used and there and not set(used) & set(there):
+            some = ", ".join(sorted(map_id for maps in used.values() for map_id in maps)[:3])
+            raise StoreUnavailable(
+                f"Milvus has no map's descriptors, not those of {some} either. Connect to the Milvus and the database"
+                " of it that have, or rebuild the maps' indexes if they have lost them."
+            )
 
     def check_pictures(self) -> None:
         """Raise unless pictures could be stored now, if they are stored elsewhere than the rest.
@@ -274,12 +284,14 @@ class MilvusStore:
         self._expect_open()
         with self._database.reading() as connection:
             forgotten = ledger.unlisted(connection, ABANDONED_SECONDS)
-            encoders = ledger.encoders(connection)
+            encoders, used = ledger.encoders(connection), ledger.used_collections(connection)
         for name, number in forgotten.items():
             with suppress(UnknownMap):  # it was published, or removed
                 log.warning("The unfinished map %s is removed: nobody has written to it for a while", name)
                 self._remove(name, number)
-        return sweep(self._database, [self._collection_of(*encoder) for encoder in encoders])
+        # What is in a collection that no map is in may be another database's.
+        ours = [self._collection_of(*encoder) for encoder in encoders]
+        return sweep(self._database, [collection for collection in ours if collection.id in used])
 
     def start_sweeping(self) -> None:
         """Sweep now and from time to time, in a thread of its own, until the store is closed."""

@@ -19,6 +19,9 @@ CREATE TABLE IF NOT EXISTS maps (
     writes bigint NOT NULL DEFAULT 0,   -- grows with every write
     inserted bigint NOT NULL DEFAULT 0  -- Milvus's timestamp of the last insertion that counts
 );
+ALTER TABLE maps
+    -- Milvus's id of the collection that has its descriptors; 0: none has, or it was not noted
+    ADD COLUMN IF NOT EXISTS collection bigint NOT NULL DEFAULT 0;
 
 -- The code of the places without a sequence is -1, and their sequence has no name.
 CREATE TABLE IF NOT EXISTS sequences (

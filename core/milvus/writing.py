@@ -30,13 +30,20 @@ class Write:
     """Collects what one transaction changes of a map, whose row it has locked."""
 
     def __init__(
-        self, connection: Connection[Any], collection: Collection, state: MapState, objects: Objects | None
+        self,
+        connection: Connection[Any],
+        collection: Collection,
+        state: MapState,
+        objects: Objects | None,
+        rebuilding: bool = False,
     ) -> None:
         """Begin a write.
 
         Args:
             objects: where pictures are put; None: in PostgreSQL.
+            rebuilding: whether entities may go to another collection than the one that has the map's so far.
         """
+        self._rebuilding = rebuilding
         self.state = state
         self._objects = objects
         self._pictures: dict[str, bytes] = {}  # by the names of their objects
@@ -181,6 +188,10 @@ class Write:
         changed = {"revision": self.state.record.revision + 1, "updated_at": self._now}
         self.state = replace(self.state, record=record.model_copy(update=changed))
 
+    def move(self) -> None:
+        """Note that all entities of the map are in Milvus's present collection."""
+        self.state = replace(self.state, collection=self._collection.id)
+
     def new_key(self) -> int:
         """A number that was never used before."""
         return ledger.new_key(self.connection)
@@ -231,6 +242,9 @@ class Write:
 
     def _insert(self) -> None:
         if self._entities:
+            if not self._rebuilding:
+                self._collection.expect(self.state.collection)
+                self.state = replace(self.state, collection=self._collection.id)
             inserted = self._collection.insert(self.state.number, [made() for made in self._entities.values()])
             self.state = replace(self.state, inserted=max(self.state.inserted, inserted))
         if self.state != self._before or self._entities or self._changed:

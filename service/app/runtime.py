@@ -155,7 +155,8 @@ class Runtime:
         await to_thread.run_sync(self.engine.close)
 
     async def check_readiness(self) -> dict[str, str]:
-        """The outcome of each check by its name; each is "ok", but for pictures, which queries do without.
+        """The outcome of each check by its name; each is "ok", but for pictures, which queries do without, and others,
+        which says how services differ.
 
         Raises:
             NotReady: at least one is not "ok".
@@ -175,6 +176,8 @@ class Runtime:
         self._note_readiness("; ".join(bad))
         if self.settings.objects is not None:
             checks["pictures"] = await self._check_pictures()
+        if self.shared is not None:
+            checks["others"] = self.shared.agreement.state
         if bad:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks

@@ -54,6 +54,7 @@ class Replica:
         self.displaced = False
         """Whether another service runs under this id, because its data directory is a copy."""
         self._entered, self._beaten = False, -math.inf
+        self._trouble: dict[str, str] = {}  # what was logged last of each thing that does not work
         self._tasks: list[Callable[[], None]] = []
         self._heard: dict[str, Heard] = {}
         self._stopping = threading.Event()
@@ -75,7 +76,7 @@ class Replica:
         try:
             self.beat()
         except StorageFailure as error:
-            log.error("the service does not take part yet: %s", error)
+            self._note("the service does not take part yet", error)
         for name, work in (("replica-beat", self._beat_on), ("replica-listen", self._listen_on)):
             thread = threading.Thread(target=work, name=name, daemon=True)
             thread.start()
@@ -105,7 +106,7 @@ class Replica:
         """Why this service is not one of those that share state, in a sentence; "ok" if it is."""
         if self.displaced:
             return "Another service runs under the same id: one data directory is a copy of the other."
-        return "ok" if self.living else "PostgreSQL cannot be reached."
+        return "ok" if self.living else next(iter(self._trouble.values()), "PostgreSQL cannot be reached.")
 
     def say(self, topic: str, text: str = "") -> None:
         """Tell all services, this one included; what is said is not kept for those that do not hear it."""
@@ -113,14 +114,26 @@ class Replica:
 
     # The threads
 
+    def _note(self, what: str, error: Exception | None) -> None:
+        """Log that something does not work, once for each reason, or that it works again."""
+        before = self._trouble.pop(what, None)
+        if error is not None:
+            self._trouble[what] = str(error)
+            if before != str(error):
+                log.warning("%s: %s", what, error)
+        elif before is not None:
+            log.info("no more: %s", what)
+
     def _beat_on(self) -> None:
         while not self._stopping.wait(BEAT_SECONDS):
+            failed: Exception | None = None
             for work in (self.beat, *self._tasks):
                 try:
                     work()
                 except Exception as error:
-                    log.warning("a replica is not up to date: %s", error)
+                    failed = error
                     break  # the others would wait as long for the same server
+            self._note("the service is not up to date with the others", failed)
 
     def beat(self) -> None:
         """Say that this service is there.
@@ -151,7 +164,7 @@ class Replica:
             try:
                 self._listen()
             except Exception as error:
-                log.warning("a replica does not hear the others: %s", error)
+                self._note("the service does not hear the others", error)
                 self._stopping.wait(RECONNECT_SECONDS)
 
     def _listen(self) -> None:
@@ -159,6 +172,7 @@ class Replica:
             connection.execute(f"LISTEN {CHANNEL}")
             for heard in self._heard.values():
                 heard(None)
+            self._note("the service does not hear the others", None)
             while not self._stopping.is_set():
                 for notice in connection.notifies(timeout=0.5):
                     topic, _, text = notice.payload.partition(" ")

@@ -8,6 +8,7 @@ CREATE TABLE IF NOT EXISTS service.replicas (
     process text NOT NULL,                  -- made anew at each start
     seen timestamptz NOT NULL DEFAULT clock_timestamp()
 );
+ALTER TABLE service.replicas ADD COLUMN IF NOT EXISTS settings text; -- what all should have in common, as JSON
 
 -- A service that has not said that it is there for ten seconds counts as gone.
 CREATE OR REPLACE VIEW service.living AS

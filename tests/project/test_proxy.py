@@ -16,6 +16,7 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
+from tests.certificates import certify
 from tests.service.balancer import nginx_with
 from tests.service.scenes import jpeg
 from tests.service.server import ROOT, Server, free_port
@@ -38,17 +39,6 @@ class Proxied:
     def client(self, key: str | None = None) -> httpx.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         return httpx.Client(base_url=f"https://localhost:{self.port}", verify=self.trust, headers=headers, timeout=60)
-
-
-def certify(folder: Path) -> None:
-    """Make a certificate authority, and a certificate of it for localhost."""
-    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
-    own = ["-subj", "/CN=authority", "-keyout", f"{folder}/authority.key", "-out", f"{folder}/authority.pem"]
-    host = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-addext", "basicConstraints=CA:FALSE"]
-    signed = ["-CA", f"{folder}/authority.pem", "-CAkey", f"{folder}/authority.key"]
-    files = ["-keyout", f"{folder}/server.key", "-out", f"{folder}/server.pem"]
-    for words in (own, [*host, *signed, *files]):
-        subprocess.run(["openssl", "req", "-x509", *curve, *words], check=True, capture_output=True)
 
 
 @pytest.fixture(scope="module")

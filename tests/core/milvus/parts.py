@@ -9,6 +9,7 @@ from contextlib import suppress
 from hashlib import sha256
 from typing import Protocol
 
+import grpc
 import numpy as np
 from pymilvus import Collection, connections
 from pymilvus.exceptions import MilvusException
@@ -68,7 +69,7 @@ class Postgres(_OfServer):
 
 
 class Milvus(_OfServer):
-    """Asked for a search, which is the last thing that it can do again."""
+    """Asked for a search that sees all that was written, which is the last thing that it can do again."""
 
     def __init__(self, servers: Servers, _: ProcessClient) -> None:
         super().__init__(servers.milvus)
@@ -79,8 +80,8 @@ class Milvus(_OfServer):
             connections.connect("asking", uri=self._address, timeout=1)
             collection = Collection(collection_name(ENCODER, DIMENSION), using="asking")
             query = [np.ones(DIMENSION, np.float32)]
-            collection.search(query, "descriptor", {"metric_type": "IP"}, 1, timeout=1, consistency_level="Eventually")
-        except MilvusException as error:
+            collection.search(query, "descriptor", {"metric_type": "IP"}, 1, timeout=2, consistency_level="Strong")
+        except (MilvusException, grpc.RpcError) as error:
             raise StorageFailure(str(error)) from error
         finally:
             with suppress(MilvusException):

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymilvus import MilvusClient
 
-from core.errors import StorageFailure
+from core.errors import StorageFailure, StoreUnavailable
 from core.milvus import ledger, open_store
 from core.milvus.map import MilvusMap
 from core.milvus.store import MilvusStore
@@ -94,3 +95,35 @@ def test_what_milvus_lost_is_noticed_and_restored(store: MilvusStore, lab: Milvu
     assert store.verify("swept").ok
     ((rows, _),) = lab.scope().search(descriptor_of("p1")[np.newaxis])
     assert [place.id for place in lab.places_at(rows[:1].tolist()) if place] == ["p1"]
+
+
+def test_a_milvus_that_does_not_have_the_descriptors(servers: Servers, store: MilvusStore, lab: MilvusMap) -> None:
+    """As one of two services sees it that is connected to another Milvus, or all see it if Milvus has lost its data."""
+    lab.enrol([frame("a"), frame("b")])
+    administrator = MilvusClient(servers.milvus_address)
+    administrator.create_database("elsewhere")
+    other = open_store(servers.milvus_address, servers.postgres_address, database="elsewhere")
+    there = other.get("swept")
+    query = descriptor_of("a")[np.newaxis]
+    for ask in (lambda: there.scope().search(query), lambda: there.enrol([frame("c")])):
+        with pytest.raises(StoreUnavailable, match="not the one that has the map's descriptors"):
+            ask()
+    with pytest.raises(StoreUnavailable, match="Milvus has no map's descriptors"):
+        other.check_writable()
+    assert other.sweep() == 0
+
+    def first(of: MilvusMap) -> list[str]:
+        ((rows, _),) = of.scope().search(query)
+        return [place.id for place in of.places_at(rows[:1].tolist()) if place is not None]
+
+    store.check_writable()
+    assert first(lab) == ["a"] and lab.count_places() == 2
+    there.rebuild_index()
+    assert first(there) == ["a"]
+    with pytest.raises(StoreUnavailable, match="not the one that has the map's descriptors"):
+        first(lab)
+    lab.rebuild_index()
+    assert first(lab) == ["a"]
+    other.close()
+    MilvusClient(servers.milvus_address, db_name="elsewhere").drop_collection(there.collection.name)
+    administrator.drop_database("elsewhere")

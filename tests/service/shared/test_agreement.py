@@ -1,0 +1,77 @@
+"""Services with different settings, encoders and clocks: each says so and goes on, and nothing is lost."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+
+from service.settings import Settings
+from service.shared.agreement import COMMON, Agreement
+from service.shared.database import SharedDatabase
+from service.shared.replica import FILE, Replica
+from tests.service.encoders import COARSE, install_two_stage_encoder
+from tests.service.server import Server
+from tests.service.sessions.test_sessions import begin
+from tests.service.shared.postgres import Postgres
+
+FAKETIME = sorted(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
+SLOW = ("env", f"LD_PRELOAD={FAKETIME[0]}", "FAKETIME=-5m", "FAKETIME_DONT_FAKE_MONOTONIC=1") if FAKETIME else ()
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+
+
+def test_all_that_should_be_alike_are_settings() -> None:
+    assert set(COMMON) <= set(Settings.model_fields)
+
+
+def test_differences_are_told_until_they_end(database: SharedDatabase, tmp_path: Path) -> None:
+    replicas, services = [], []
+    for name, rate in (("one", 5.0), ("other", 7.0)):
+        models = tmp_path / f"models-{name}"
+        if name == "other":
+            install_two_stage_encoder(models)
+        replica = Replica(database, tmp_path / name)
+        given = Settings(data_dir=tmp_path / name, rate_per_key=rate, models_dir=models)
+        replicas.append(replica)
+        services.append(Agreement(given, database, replica.id))
+
+    def until(service: Agreement, text: str, telling: list[Replica]) -> None:
+        ends = time.monotonic() + 60
+        while text not in service.state:
+            assert time.monotonic() < ends, service.state
+            for replica in telling:  # who has not for ten seconds is gone
+                replica.beat()
+            for each in services:
+                each.compare()
+
+    for service in services:
+        until(service, "rate_per_key is not that of r-", replicas)
+        until(service, "encoders is not that of r-", replicas)
+    until(services[0], "ok", replicas[:1])
+
+
+@pytest.mark.skipif(not FAKETIME, reason="libfaketime is not installed")
+def test_a_clock_that_is_five_minutes_slow(postgres: Postgres, prepared: Path, tmp_path: Path) -> None:
+    postgres.empty()
+    servers = []
+    for name, wrapper in (("right", ()), ("slow", SLOW)):
+        for part in ("data", "models"):
+            shutil.copytree(prepared / part, tmp_path / name / part)
+        (tmp_path / name / "data" / FILE).unlink(missing_ok=True)
+        servers.append(Server(tmp_path / name, {"encoder": COARSE, "postgres": postgres.address}, wrapper=wrapper))
+    right, slow = (server.wait() for server in servers)
+    until = time.monotonic() + 60
+    while "PostgreSQL" not in (said := slow.client.get("/readyz").json()["checks"]["others"]):
+        assert time.monotonic() < until, said
+        time.sleep(0.2)
+    assert said == "The clock of this machine is 300 s behind PostgreSQL's."
+    assert slow.lines(level="warning", message=f"{said[:-1]}: keys expire by it")
+    assert right.client.get("/readyz").json()["checks"]["others"] == "ok"
+
+    for begins, reads in ((right, slow), (slow, right)):  # nothing expires by the clock of the wrong one
+        session = begin(begins, "lab", expires_after=60)
+        assert reads.client.get(f"/v1/maps/lab/sessions/{session}").status_code == 200
+    assert [server.stop() for server in servers] == [0, 0]
