@@ -10,7 +10,7 @@ from xdist.scheduler import LoadFileScheduling
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-PAGES = "tests/documents/test_commands.py"
+PAGES, PROJECT = "tests/documents/test_commands.py", "tests/project/"
 LONGEST = (
     PAGES,
     "tests/service/places/",
@@ -35,8 +35,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config) -> LoadFileScheduling:
-    """The tests of one file stay together, for they share a server; but not those of pages, which take a minute."""
+    """The tests of one file stay together, for they share a server, and those of the project, which parse all files.
+
+    The documents' pages are apart, for together they would take minutes.
+    """
     config.option.loadscopereorder = False  # it begins with the files that have most tests, not with the longest
     scheduling = LoadFileScheduling(config)
-    scheduling._split_scope = lambda test: test if test.startswith(PAGES) else test.partition("::")[0]
+    scheduling._split_scope = unit_of
     return scheduling
+
+
+def unit_of(test: str) -> str:
+    """The name of what a test stays together with."""
+    if test.startswith(PROJECT):
+        return PROJECT
+    return test if test.startswith(PAGES) else test.partition("::")[0]

@@ -21,7 +21,6 @@ def module_of(path: Path) -> str:
     return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 
-@cache
 def syntax_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(), path.name)
 

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,6 +24,9 @@ from tests.project.sources import CLIENT, FILES, FOLDERS, NODE, ROOT, forbidden_
 from tests.project.test_lock import locked
 
 MOST_MODULES = 16
+
+installed = cache(packages_distributions)
+"""The distributions of each top-level module."""
 
 
 def import_graph(files: Iterable[Path]) -> dict[str, set[str]]:
@@ -136,7 +140,7 @@ def test_what_is_imported_is_declared() -> None:
         | {Path(folder).name for folder in FOLDERS}
         | {path.stem for path in (ROOT / "examples").glob("*.py")}
     )
-    distributions = packages_distributions()
+    distributions = installed()
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"
         for path in FILES
@@ -174,7 +178,7 @@ def test_the_service_and_the_core_need_only_what_the_service_lock_has() -> None:
     extra = set(locked("development")) - set(locked("service"))
     blocked = {
         top
-        for top, distributions in packages_distributions().items()
+        for top, distributions in installed().items()
         if {canonicalize_name(name) for name in distributions} <= extra
     }
     assert {"matplotlib", "PIL", "sklearn", "pytest"} <= blocked

@@ -15,6 +15,8 @@ def test_nothing_reads_a_pickle() -> None:
     assert [line for folder in FOLDERS for line in forbidden_imports(folder, PICKLING)] == []
     calls = []
     for path in FILES:
+        if "allow_pickle" not in (text := path.read_text()) and "read_array" not in text:
+            continue
         for node in ast.walk(syntax_of(path)):
             if isinstance(node, ast.Attribute) and ast.unparse(node) == "np.lib.format.read_array":
                 calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")

@@ -14,6 +14,7 @@ import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
+from uuid import uuid4
 
 from tests.service.forks import context
 
@@ -41,13 +42,13 @@ class ForkedCommands:
     """A script named ``placerec`` in a folder, and the process that does its work."""
 
     def __init__(self, folder: Path) -> None:
-        address, self.script = folder / "socket", folder / "placerec"
+        address, self.script = f"\0placerec-{uuid4()}", folder / "placerec"  # a path might be too long for a socket
         with socket.socket(socket.AF_UNIX) as listening:
-            listening.bind(str(address))
+            listening.bind(address)
             listening.listen()
             self._process = context.Process(target=_listen, args=(listening,))
             self._process.start()
-        self.script.write_text(SCRIPT.format(python=sys.executable, address=str(address)))
+        self.script.write_text(SCRIPT.format(python=sys.executable, address=address))
         self.script.chmod(0o755)
 
     def close(self) -> None:

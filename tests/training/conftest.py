@@ -1,4 +1,4 @@
-"""Pictures to train on, made here; one thread, for tests run two at a time and would wait for each other's threads."""
+"""Pictures to train on, made here; one thread, several tests run at a time and would wait for the threads of others."""
 
 from __future__ import annotations
 

@@ -34,13 +34,15 @@ def test_it_does_not_start_on_a_port_in_use(server: Server, tmp_path: Path) -> N
 
 
 def test_it_is_not_exposed_without_keys(tmp_path: Path) -> None:
-    said = refused("--host", "0.0.0.0", "--port", 0, data_dir=tmp_path)
-    assert "PLACEREC_ALLOW_ANONYMOUS" in said
+    said = refused("--host", "0.0.0.0", "--port", 0, data_dir=tmp_path / "data")
+    assert "PLACEREC_HOST" in said and "PLACEREC_ALLOW_ANONYMOUS" in said
+    assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize("variable", ["port", "queue_length"])
 def test_a_wrong_setting_is_named(variable: str, tmp_path: Path) -> None:
-    assert f"PLACEREC_{variable.upper()}: " in refused(**{variable: "no number", "data_dir": tmp_path})
+    assert f"PLACEREC_{variable.upper()}: " in refused(**{variable: "no number", "data_dir": tmp_path / "data"})
+    assert not (tmp_path / "data").exists()
 
 
 def test_it_stops_when_told_and_gives_the_data_back(tmp_path: Path) -> None:
