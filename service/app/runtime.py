@@ -195,7 +195,9 @@ class Runtime:
     async def _check_pictures(self) -> str:
         """The state of the object store; queries do without it, so nobody waits long for it here."""
         check = self._pictures_check
-        if check is None or (check.done() and time.monotonic() - self._pictures_checked > PICTURES_CHECK_SECONDS):
+        sound = check is not None and check.done() and check.result() == "ok"
+        wait = PICTURES_CHECK_SECONDS if sound else DISK_CHECK_SECONDS
+        if check is None or (check.done() and time.monotonic() - self._pictures_checked > wait):
             self._pictures_checked = time.monotonic()
             check = self._pictures_check = asyncio.create_task(in_thread(_outcome, self.engine.maps.check_pictures))
         await asyncio.wait({check}, timeout=1.0)
