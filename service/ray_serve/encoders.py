@@ -231,7 +231,15 @@ class RayEncoders:
         """Have frames encoded by one replica, or put them back."""
         now = time.monotonic()
         sent = [
-            SentFrame(frame.encoder.identity, frame.data, frame.mask, frame.deadline - now, frame.bulk, frame.keypoints)
+            SentFrame(
+                frame.encoder.identity,
+                frame.data,
+                frame.mask,
+                frame.deadline - now,
+                frame.bulk,
+                frame.keypoints,
+                frame.features,
+            )
             for frame in frames
         ]
         self._metrics.frames.observe(len(frames))
