@@ -303,6 +303,8 @@ class RayEncoders:
                     return [ClientGone("nobody waits for it any more")] * len(frames)
                 if not call.done() and time.monotonic() > until:
                     raise TimeoutError("it took too long")
+            if call.cancelled():  # by Ray, when the cluster is left
+                raise ConnectionError("the call was given up")
             return call.result()
         finally:
             if not call.done():
