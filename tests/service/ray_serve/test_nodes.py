@@ -1,4 +1,4 @@
-"""Encoders on several nodes of a Ray cluster: one is killed under a load, and there are more and fewer with the load."""
+"""Encoders on several nodes of a Ray cluster: one node is killed under a load, and replicas grow and shrink with it."""
 
 from __future__ import annotations
 
