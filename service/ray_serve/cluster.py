@@ -272,6 +272,7 @@ def _prepare_environment(local: bool) -> None:
     if local:
         # By this variable Ray chooses the loopback address for its ports; its name tells where that is the default.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # else what is still at work in a cluster that was left starts a Ray
     os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
     for name, value in (QUICK | NODE).items():
         os.environ.setdefault(name, value)
