@@ -4,12 +4,15 @@
 
 The replicas take no processor time for a frame, so a machine of two cores can stand for one front and eight devices.
 Each is one device that computes one frame after the other; the front, Ray, the robots and the replicas' handling of
-calls share the cores of this machine.  At least 90 % of as many times one replica's rate, up to the front's own limit:
-that is measured with replicas that do not wait at all.
+calls share the cores of this machine.  At least 90 % of as many times one replica's rate, up to the limit of the
+machine: that is measured with replicas that do not wait at all.  The processor time of the front alone says how many
+queries a second a front with a core of its own could carry, for it has one interpreter.
 """
 
 from __future__ import annotations
 
+import os
+import resource
 import tempfile
 import time
 from pathlib import Path
@@ -18,14 +21,14 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.frames import camera_frames
-from benchmarks.process import median, processor_time, service
-from benchmarks.ray_serve.waiting import WAIT, WaitingReplica
+from benchmarks.process import descendants, median, processor_time, service
+from benchmarks.ray_serve.waiting import WAIT, WaitingReplica, prepare
 from benchmarks.report import report, verdict
 from core.evaluation.samples import fill_map
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from service.commands.load import measure
-from service.ray_serve.cluster import Cluster
+from service.ray_serve.cluster import APPLICATION, Cluster
 from service.ray_serve.encoders import WATCH
 from service.settings import Settings
 
@@ -33,8 +36,16 @@ MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query?verify=never"
 LINEAR = 0.9
 NEAR = 0.9
-"""A rate above this share of the front's limit is the front's, not the replicas'."""
+"""A rate above this share of the limit is not the replicas'."""
+WARM_SECONDS = 2.0
 START_SECONDS = 300.0
+
+
+def time_of_all() -> float:
+    """Processor time of the front, Ray, the replicas and the robots so far, in seconds."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    running = sum(processor_time(pid) for pid in {os.getpid(), *descendants(os.getpid())})
+    return running + ended.ru_utime + ended.ru_stime
 
 
 def cluster_of(folder: Path, replicas: int, batch: int) -> Cluster:
@@ -52,7 +63,11 @@ def cluster_of(folder: Path, replicas: int, batch: int) -> Cluster:
 
 
 def deploy(cluster: Cluster, replicas: int) -> None:
-    """Deploy waiting replicas, and wait until so many run and no other does."""
+    """Deploy waiting replicas in place of others, and wait until so many run and no other does."""
+    from ray import serve
+
+    if cluster.state().running:
+        serve.delete(APPLICATION)  # a rollout would start one after the other
     cluster.deploy(WaitingReplica)
     until = time.monotonic() + START_SECONDS
     while (state := cluster.state()).running != replicas or state.deploying:
@@ -66,7 +81,7 @@ def main(
     replicas: Annotated[list[int] | None, typer.Option(help="Several times; default 1, 2, 4, 8.")] = None,
     places: Annotated[int, typer.Option(min=2)] = 200,
     batch: Annotated[int, typer.Option(min=1, help="Most frames of a call.")] = 4,
-    seconds: Annotated[float, typer.Option(min=1, help="Of one turn.")] = 6.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Of one turn.")] = 4.0,
     turns: Annotated[int, typer.Option(min=1)] = 3,
 ) -> None:
     """Measure and compare."""
@@ -74,6 +89,7 @@ def main(
     frames, content = camera_frames(32)
     rates: dict[int, float] = {}
     costs: dict[int, float] = {}
+    whole: dict[int, float] = {}
     refused = 0
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
@@ -81,8 +97,7 @@ def main(
         (folder / "frames").mkdir()
         for index, data in enumerate(frames):
             (folder / "frames" / f"{index:03d}.jpg").write_bytes(data)
-        (folder / "models").mkdir()
-        (folder / "models" / WAIT).write_text(str(wait))
+        prepare(folder / "models", DEFAULT_ENCODER, wait)
         first = cluster_of(folder, max(numbers), batch)
         first.join()
         try:
@@ -90,22 +105,27 @@ def main(
             deploy(cluster_of(folder, numbers[0], batch), numbers[0])
             with service(folder / "data", 0, own) as process:
                 for number in [*numbers, 0]:
-                    if not number:  # the front's own limit, with as many as it may need
+                    count = number or numbers[-1]
+                    if not number:  # the limit of the machine, with those that are there
                         (folder / "models" / WAIT).write_text("0")
-                    count = number or 2
-                    deploy(cluster_of(folder, count, batch), count)
+                    elif number != numbers[0]:
+                        deploy(cluster_of(folder, count, batch), count)
                     time.sleep(2 * WATCH)  # then the front knows, too
                     robots = (2 * batch + 1) * count
                     found: list[dict[str, Any]] = []
                     for turn in range(turns + 1):  # the first one warms up
-                        before = processor_time(process.pid)
-                        seen = measure(str(process.client.base_url), PATH, folder / "frames", robots, seconds)
-                        seen["front"] = processor_time(process.pid) - before
+                        before = processor_time(process.pid), time_of_all()
+                        lasting = seconds if turn else WARM_SECONDS
+                        seen = measure(str(process.client.base_url), PATH, folder / "frames", robots, lasting)
+                        seen["front"], seen["all"] = processor_time(process.pid) - before[0], time_of_all() - before[1]
                         if turn:
                             found.append(seen)
                             refused += sum(n for status, n in seen["statuses"].items() if status != "200")
                     rates[number] = median([len(one["milliseconds"]) / one["seconds"] for one in found])
-                    costs[number] = median([1e3 * one["front"] / len(one["milliseconds"]) for one in found])
+                    costs[number], whole[number] = (
+                        median([1e3 * one[part] / len(one["milliseconds"]) for one in found])
+                        for part in ("front", "all")
+                    )
         finally:
             first.close()
     limit = rates.pop(0)
@@ -116,30 +136,37 @@ def main(
         ideal = number * 1e3 / wait
         share = rate / ideal
         bound = min(1.0, limit / ideal)
-        figures[str(number)] = {"queries_per_second": rate, "of_linear": share, "front_milliseconds": costs[number]}
-        rows.append((number, f"{ideal:.1f}", f"{rate:.1f}", f"{100 * share:.0f} %", costs[number]))
+        figures[str(number)] = {
+            "queries_per_second": rate,
+            "of_linear": share,
+            "front_milliseconds": costs[number],
+            "all_milliseconds": whole[number],
+        }
+        rows.append((number, f"{ideal:.1f}", f"{rate:.1f}", f"{100 * share:.0f} %", costs[number], whole[number]))
         if ideal <= NEAR * limit:
             bars.append(f"{number} replicas: {share:.2f} of linear, {verdict(share, LINEAR, at_least=True)}")
         else:
-            bars.append(f"{number} replicas: {ideal:.0f}/s would be above the front's limit ({bound:.2f} of it)")
-    rows.append(("none waits", "", f"{limit:.1f}", "the front's limit", costs[0]))
+            bars.append(f"{number} replicas: {ideal:.0f}/s would be above the machine's limit ({bound:.2f} of it)")
+    rows.append(("none waits", "", f"{limit:.1f}", "the machine's limit", costs[0], whole[0]))
     title = f"replicas that wait {wait:g} ms a frame in place of a device, {places} places, {content}"
     report(
         "ray_serve_scaling",
         title,
-        ["replicas", "linear per s", "per s", "of linear", "ms of the front a query"],
+        ["replicas", "linear per s", "per s", "of linear", "ms of the front a query", "and of all processes"],
         rows,
         {
             "wait_milliseconds": wait,
             "batch": batch,
             "places": places,
-            "front_limit_per_second": limit,
+            "machine_limit_per_second": limit,
+            "front_limit_per_second": 1e3 / costs[0],
             "replicas": figures,
             "refused": refused,
         },
     )
     for bar in bars:
         print(bar)
+    print(f"a front with a core of its own: {1e3 / costs[0]:.0f} queries/s by its processor time")
     print(f"refused: {refused}")
 
 

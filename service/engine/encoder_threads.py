@@ -127,6 +127,8 @@ class EncoderThreads:
             pixels = decode(frame.data, self._limits)
             decoded = time.perf_counter()
             encoding = frame.encoder.encode(pixels, frame.mask)
+            if not frame.features:
+                encoding = replace(encoding, regions=encoding.regions.without_features())
             encoded_at = time.perf_counter()
             wanted = frame.keypoints and len(encoding.regions) > 0
             keypoints = keypoints_in(packaged_xfeat(), ScaledFrame.of(pixels, frame.mask)) if wanted else None

@@ -36,6 +36,7 @@ class Encoded:
     """A frame, decoded and encoded.
 
     source: its pixels, or what decodes them when they are first asked for, where another process has encoded it.
+    encoding: its regions have features only if these were asked for.
     encoder: the encoder that has encoded it.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
     mask: the part of the frame that was ignored.
@@ -88,6 +89,7 @@ class QueuedFrame:
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
     keypoints: whether the frame's keypoints are wanted, too.
+    features: whether the features of its regions are, which only explanations need.
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
     result: the encoded frame, or the error that kept it from being encoded.
@@ -102,6 +104,7 @@ class QueuedFrame:
     deadline: float
     bulk: bool = False
     keypoints: bool = False
+    features: bool = False
     after_encoding: AfterEncoding | None = None
     attempts: int = 0
     result: Future[Encoded] = field(default_factory=Future)

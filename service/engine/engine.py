@@ -228,18 +228,21 @@ class Engine:
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
         keypoints: bool = False,
+        features: bool = False,
     ) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``queue.place``.
 
         Args:
-            keypoints: whether the frame's keypoints are wanted, too.
+            keypoints, features: whether the frame's keypoints, or the features of its regions, are wanted, too.
 
         Raises:
             EncoderNotInstalled: the map's encoder is not installed.
             Others: see ``EncoderQueue.encode``.
         """
         try:
-            return await self.queue.encode(map_.record.encoder, data, deadline, mask, after_encoding, keypoints)
+            return await self.queue.encode(
+                map_.record.encoder, data, deadline, mask, after_encoding, keypoints, features
+            )
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -253,6 +256,7 @@ class Engine:
         mask: Mask | None = None,
         verify: Verify = "never",
         camera: str | None = None,
+        features: bool = False,
     ) -> Recognized:
         """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, verify, judge.
 
@@ -263,6 +267,7 @@ class Engine:
             mask: the part of the frame that is ignored.
             verify: when the geometry of the best candidates is verified.
             camera: the name of the camera that took the frame; None: not known.
+            features: whether the features of its regions are wanted, too.
 
         Raises:
             QueueFull: too many requests are waiting.
@@ -271,7 +276,7 @@ class Engine:
         """
         with self.queue.place():
             encoded = await self.encode_for(
-                map_, data, deadline, mask, search_ahead(map_, k, selection, verify, camera)
+                map_, data, deadline, mask, search_ahead(map_, k, selection, verify, camera), features=features
             )
         (recognized,) = await self.searches.recognize(map_, [encoded], k, selection, verify, camera)
         return recognized

@@ -150,14 +150,14 @@ class EncoderQueue:
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
         keypoints: bool = False,
+        features: bool = False,
     ) -> Encoded:
         """Wait in the queue, then decode and encode one frame; call it within ``place``.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
             mask: the part of the frame that is ignored.
-            keypoints: whether the frame's keypoints are wanted, too.
-            after_encoding: see :class:`QueuedFrame`.
+            keypoints, features, after_encoding: see :class:`QueuedFrame`.
 
         Raises:
             DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
@@ -165,7 +165,9 @@ class EncoderQueue:
             UnknownEncoder, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
-        frame = QueuedFrame(encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding)
+        frame = QueuedFrame(
+            encoder, data, mask, deadline.at, keypoints=keypoints, features=features, after_encoding=after_encoding
+        )
         self.encoders.put([frame])
         result = asyncio.wrap_future(frame.result)
         try:

@@ -79,7 +79,7 @@ async def query(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
     recognized = await engine.recognize(
-        map_, data, deadline, options.k, options.selection(), mask, options.verify, options.camera
+        map_, data, deadline, options.k, options.selection(), mask, options.verify, options.camera, options.explain
     )
     asked = AskedFrame(options.camera)
     answer = counted_answer(engine, statistics, map_, recognized, asked)

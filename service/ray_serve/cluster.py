@@ -8,6 +8,7 @@ import ipaddress
 import logging
 import math
 import os
+import socket
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -34,9 +35,18 @@ OBJECT_STORE_BYTES = 100_000_000
 
 QUICK = {
     "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",  # a replica computes in threads of its own
+    "RAY_SERVE_METRICS_EXPORT_INTERVAL_MS": "5000",
 }
-"""Variables by which Ray Serve spares a thread; a value that the user has set stays."""
+"""Variables by which Ray Serve spares a thread, and time; a value that the user has set stays."""
 
+NODE = {
+    "RAY_worker_niceness": "0",  # else 15: replicas would wait for whatever else the machine does
+}
+"""Variables of a Ray that is started here; where others start it, they set them."""
+
+
+CONNECT_SECONDS = 2.0
+"""Seconds within which the head of a cluster accepts a connection, if it runs."""
 
 log = logging.getLogger("placerec.ray")
 
@@ -73,8 +83,8 @@ class Cluster:
         self._own = not settings.ray_address
         _prepare_environment(self._own or _is_loopback(settings.ray_address))
 
-    def open(self) -> DeploymentHandle[Replica]:
-        """Start or join the cluster, deploy the encoders unless they are there, and return what calls them; blocks.
+    def open(self) -> None:
+        """Start or join the cluster, and deploy the encoders unless they are there; blocks.
 
         Raises:
             RayUnavailable: one of these fails.
@@ -85,17 +95,9 @@ class Cluster:
         try:
             if APPLICATION not in serve.status().applications:
                 self.deploy()
-            handle: DeploymentHandle[Replica] = serve.get_app_handle(APPLICATION)
         except Exception as error:
             _leave()
             raise RayUnavailable(f"the encoders cannot be deployed: {_first_line(error)}") from error
-        # Without references a call goes straight to the replica; Ray's object store would double its cost.
-        return handle.options(
-            method_name="encode",
-            _by_reference=False,
-            request_serialization="pickle",
-            response_serialization="pickle",
-        )
 
     def join(self) -> None:
         """Start or join the cluster; blocks.
@@ -105,6 +107,7 @@ class Cluster:
         """
         import ray
 
+        self._look_for_head()
         chosen: dict[str, Any] = {"address": self._settings.ray_address}
         if self._own:
             chosen = {
@@ -128,6 +131,18 @@ class Cluster:
                 logging.getLogger(name).handlers.clear()
                 logging.getLogger(name).propagate = True
                 logging.getLogger(name).setLevel(logging.WARNING)
+
+    def _look_for_head(self) -> None:
+        """Raise RayUnavailable at once if nothing listens there; Ray itself would try for more than a minute."""
+        address = self._settings.ray_address
+        if self._own:
+            return
+        host, _, port = address.rpartition(":")
+        try:
+            with socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS):
+                pass
+        except (OSError, ValueError) as error:
+            raise RayUnavailable(f"the Ray cluster {address} is away: {_first_line(error)}") from error
 
     def deploy(self, replica: type = Replica) -> None:
         """Deploy the encoders as they are installed now.
@@ -216,6 +231,10 @@ class Cluster:
                 serve.shutdown()  # type: ignore[no-untyped-call]
             _leave()
 
+    def abandon(self) -> None:
+        """Leave a cluster that does not answer, so that it, or another at its address, can be joined again; blocks."""
+        _leave()
+
     def forget(self) -> None:
         """Let the end of this process wait for no Ray, after :meth:`close` has waited in vain."""
         import ray
@@ -253,15 +272,37 @@ def _prepare_environment(local: bool) -> None:
     if local:
         # By this variable Ray chooses the loopback address for its ports; its name tells where that is the default.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # else what is still at work in a cluster that was left starts a Ray
     os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
-    for name, value in QUICK.items():
+    for name, value in (QUICK | NODE).items():
         os.environ.setdefault(name, value)
+
+
+def caller() -> DeploymentHandle[Replica]:
+    """What calls replicas to encode, from the event loop that runs now and with no thread of Ray's between.
+
+    It is no handle that Ray Serve keeps for others, which may have no such loop.
+    """
+    from ray.serve.handle import DeploymentHandle
+
+    handle: DeploymentHandle[Replica] = DeploymentHandle(DEPLOYMENT, APPLICATION)
+    handle._init(_run_router_in_separate_loop=False)  # type: ignore[no-untyped-call]
+    # Without references a call goes straight to the replica; Ray's object store would double its cost.
+    return handle.options(
+        method_name="encode",
+        _by_reference=False,
+        request_serialization="pickle",
+        response_serialization="pickle",
+    )
 
 
 def _leave() -> None:
     import ray
+    from ray.serve.context import _set_global_client
 
     ray.shutdown()
+    # Else Ray Serve could take the controller of this cluster for that of the next one.
+    _set_global_client(None)  # type: ignore[no-untyped-call]
 
 
 def _is_loopback(address: str) -> bool:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -20,7 +22,7 @@ from typing import Any, TypeVar
 from core.frames.images import Limits, decode
 from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import ClientGone, NotReady
-from service.ray_serve.cluster import Cluster, RayUnavailable
+from service.ray_serve.cluster import Cluster, RayUnavailable, caller
 from service.ray_serve.metrics import CallMetrics
 from service.ray_serve.replica import ReturnedFrame, SentFrame
 from service.settings import Settings
@@ -46,11 +48,17 @@ UNSERVED = 5.0
 WATCH = 1.0
 """Seconds between two looks at the cluster."""
 
-AWAY = 10.0
+AWAY = 2.0
 """Seconds between two attempts to reach a cluster."""
 
-LOST = 20.0
-"""Seconds without an answer after which a cluster counts as lost.  Ray cannot be begun anew within a process."""
+LOST = 10.0
+"""Seconds without an answer after which a cluster counts as lost, and is left to be joined again."""
+
+LONGEST_END = 10.0
+"""Seconds that the end of the service waits for Ray."""
+
+LONGEST_LEAVE = 60.0
+"""Seconds that leaving a lost cluster may take; Ray needs some fifteen if nothing of it is there any more."""
 
 LONGEST_START = 180.0
 """Seconds that a Ray may take to start, or a cluster to take its deployment."""
@@ -127,11 +135,17 @@ class RayEncoders:
 
     async def _leave(self) -> None:
         """Leave the cluster; one that has died may keep its thread, but nobody waits for that."""
-        self._handle = None
+        await self._stop_calling()
         with suppress(Exception):
-            await self._ray.ask(self._cluster.close, AWAY)
+            await self._ray.ask(self._cluster.close, LONGEST_END)
             return
         self._cluster.forget()
+
+    async def _stop_calling(self) -> None:
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            with suppress(Exception):
+                await asyncio.wait_for(handle.shutdown_async(), 1.0)
 
     async def _watch(self) -> None:
         """Open the cluster, then look at it until the end."""
@@ -140,7 +154,8 @@ class RayEncoders:
             pause = WATCH
             try:
                 if self._handle is None:
-                    self._handle = await self._ray.ask(self._cluster.open, LONGEST_START)
+                    await self._ray.ask(self._cluster.open, LONGEST_START)
+                    self._handle = caller()
                     answered = time.monotonic()
                     log.info("joined the Ray cluster", extra={"address": self._cluster.address()})
                 found = await self._ray.ask(self._cluster.state, LOST)
@@ -150,13 +165,28 @@ class RayEncoders:
             except Exception as error:
                 if time.monotonic() - answered > LOST:
                     why = f"{type(error).__name__} {error}".splitlines()[0][:500]
-                    self._note(0, f"the Ray cluster does not answer: {why}; the service has to be started again")
+                    self._note(0, f"the Ray cluster does not answer: {why}")
+                    await self._abandon()
             else:
                 answered = time.monotonic()
                 self._note(found.running, f"no encoder runs in the Ray cluster: {found.problem or 'they start'}")
             self._dispatch()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._stop.wait(), pause)
+
+    async def _abandon(self) -> None:
+        """Leave a cluster that is lost; if Ray cannot even do that, end the service, which is then started again."""
+        await self._stop_calling()
+        leaving = _RayThread()  # the other may wait for an answer for ever
+        try:
+            await leaving.ask(self._cluster.abandon, LONGEST_LEAVE)
+        except Exception as error:
+            log.error("the lost Ray cluster cannot be left, so the service ends", extra={"error": repr(error)[:500]})
+            self._cluster.forget()
+            os.kill(os.getpid(), signal.SIGTERM)
+            await self._stop.wait()
+        self._ray.end()
+        self._ray = leaving
 
     def _note(self, running: int, problem: str) -> None:
         """Take over what the cluster says."""
@@ -231,7 +261,15 @@ class RayEncoders:
         """Have frames encoded by one replica, or put them back."""
         now = time.monotonic()
         sent = [
-            SentFrame(frame.encoder.identity, frame.data, frame.mask, frame.deadline - now, frame.bulk, frame.keypoints)
+            SentFrame(
+                frame.encoder.identity,
+                frame.data,
+                frame.mask,
+                frame.deadline - now,
+                frame.bulk,
+                frame.keypoints,
+                frame.features,
+            )
             for frame in frames
         ]
         self._metrics.frames.observe(len(frames))
@@ -265,6 +303,8 @@ class RayEncoders:
                     return [ClientGone("nobody waits for it any more")] * len(frames)
                 if not call.done() and time.monotonic() > until:
                     raise TimeoutError("it took too long")
+            if call.cancelled():  # by Ray, when the cluster is left
+                raise ConnectionError("the call was given up")
             return call.result()
         finally:
             if not call.done():
@@ -311,16 +351,20 @@ class RayEncoders:
 class _RayThread:
     """The thread in which all that blocks is asked of Ray, one thing after the other.
 
-    It is one for good, since the processes of a local Ray end with the thread that has started them.
+    It is one as long as Ray answers, since the processes of a local Ray end with the thread that has started them.
     """
 
     def __init__(self) -> None:
-        self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         threading.Thread(target=self._run, name="ray", daemon=True).start()
 
     def _run(self) -> None:
-        while True:
-            self._work.get()()
+        while (work := self._work.get()) is not None:
+            work()
+
+    def end(self) -> None:
+        """End the thread once it has done what it is asked."""
+        self._work.put(None)
 
     async def ask(self, work: Callable[[], Made], seconds: float) -> Made:
         """Run blocking work, which is left alone if it takes too long.

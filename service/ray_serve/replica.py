@@ -46,6 +46,7 @@ class SentFrame:
     """A frame on its way to a replica.
 
     identity: of the encoder.
+    keypoints, features: what is wanted besides descriptors.
     seconds: until its deadline, from the moment at which it was sent; clocks of two machines need not agree.
     """
 
@@ -55,6 +56,7 @@ class SentFrame:
     seconds: float
     bulk: bool
     keypoints: bool
+    features: bool
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Replica:
             else:
                 until = arrived + frame.seconds
                 queued.append(
-                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, keypoints=frame.keypoints)
+                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, frame.keypoints, frame.features)
                 )
         waiting = [frame for frame in queued if isinstance(frame, QueuedFrame)]
         self._threads.put(waiting)
