@@ -21,7 +21,7 @@ from core.errors import MapExists, UnknownMap
 from core.maps.counterparts import Standing
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import KeptFrame, MapRecord, Outline, SequenceSummary
-from core.milvus.pictures import Kept, StoredObject
+from core.milvus.pictures.kept import Kept, StoredObject
 from core.milvus.tokens import tokens_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
 

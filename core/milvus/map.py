@@ -45,7 +45,7 @@ from core.milvus.parts.exporter import MilvusExporter
 from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
-from core.milvus.pictures import read_pictures
+from core.milvus.pictures.kept import read_pictures
 from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
@@ -54,7 +54,7 @@ from core.storage.pagination import Listing, decode_name, decode_number, listing
 from core.storage.writing import check_enrolment
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 log = logging.getLogger(__name__)
 

@@ -16,11 +16,11 @@ from core.maps.archives.reading import Archive
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.milvus import ledger
-from core.milvus.bucket import Bucket
 from core.milvus.collection import Collection, Connection
 from core.milvus.database import Database
 from core.milvus.importing import Importing
 from core.milvus.map import MilvusMap
+from core.milvus.pictures.bucket import Bucket
 from core.milvus.sweep import sweep, sweep_objects
 from core.milvus.verification import inspect
 from core.places import check_map_id
@@ -28,7 +28,7 @@ from core.storage.archives.unpacking import check_sizes, layout_of
 from core.storage.pagination import Listing, decode_name, one_more, page_of
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 MOST_MAPS = 1000
 """Maps of which an object is kept, so that whoever asks for a map twice gets the same one."""
@@ -375,6 +375,6 @@ class MilvusStore:
 
 
 def _objects_of(bucket: Bucket) -> Objects:
-    from core.milvus.objects import Objects  # with it comes what speaks S3
+    from core.milvus.pictures.objects import Objects  # with it comes what speaks S3
 
     return Objects(bucket)

@@ -14,10 +14,10 @@ from core.errors import UnknownMap
 from core.milvus import ledger
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.database import Database
-from core.milvus.pictures import before_key, key_of
+from core.milvus.pictures.kept import before_key, key_of
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 SWEEPING = 7062
 """The kind of the lock of the database that whoever sweeps holds."""

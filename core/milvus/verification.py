@@ -16,7 +16,7 @@ from core.milvus import ledger
 from core.milvus.forms import Form
 from core.milvus.ledger import PlaceEntry
 from core.milvus.map import MilvusMap
-from core.milvus.pictures import read_pictures
+from core.milvus.pictures.kept import read_pictures
 
 AT_ONCE = 128
 """Places that are read together; Milvus waits up to 0.2 s for the next tick of its clock each time."""

@@ -17,13 +17,13 @@ from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
 from core.milvus.ledger import Frame, MapState, PlaceEntry
-from core.milvus.pictures import Kept, new_object
+from core.milvus.pictures.kept import Kept, new_object
 from core.milvus.tokens import tokens_of
 from core.places import Place, PlaceFields, Pose
 from core.storage.database.ledger import metadata_text, picture_of, same_fields
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 
 class Write:

@@ -21,12 +21,12 @@ from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.forms import Form
 from core.milvus.ledger import MapState
-from core.milvus.pictures import Kept, digest_of, read_pictures, size_of
+from core.milvus.pictures.kept import Kept, digest_of, read_pictures, size_of
 from core.places import Pose
 from core.storage.database.ledger import metadata_text, moment_text
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 READ_AT_ONCE = 16
 """Frames whose descriptors, pictures or keypoints are read together."""

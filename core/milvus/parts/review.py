@@ -18,10 +18,10 @@ from core.maps.review import ReviewFrame, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
-from core.milvus.pictures import new_object, read_pictures
+from core.milvus.pictures.kept import new_object, read_pictures
 
 if TYPE_CHECKING:
-    from core.milvus.objects import Objects
+    from core.milvus.pictures.objects import Objects
 
 _COLUMNS = "number, at, digest, size, answer, label"
 

@@ -18,8 +18,8 @@ from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.maps import MapSettings, ReviewSetting
 from core.milvus import Bucket, ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.objects import Objects
-from core.milvus.pictures import StoredObject
+from core.milvus.pictures.kept import StoredObject
+from core.milvus.pictures.objects import Objects
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
 from tests.core.milvus.object_server import PORTS, object_store, reading_only

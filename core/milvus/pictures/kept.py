@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from core.errors import StorageFailure
-
-if TYPE_CHECKING:
-    from core.milvus.objects import Objects
 
 
 @dataclass(frozen=True)
@@ -26,6 +23,12 @@ class StoredObject:
     name: str
     size: int
     digest: bytes
+
+
+class Reader(Protocol):
+    """What reads objects, one for each that is asked for; None: it is missing or damaged."""
+
+    def read(self, kept: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
 
 
 Kept = bytes | StoredObject | None
@@ -64,7 +67,7 @@ def digest_of(kept: bytes | StoredObject) -> bytes:
     return kept.digest if isinstance(kept, StoredObject) else hashlib.sha256(kept).digest()
 
 
-def read_pictures(objects: Objects | None, kept: Mapping[int, Kept]) -> dict[int, bytes | None]:
+def read_pictures(objects: Reader | None, kept: Mapping[int, Kept]) -> dict[int, bytes | None]:
     """Pictures by row, wherever they are; those whose object is missing, or damaged, are left out.
 
     Raises:

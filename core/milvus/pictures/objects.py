@@ -23,9 +23,9 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
-from core.milvus.bucket import Bucket
 from core.milvus.outage import Outage, Unreachable
-from core.milvus.pictures import StoredObject
+from core.milvus.pictures.bucket import Bucket
+from core.milvus.pictures.kept import StoredObject
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, S3Config

@@ -1,0 +1,1 @@
+"""Pictures of places: where each is, and the object store that may have them."""
