@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
@@ -34,13 +36,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config) -> LoadFileScheduling:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
     """The tests of one file stay together, for they share a server, and those of the project, which parse all files.
 
     The documents' pages are apart, for together they would take minutes.
     """
     config.option.loadscopereorder = False  # it begins with the files that have most tests, not with the longest
-    scheduling = LoadFileScheduling(config)
+    scheduling = LoadFileScheduling(config, log)
     scheduling._split_scope = unit_of
     return scheduling
 
