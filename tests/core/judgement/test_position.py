@@ -32,7 +32,7 @@ def test_the_mean_turns_with_what_it_is_the_mean_of(angles: list[float], turn: f
     turned, same_spread = circular_mean(np.add(angles, turn), weights)
     if spread < 150:  # beyond, the mean is decided by rounding
         assert abs((turned - mean - turn + 180) % 360 - 180) < 1e-6
-        assert same_spread == pytest.approx(spread, abs=1e-6)
+        assert same_spread == pytest.approx(spread, abs=1e-5)  # near zero it is the root of a rounding error
 
 
 def test_the_mean_of_directions() -> None:

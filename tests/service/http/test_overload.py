@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -14,21 +15,25 @@ def test_of_64_callers_on_a_queue_of_8_each_is_answered_or_told_to_come_again(st
     if strict.client.get("/v1/maps/overload").status_code == 404:
         strict.create_map("overload")
         assert strict.enrol("overload", "p", jpeg(1)).status_code == 201
-    callers = [opened(strict, f"127.0.0.{2 + number % 5}") for number in range(64)]
     request = post("/v1/maps/overload/query?k=1", jpeg(1))
-    for caller in callers:
+
+    def call(number: int) -> tuple[int, bytes]:
+        caller = opened(strict, f"127.0.0.{2 + number % 5}")
         caller.sendall(request)
-    answers = [answer(caller) for caller in callers]
+        found = answer(caller)
+        caller.sendall(get("/livez"))  # a refusal costs nobody the connection
+        assert answer(caller)[0] == 200
+        caller.close()
+        return found
+
+    with ThreadPoolExecutor(64) as callers:
+        answers = list(callers.map(call, range(64)))
     statuses = [status for status, _ in answers]
     assert set(statuses) == {200, 503} and statuses.count(200) >= 8
     for status, head in answers:
         if status == 503:
             found = re.search(rb"(?i)\r\nretry-after: (\d+)", head)
             assert found is not None and 1 <= int(found[1]) <= 3
-    for caller in callers:  # a refusal costs nobody the connection
-        caller.sendall(get("/livez"))
-        assert answer(caller)[0] == 200
-        caller.close()
     shed = re.search(r'placerec_problems_total\{type="queue-full"\} (\S+)', strict.client.get("/metrics").text)
     assert shed is not None and float(shed[1]) >= statuses.count(503)
 

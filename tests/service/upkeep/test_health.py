@@ -60,12 +60,12 @@ def test_health_counts_what_was_answered(server: Server) -> None:
 
 def test_a_new_map_of_the_same_name_begins_with_nothing(server: Server) -> None:
     for _ in range(2):
-        server.create_map("again", encoder=COARSE)
-        enrol_frames(server, "again", [jpeg(n) for n in range(2)])
-        assert server.client.get("/v1/maps/again/health").json()["answers"]["queries"] == 0
-        server.query("again", jpeg(1))
-        assert server.client.get("/v1/maps/again/health").json()["answers"]["queries"] == 1
-        assert server.client.delete("/v1/maps/again").status_code == 204
+        server.create_map("twice-made", encoder=COARSE)
+        enrol_frames(server, "twice-made", [jpeg(n) for n in range(2)])
+        assert server.client.get("/v1/maps/twice-made/health").json()["answers"]["queries"] == 0
+        server.query("twice-made", jpeg(1))
+        assert server.client.get("/v1/maps/twice-made/health").json()["answers"]["queries"] == 1
+        assert server.client.delete("/v1/maps/twice-made").status_code == 204
 
 
 def test_gaps_and_stretches_to_record_again(server: Server) -> None:
