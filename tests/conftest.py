@@ -35,20 +35,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: next((rank for rank, name in enumerate(LONGEST) if item.nodeid.startswith(name)), 99))
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
+class Scheduling(LoadFileScheduling):  # type: ignore[misc]
     """The tests of one file stay together, for they share a server, and those of the project, which parse all files.
 
     The documents' pages are apart, for together they would take minutes.
     """
-    config.option.loadscopereorder = False  # it begins with the files that have most tests, not with the longest
-    scheduling = LoadFileScheduling(config, log)
-    scheduling._split_scope = unit_of
-    return scheduling
+
+    def _split_scope(self, nodeid: str) -> str:
+        if nodeid.startswith(PROJECT):
+            return PROJECT
+        return nodeid if nodeid.startswith(PAGES) else nodeid.partition("::")[0]
 
 
-def unit_of(test: str) -> str:
-    """The name of what a test stays together with."""
-    if test.startswith(PROJECT):
-        return PROJECT
-    return test if test.startswith(PAGES) else test.partition("::")[0]
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
+    """One that begins with the longest files, not with those of most tests."""
+    config.option.loadscopereorder = False
+    return Scheduling(config, log)

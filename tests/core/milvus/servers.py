@@ -76,13 +76,6 @@ def postgres_programs() -> Path:
     return folders[-1]
 
 
-def free_port() -> int:
-    """A port that nobody listens at."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
-
-
 _ETCD = """
 listen-client-urls: http://127.0.0.1:{client}
 advertise-client-urls: http://127.0.0.1:{client}
@@ -168,10 +161,8 @@ class Servers:
     """The servers, and their addresses."""
 
     def __init__(self, folder: Path, milvus_settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
-        programs = postgres_programs()
         if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
-        user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
         ports = fixed_ports(2 + PORTS)
         self.postgres_address = f"postgresql://placerec@127.0.0.1:{ports[0]}/postgres"
         self.milvus_address = f"http://127.0.0.1:{ports[1]}"
@@ -179,23 +170,7 @@ class Servers:
         for path in data:
             path.mkdir(parents=True)
         folder.chmod(0o755)
-        if user is not None:
-            shutil.chown(data[0], user)
-        files = data[0] / "data"
-        initdb: list[str | Path] = [
-            programs / "initdb",
-            "-D",
-            files,
-            "-U",
-            "placerec",
-            "-E",
-            "UTF8",
-            "--locale=C",
-            "--auth=trust",
-        ]
-        subprocess.run(initdb, cwd=data[0], user=user, check=True, stdout=subprocess.DEVNULL)
-        serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(ports[0]), "-k", data[0]]
-        self.postgres = Server(serve, data[0], self._ask_postgres, user)
+        self.postgres = postgres_server(data[0], ports[0], self._ask_postgres)
         self.milvus = _milvus(data[1], ports[1], milvus_settings, self._ask_milvus)
         keep_objects, self.bucket, ask_objects = object_store(data[2], ports[2:])
         self.objects = Server(keep_objects, data[2], ask_objects)
@@ -209,6 +184,22 @@ class Servers:
             connection.check()
         finally:
             connection.close()
+
+
+def postgres_server(folder: Path, port: int, answers: Callable[[], None]) -> Server:
+    """A PostgreSQL with the superuser ``placerec``, who needs no password, and its data in a folder.
+
+    Raises:
+        Missing: it is not installed.
+    """
+    programs, files = postgres_programs(), folder / "data"
+    user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
+    if user is not None:
+        shutil.chown(folder, user)
+    make = [programs / "initdb", "-D", files, "-U", "placerec", "-E", "UTF8", "--locale=C", "--auth=trust", "-N"]
+    subprocess.run([str(word) for word in make], cwd=folder, user=user, check=True, stdout=subprocess.DEVNULL)
+    serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(port), "-k", folder]
+    return Server(serve, folder, answers, user)
 
 
 def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,24 +12,17 @@ from pathlib import Path
 import psycopg
 
 from service.shared.database import SharedDatabase
-from tests.core.milvus.servers import Server, free_port, postgres_programs
+from tests.core.milvus.servers import fixed_ports, postgres_server
 
 
 class Postgres:
     """PostgreSQL in a folder of its own."""
 
     def __init__(self, folder: Path) -> None:
-        programs, port = postgres_programs(), free_port()
-        user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
+        (port,) = fixed_ports(1)
         self.address = f"postgresql://placerec@127.0.0.1:{port}/postgres"
         folder.chmod(0o755)
-        if user is not None:
-            shutil.chown(folder, user)
-        files = folder / "data"
-        make = [programs / "initdb", "-D", files, "-U", "placerec", "-E", "UTF8", "--locale=C", "--auth=trust", "-N"]
-        subprocess.run([str(word) for word in make], cwd=folder, user=user, check=True, stdout=subprocess.DEVNULL)
-        serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(port), "-k", folder]
-        self.server = Server(serve, folder, self._ask, user)
+        self.server = postgres_server(folder, port, self._ask)
 
     def _ask(self) -> None:
         psycopg.connect(self.address, connect_timeout=5).close()
