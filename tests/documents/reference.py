@@ -70,7 +70,7 @@ PUBLISHED_FIGURES = """
 
 These are recalls that others have published of these protocols, in percent. Nothing in this table was measured here. A
 report shows those of its protocol in a table of their own. Figures that could not be read in a source are left out:
-those of BoQ and MegaLoc, and those that were measured by another protocol.
+all but one of MegaLoc, and those that were measured by another protocol.
 """
 
 METHODS = ("get", "post", "put", "patch", "delete")

@@ -1,7 +1,7 @@
 """Figures that others have published, by the name of the protocol; none of them was measured here.
 
-Each was read in the source that stands beside it, or in a transcript of its table.  What could not be read is left out:
-figures of BoQ and MegaLoc, and those of sets that were evaluated under another protocol than the one of that name here.
+Each was read in the source that stands beside it, or in a transcript of its table.  What could not be read is left out,
+which is all but one figure of MegaLoc, and so are those of another protocol than the one of that name here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ class Published:
 
 
 ANYLOC = "Keetha et al., AnyLoc, RA-L 2023 (arXiv 2308.00688), Table III"
+BOQ = "Ali-bey et al., BoQ, CVPR 2024, table of the repository amaralibey/Bag-of-Queries (DINOv2, 12 288 values)"
 EIGENPLACES = "Berton et al., EigenPlaces, ICCV 2023 (arXiv 2308.10832), Tables 3 and 4"
+MEGALOC = "Berton and Masone, MegaLoc, CVPR Workshops 2025 (arXiv 2502.17237), as quoted by others"
 MIXVPR = "Ali-bey et al., MixVPR, WACV 2023, table of the repository amaralibey/MixVPR"
 SALAD = "Izquierdo and Civera, SALAD, CVPR 2024, table of the repository serizba/salad"
 SELAVPR = "Lu et al., SelaVPR++, T-PAMI 2025, table of the repository Lu-Feng/SelaVPRplusplus (DINOv2-L, re-ranking)"
@@ -57,7 +59,24 @@ _EIGENPLACES = {
     "svox.snow": (54.4, 92.0, 96.8, 93.1),
     "svox.sun": (35.4, 78.5, 84.8, 86.4),
 }
+_BOQ = {
+    "amstertime": (63.0, 81.6, 85.1),
+    "eynsham": (92.2, 95.6, 96.4),
+    "msls-val": (93.8, 96.8, 97.0),
+    "nordland.10": (90.6, 96.0, 97.5),
+    "pitts250k": (96.6, 99.1, 99.5),
+    "pitts30k": (93.7, 97.1, 97.9),
+    "sped": (92.5, 95.9, 96.7),
+    "st-lucia.vg": (99.9, 100.0, 100.0),
+    "svox.night": (97.7, 99.5, 99.8),
+    "svox.overcast": (98.5, 99.3, 99.4),
+    "svox.rain": (98.8, 99.7, 99.8),
+    "svox.snow": (99.4, 99.7, 99.9),
+    "svox.sun": (97.5, 99.4, 99.5),
+}
 _REPOSITORIES = (
+    (BOQ, 2024, "BoQ", _BOQ),
+    (MEGALOC, 2025, "MegaLoc", {"baidu-mall": (87.7,)}),
     (MIXVPR, 2023, "MixVPR", {"pitts250k": (94.3, 98.2, 98.9), "msls-val": (88.2, 93.1, 94.3)}),
     (SALAD, 2024, "SALAD", {"msls-val": (92.2, 96.4, 97.0), "nordland.2760": (76.0, 89.2, 92.0)}),
     (SELAVPR, 2025, "SelaVPR++", {"pitts30k": (94.4,), "msls-val": (94.5,), "nordland.10": (97.2,)}),
