@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ from core.frames.images import Limits, decode
 from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import ClientGone, NotReady
 from service.ray_serve.cluster import Cluster, RayUnavailable, caller
+from service.ray_serve.loads import LOADS
 from service.ray_serve.metrics import CallMetrics
 from service.ray_serve.replica import ReturnedFrame, SentFrame
 from service.settings import Settings
@@ -80,7 +82,6 @@ class RayEncoders:
         self._handle: Any = None
         self._waiting = WaitingFrames()
         self._sent: set[QueuedFrame] = set()  # on their way, or about to be sent again
-        self._calls = 0
         self._running, self._served, self._begun = 0, time.monotonic(), False
         self._state = "the encoders are being started in the Ray cluster"
         self._tasks: set[asyncio.Task[None]] = set()
@@ -227,19 +228,26 @@ class RayEncoders:
     def _dispatch(self) -> None:
         """Send what waits, as far as replicas have nothing to do or a full batch waits for those that have."""
         while self._handle is not None and self._running and len(self._waiting):
-            idle = self._running - self._calls
+            idle = self._running - LOADS.busy
             if idle > 0:
                 frames = self._take(min(self._settings.ray_batch, -(-len(self._waiting) // idle)))
-            elif self._calls < 2 * self._running and len(self._waiting) >= self._settings.ray_batch:
+            elif len(LOADS) < 2 * self._running and len(self._waiting) >= self._settings.ray_batch:
                 frames = self._take(self._settings.ray_batch)
             else:
                 return
             if frames:
-                self._calls += 1
                 self._sent.update(frames)
-                task = self._loop.create_task(self._send(frames))
+                now = time.monotonic()
+                sent = [_sent(frame, now) for frame in frames]
+                LOADS.begin(sent)
+                task = self._loop.create_task(self._send(frames, sent))
                 self._tasks.add(task)
-                task.add_done_callback(self._tasks.discard)
+                task.add_done_callback(partial(self._ended, sent))
+
+    def _ended(self, sent: list[SentFrame], task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        LOADS.end(sent)
+        self._dispatch()
 
     def _take(self, most: int) -> list[QueuedFrame]:
         """The next frames that are still wanted; one that was lost before is alone."""
@@ -257,21 +265,8 @@ class RayEncoders:
             taken.append(frame)
         return taken
 
-    async def _send(self, frames: list[QueuedFrame]) -> None:
+    async def _send(self, frames: list[QueuedFrame], sent: list[SentFrame]) -> None:
         """Have frames encoded by one replica, or put them back."""
-        now = time.monotonic()
-        sent = [
-            SentFrame(
-                frame.encoder.identity,
-                frame.data,
-                frame.mask,
-                frame.deadline - now,
-                frame.bulk,
-                frame.keypoints,
-                frame.features,
-            )
-            for frame in frames
-        ]
         self._metrics.frames.observe(len(frames))
         try:
             returned = await self._call(frames, sent)
@@ -282,9 +277,6 @@ class RayEncoders:
         else:
             for frame, made in zip(frames, returned, strict=True):
                 self._finish(frame, made)
-        finally:
-            self._calls -= 1
-            self._dispatch()
 
     async def _call(self, frames: list[QueuedFrame], sent: list[SentFrame]) -> list[ReturnedFrame | Exception]:
         """What a replica makes of frames; the call is cancelled as soon as nobody waits for any of them.
@@ -391,6 +383,18 @@ class _RayThread:
 async def _result(response: Any) -> list[ReturnedFrame | Exception]:
     made: list[ReturnedFrame | Exception] = await response
     return made
+
+
+def _sent(frame: QueuedFrame, now: float) -> SentFrame:
+    return SentFrame(
+        frame.encoder.identity,
+        frame.data,
+        frame.mask,
+        frame.deadline - now,
+        frame.bulk,
+        frame.keypoints,
+        frame.features,
+    )
 
 
 def _fail(frame: QueuedFrame, error: Exception) -> None:
