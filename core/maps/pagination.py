@@ -9,16 +9,12 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import sqlite3
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import TypeVar
 
 from core.errors import InvalidCursor
 from core.maps.place_filter import PlaceFilter
-from core.maps.records import SequenceSummary
-from core.places import Place
-from core.storage.database import ledger
-from core.storage.database.conditions import text_of
 
 Entry = TypeVar("Entry")
 
@@ -77,37 +73,20 @@ def page_of(
 
 def listing_of_places(map_id: str, wanted: PlaceFilter) -> Listing:
     """Names the places of a map that fulfil some conditions."""
-    others = text_of(wanted)
+    others = _text_of(wanted)
     return ["places", map_id, wanted.sequence] + ([] if others is None else [others])
 
 
-def page_of_places(
-    connection: sqlite3.Connection, map_id: str, cursor: str | None, limit: int, wanted: PlaceFilter
-) -> tuple[list[Place], str | None]:
-    """Places that fulfil some conditions, in the order of their enrolment, and the cursor of the next page.
-
-    Raises:
-        InvalidCursor.
-    """
-    listing = listing_of_places(map_id, wanted)
-    after = decode_number(listing, cursor)
-    found = ledger.places_after(connection, after, one_more(limit), wanted)
-    page, more = page_of(listing, found, limit, lambda stored: stored.number)
-    return [stored.place for stored in page], more
+def _text_of(wanted: PlaceFilter) -> str | None:
+    """Text that is the same for the same conditions; None without any but ``sequence``."""
+    ids = None if wanted.ids is None else json.dumps(wanted.ids)
+    metadata = json.dumps(dict(wanted.metadata)) if wanted.metadata else None
+    given = [ids, wanted.camera, _moment(wanted.after), _moment(wanted.before), metadata]
+    return None if given == [None] * len(given) else json.dumps(given)
 
 
-def page_of_sequences(
-    connection: sqlite3.Connection, map_id: str, cursor: str | None, limit: int
-) -> tuple[list[SequenceSummary], str | None]:
-    """Sequences by name, and the cursor of the next page.
-
-    Raises:
-        InvalidCursor.
-    """
-    listing: Listing = ["sequences", map_id]
-    after = decode_name(listing, cursor)
-    found = ledger.sequences_after(connection, after, one_more(limit))
-    return page_of(listing, found, limit, lambda sequence: sequence.name)
+def _moment(moment: datetime | None) -> str | None:
+    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 
 def one_more(limit: int) -> int:

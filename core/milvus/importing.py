@@ -15,6 +15,7 @@ from psycopg import errors as refusals
 from core.errors import InvalidArchive, InvalidField
 from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
 from core.maps.cameras import CameraRecord
+from core.maps.stored_fields import metadata_text
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.forms import Form
@@ -23,7 +24,6 @@ from core.milvus.map import MilvusMap
 from core.milvus.writing import Write
 from core.places import NO_SEQUENCE, Place
 from core.storage.archives.unpacking import Content, Unpacking
-from core.storage.database.ledger import metadata_text
 
 
 class Importing(Unpacking):

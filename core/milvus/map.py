@@ -22,6 +22,8 @@ from core.errors import (
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints, keypoints_of
+from core.maps.enrolling import check_enrolment
+from core.maps.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
@@ -50,8 +52,6 @@ from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
 from core.places import Place, PlaceFields
-from core.storage.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
-from core.storage.writing import check_enrolment
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects

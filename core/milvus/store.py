@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from core.errors import MapExists, StorageFailure, StoreUnavailable, UnknownMap
 from core.maps.archives.reading import Archive
+from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.milvus import ledger
@@ -25,7 +26,6 @@ from core.milvus.sweep import sweep, sweep_objects
 from core.milvus.verification import inspect
 from core.places import check_map_id
 from core.storage.archives.unpacking import check_sizes, layout_of
-from core.storage.pagination import Listing, decode_name, one_more, page_of
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects

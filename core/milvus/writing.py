@@ -11,8 +11,10 @@ from psycopg import Connection
 
 from core.errors import UnknownPlace
 from core.geometry.keypoints import Keypoints
+from core.maps.enrolling import picture_of
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
+from core.maps.stored_fields import metadata_text, same_fields
 from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
@@ -20,7 +22,6 @@ from core.milvus.ledger import Frame, MapState, PlaceEntry
 from core.milvus.pictures.kept import Kept, new_object
 from core.milvus.tokens import tokens_of
 from core.places import Place, PlaceFields, Pose
-from core.storage.database.ledger import metadata_text, picture_of, same_fields
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects

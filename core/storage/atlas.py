@@ -23,6 +23,7 @@ from pathlib import Path
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.maps.archives.reading import Archive
+from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.places import check_map_id
@@ -31,7 +32,6 @@ from core.storage.files.row_formats import HALF
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
-from core.storage.pagination import Listing, decode_name, one_more, page_of
 from core.storage.verification import inspect_folder
 
 log = logging.getLogger(__name__)

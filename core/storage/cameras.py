@@ -17,8 +17,8 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.maps.cameras import MOST_CAMERAS, CameraRecord
 from core.maps.cameras import Cameras as AnyCameras
+from core.maps.stored_fields import moment_text
 from core.storage.database import row_checksums
-from core.storage.database.ledger import moment_text
 from core.storage.writing import Write
 
 Connected = TypeVar("Connected")

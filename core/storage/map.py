@@ -25,6 +25,7 @@ from core.errors import (
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints
+from core.maps.enrolling import check_enrolment
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
@@ -47,8 +48,8 @@ from core.storage.counterparts import Counterparts
 from core.storage.database import keypoints, ledger
 from core.storage.database.connections import DatabaseClosed
 from core.storage.database.ledger import SegmentEntry, segment_entries
+from core.storage.listings import page_of_places, page_of_sequences
 from core.storage.opening import OpenMap, open_map
-from core.storage.pagination import page_of_places, page_of_sequences
 from core.storage.plan import Plan
 from core.storage.review import FILE as REVIEW_FILE
 from core.storage.review import ReviewFrames
@@ -58,7 +59,7 @@ from core.storage.search.snapshot import SearchScope, Snapshot
 from core.storage.search.tiers import storage_of, unopened
 from core.storage.transfer import Transfer
 from core.storage.verification import inspect
-from core.storage.writing import FailedWrites, Write, check_enrolment
+from core.storage.writing import FailedWrites, Write
 
 log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
 from core.maps.review import ReviewFrame, frames_to_drop
-from core.storage.database.ledger import moment_text
+from core.maps.stored_fields import moment_text
 
 FILE = "review.sqlite"
 

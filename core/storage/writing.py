@@ -12,51 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage, primary_code
-from core.errors import NoRegions
 from core.geometry.keypoints import Keypoints
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, check_place_id, microseconds
+from core.maps.stored_fields import same_fields
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, microseconds
 from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
 from core.storage.files import segment_files as descriptors
-from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap
 from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
-
-
-def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:
-    """Raise an error for a frame that a map cannot store.
-
-    Args:
-        dimension, local_shape: of the map's descriptors, D and (C, L).
-
-    Raises:
-        InvalidIdentifier: the id is malformed.
-        NoRegions: the descriptor is all zero.
-        ValueError: descriptors or a digest of the wrong kind, which is a programming error.
-    """
-    check_place_id(item.id)
-    descriptor = item.descriptor
-    if descriptor.dtype != np.float32 or descriptor.shape != (dimension,):
-        raise ValueError(f"a descriptor of this map is float32 [{dimension}]")
-    if item.local.dtype != np.int8 or item.local.shape != local_shape:
-        raise ValueError(f"the local descriptors of a frame of this map are int8 {list(local_shape)}")
-    with np.errstate(over="ignore"):
-        squares = float(np.dot(descriptor, descriptor))
-    if not np.isfinite(squares):
-        raise ValueError("a descriptor is finite")
-    if np.abs(descriptor).max() > LARGEST_HALF:
-        raise ValueError(f"the values of a descriptor are within ±{LARGEST_HALF:.0f}")
-    if squares == 0:
-        raise NoRegions(f"The frame for place {item.id!r} has no region of interest, so it cannot be enrolled.")
-    if len(item.digest) != 32:
-        raise ValueError("a digest is the 32 bytes of SHA-256")
-    if item.regions < 0:
-        raise ValueError("the number of regions is not negative")
 
 
 def _location(stored: StoredPlace) -> Location:
@@ -196,7 +164,7 @@ class Write:
 
     def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
         """Change the fields of a place; its frame stays."""
-        if ledger.same_fields(stored.place, fields):
+        if same_fields(stored.place, fields):
             return stored.place, "unchanged"
         now_stored = ledger.set_fields(self.connection, stored, fields, self._now)
         self._moved[stored.row] = _location(now_stored)

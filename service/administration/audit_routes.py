@@ -10,8 +10,8 @@ from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from core import errors
+from core.maps.pagination import Listing, decode_name, encode_cursor
 from core.places import Timestamp
-from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.access.audit import LatestLines
 from service.administration.audit_lines import Line, Position, Trail, lines_in_memory, lines_of_files
 from service.errors.faults import InvalidRequest

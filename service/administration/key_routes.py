@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.pagination import Listing, decode_name, page_of
+from core.maps.pagination import Listing, decode_name, page_of
 from service.access.gate import Gate
 from service.access.keys import Key, KeyRecords
 from service.access.roles import ANONYMOUS

@@ -13,7 +13,7 @@ from pydantic import Field
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
-from core.storage.pagination import Listing, decode_number, page_of
+from core.maps.pagination import Listing, decode_number, page_of
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation

@@ -12,8 +12,8 @@ from starlette.responses import Response
 from core import errors
 from core.frames.containers import read_header
 from core.maps import Map
+from core.maps.pagination import Listing, decode_number, page_of
 from core.places import check_place_id
-from core.storage.pagination import Listing, decode_number, page_of
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.pagination import Listing, decode_name, page_of
+from core.maps.pagination import Listing, decode_name, page_of
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,

@@ -20,11 +20,11 @@ from core.frames.exif import read_orientation, read_pose_and_time
 from core.frames.images import decode
 from core.maps.archives.manifest import read_manifest
 from core.maps.archives.tar_layout import manifest_size
+from core.maps.pagination import decode_name, decode_number, encode_cursor
 from core.method.catalogue import load_encoder
 from core.networks.checkpoints import read_checkpoint
 from core.networks.network import load_network, read_definition
 from core.storage.files.array_files import StaleArrays, read_arrays, write_arrays
-from core.storage.pagination import decode_name, decode_number, encode_cursor
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
 from service.http.schemas import validated

@@ -17,13 +17,13 @@ from core.maps.archives.lines import written_line
 from core.maps.archives.manifest import ArchivedRecord
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.maps.cameras import CameraRecord
+from core.maps.stored_fields import metadata_text, moment_text
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.forms import Form
 from core.milvus.ledger import MapState
 from core.milvus.pictures.kept import Kept, digest_of, read_pictures, size_of
 from core.places import Pose
-from core.storage.database.ledger import metadata_text, moment_text
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects

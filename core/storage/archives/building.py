@@ -15,11 +15,12 @@ from core.errors import InvalidArchive, InvalidField
 from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, PlaceLine, SequenceLine
 from core.maps.archives.reading import Archive
 from core.maps.records import MapRecord
+from core.maps.stored_fields import field_columns, moment_text
 from core.places import NO_SEQUENCE
 from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking, check_sizes, layout_of
 from core.storage.database import keypoints, ledger, row_checksums
 from core.storage.database.connections import FILE, connect
-from core.storage.database.ledger import moment_text, segment_entries
+from core.storage.database.ledger import segment_entries
 from core.storage.files import segment_files as descriptors
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from core.storage.opening import create_folder
@@ -113,7 +114,7 @@ class _Building(Unpacking):
         """Store a place without its picture and keypoints; returns its number."""
         code = NO_SEQUENCE if line.sequence is None else self._code(line.sequence, line)
         try:
-            columns = ledger.field_columns(line.fields())
+            columns = field_columns(line.fields())
         except InvalidField as error:
             raise InvalidArchive(f"The place {line.id!r} cannot be stored: {error}") from None
         columns |= {

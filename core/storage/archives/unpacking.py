@@ -20,7 +20,7 @@ from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, Place
 from core.maps.archives.manifest import Manifest, Part
 from core.maps.archives.reading import Archive, PartReader
 from core.maps.cameras import MOST_CAMERAS
-from core.storage.files.row_formats import LARGEST_HALF
+from core.maps.enrolling import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 
 CHUNK_BYTES = 16 << 20

@@ -28,13 +28,6 @@ def conditions(wanted: PlaceFilter) -> dict[str, str]:
     return {condition: value for condition, value in given.items() if value is not None}
 
 
-def text_of(wanted: PlaceFilter) -> str | None:
-    """Text that is the same for the same conditions; None without any but ``sequence``."""
-    others = [value for condition, value in conditions(wanted).items() if condition != "s.name = ?"]
-    named = [wanted.camera is not None, wanted.after is not None, wanted.before is not None, *others]
-    return json.dumps(named) if others else None
-
-
 def _moment(moment: datetime | None) -> str | None:
     """A moment as it is stored."""
     return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")

@@ -14,19 +14,16 @@ from datetime import datetime
 from typing import Any
 
 from core.disk.files import Damage
-from core.errors import InvalidField, StorageFailure, UnknownPlace
+from core.errors import StorageFailure, UnknownPlace
+from core.maps.enrolling import picture_of
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import Enrolment, History, Keep, MapRecord, SequenceSummary
+from core.maps.stored_fields import POSE_VALUES, field_columns, moment_text
 from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
 from core.storage.database import row_checksums
 from core.storage.database.conditions import conditions
 from core.storage.database.row_checksums import CHECKED
 from core.storage.files.segment_files import Layout
-
-DEEPEST_METADATA = 64
-"""Most levels of nesting; deeper metadata could be stored but not sent."""
-
-_POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 
 _COLUMNS = CHECKED["places"]
 _PLACE = (
@@ -77,7 +74,7 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
     columns = dict(zip(_COLUMNS, sealed, strict=True))
     if not row_checksums.is_sound(sealed, seal):
         raise Damage(f"map.sqlite: place {columns['id']!r} does not match its checksum")
-    pose = {name: columns[name] for name in _POSE if columns[name] is not None}
+    pose = {name: columns[name] for name in POSE_VALUES if columns[name] is not None}
     try:
         place = Place(
             id=columns["id"],
@@ -96,55 +93,6 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
         raise Damage(f"map.sqlite: place {columns['id']!r} is invalid") from error
     numbers = {name: columns[name] for name in ("number", "row", "digest", "sequence", "ordinal", "track", "station")}
     return StoredPlace(**numbers, place=place)
-
-
-def moment_text(moment: datetime) -> str:
-    """A moment in UTC as text, which sorts by time."""
-    return moment.isoformat(timespec="microseconds")
-
-
-def _is_deep(value: Any) -> bool:
-    level = [value]
-    for _ in range(DEEPEST_METADATA):
-        level = [
-            inner
-            for outer in level
-            if isinstance(outer, dict | list | tuple)
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-        ]
-    return bool(level)
-
-
-def metadata_text(metadata: dict[str, Any]) -> str:
-    """Metadata as canonical JSON: equal metadata is always the same text.
-
-    Raises:
-        InvalidField: it has values that JSON cannot represent (NaN, infinity, other types), or is nested too deeply.
-    """
-    if _is_deep(metadata):
-        raise InvalidField(f"The metadata is nested more than {DEEPEST_METADATA} levels deep.")
-    try:
-        return json.dumps(metadata, allow_nan=False, sort_keys=True, separators=(",", ":"))
-    except (TypeError, ValueError) as error:
-        raise InvalidField(f"The metadata cannot be written as JSON: {error}.") from error
-
-
-def field_columns(fields: PlaceFields) -> dict[str, Any]:
-    """The columns of ``places`` that hold a place's fields, except for its sequence.
-
-    Raises:
-        InvalidField: the metadata cannot be written as JSON.
-    """
-    columns: dict[str, Any] = {name: getattr(fields.pose, name) if fields.pose else None for name in _POSE}
-    columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
-    columns["camera"] = fields.camera
-    columns["metadata"] = metadata_text(fields.metadata)
-    return columns
-
-
-def same_fields(a: PlaceFields, b: PlaceFields) -> bool:
-    """Whether two sets of fields are stored in the same way (unlike Python, JSON distinguishes 1 from true)."""
-    return a.sequence == b.sequence and field_columns(a) == field_columns(b)
 
 
 # Reading
@@ -274,15 +222,6 @@ def _drop_if_empty(connection: sqlite3.Connection, code: int) -> None:
     connection.execute(query, (code,))
 
 
-def picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
-    """What is kept of a frame, and its bytes."""
-    if keep == "image" and item.image is not None:
-        return keep, item.image
-    if keep != "none" and item.thumbnail is not None:
-        return "thumbnail", item.thumbnail
-    return "none", None
-
-
 def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | None) -> None:
     """Store the picture of a place that has none."""
     if content is not None:
@@ -380,7 +319,7 @@ def set_counterpart(
     track, at = (None, None) if station is None else station
     columns: dict[str, Any] = {"track": track, "station": at, "pose_of": pose_of}
     if pose != stored.place.pose:
-        columns |= {name: getattr(pose, name) if pose else None for name in _POSE}
+        columns |= {name: getattr(pose, name) if pose else None for name in POSE_VALUES}
         columns["updated_at"] = moment_text(now)
     _set(connection, stored.number, **columns)
     return expect(connection, stored.place.id)

@@ -27,9 +27,6 @@ Local = NDArray[np.int8]
 HALF: Precision = "half"
 COMPRESSED: Precision = "compressed"
 
-LARGEST_HALF = 65504.0
-"""The largest number in half precision."""
-
 BLOCK = 128
 """Values of a compressed descriptor that share a scale: those of one visual word of the default encoder."""
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from core.errors import InvalidCursor
-from core.storage.pagination import Listing, decode_name, decode_number, encode_cursor
+from core.maps.pagination import Listing, decode_name, decode_number, encode_cursor
 
 
 @pytest.mark.parametrize("number", [0, 1, 2**63 - 1])
