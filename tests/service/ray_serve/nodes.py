@@ -2,7 +2,7 @@
 
     python -m tests.service.ray_serve.nodes PORT
 
-starts a head that computes nothing, then a node for each line of its input, with so many processors.
+starts a head that computes nothing, then a node for each line ``node CPUS`` of its input, or a new head for ``head``.
 """
 
 from __future__ import annotations
@@ -61,10 +61,24 @@ class Nodes:
         )
         self._nodes = [self._read()]
 
+    @property
+    def head(self) -> Node:
+        """The node that keeps the cluster together."""
+        return self._nodes[0]
+
+    def start_head(self) -> None:
+        """Start another head at the same address; what the one before it knew is lost."""
+        self._nodes[0] = self._ask("head")
+
     def add(self, cpus: int) -> Node:
         """Start a node."""
-        self._nodes.append(node := self._ask(str(cpus)))
+        self._nodes.append(node := self._ask(f"node {cpus}"))
         return node
+
+    def kill(self) -> None:
+        """End the head and all nodes at once."""
+        for node in self._nodes:
+            node.kill()
 
     def _ask(self, command: str) -> Node:
         assert self._process.stdin is not None
@@ -83,8 +97,7 @@ class Nodes:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        for node in self._nodes:
-            node.kill()
+        self.kill()
         self._process.kill()
         self._process.wait()
 
@@ -109,6 +122,10 @@ def main(port: int) -> None:
         "object_store_memory": STORE_BYTES,
     }
 
+    def head() -> Any:
+        made.head_node = None
+        return made.add_node(num_cpus=0, gcs_server_port=port, **shared)
+
     started: set[int] = set()
 
     def start(make: Callable[[], Any]) -> None:
@@ -126,9 +143,10 @@ def main(port: int) -> None:
                 print(json.dumps({"pids": pids}), flush=True)
                 return
 
-    start(partial(made.add_node, num_cpus=0, gcs_server_port=port, **shared))
+    start(head)
     for line in sys.stdin:
-        start(partial(made.add_node, num_cpus=int(line), **shared))
+        command, *rest = line.split()
+        start(head if command == "head" else partial(made.add_node, num_cpus=int(rest[0]), **shared))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Encoders on several nodes of a Ray cluster: one node is killed under a load, and replicas grow and shrink with it."""
+"""Encoders on several nodes of Ray: one is killed under a load, replicas grow and shrink with it, all are killed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from benchmarks.ray_serve.waiting import WaitingReplica, prepare
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from service.engine.queue import EncoderQueue
+from service.errors.faults import NotReady
 from service.ray_serve import encoders_for
 from service.ray_serve.cluster import Cluster
 from service.ray_serve.encoders import RayEncoders
@@ -106,3 +107,21 @@ async def test_encoders_grow_with_the_queue_and_shrink_without(queue: EncoderQue
     assert isinstance(queue.encoders, RayEncoders)
     await asyncio.to_thread(queue.encoders._cluster.deploy)
     await asyncio.to_thread(wait_for_replicas, queue, 2)
+
+
+async def test_a_front_joins_again_when_its_cluster_returns(
+    queue: EncoderQueue, nodes: tuple[Nodes, list[Node]]
+) -> None:
+    cluster, _ = nodes
+    await asyncio.to_thread(cluster.kill)
+    with pytest.raises(NotReady):
+        while True:
+            await queue.encode(IDENTITY, jpeg(1), deadline())
+    while queue.encoders.state == "ok":
+        await asyncio.sleep(0.2)
+    await asyncio.to_thread(cluster.start_head)
+    await asyncio.to_thread(cluster.add, 2)
+    await asyncio.to_thread(wait_for_replicas, queue, 2)
+    async with Robots(queue) as robots:
+        await robots.all_served()
+    assert not robots.refused
