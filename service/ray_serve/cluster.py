@@ -44,6 +44,13 @@ NODE = {
 }
 """Variables of a Ray that is started here; where others start it, they set them."""
 
+JOINED = {
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "86400",  # else a process ends whose head has been away for a minute
+}
+"""Variables of a process that joins a cluster; it notes itself that the cluster is lost, and leaves it."""
+
+ANSWER_SECONDS = 4.0
+"""Seconds within which a cluster answers what it is asked of the encoders."""
 
 CONNECT_SECONDS = 2.0
 """Seconds within which the head of a cluster accepts a connection, if it runs."""
@@ -81,7 +88,7 @@ class Cluster:
     def __init__(self, settings: Settings, limits: Limits) -> None:
         self._settings, self._limits = settings, limits
         self._own = not settings.ray_address
-        _prepare_environment(self._own or _is_loopback(settings.ray_address))
+        prepare_environment(self._own, self._own or _is_loopback(settings.ray_address))
 
     def open(self) -> None:
         """Start or join the cluster, and deploy the encoders unless they are there; blocks.
@@ -200,10 +207,19 @@ class Cluster:
             raise RayUnavailable(f"the encoders cannot be deployed: {_first_line(error)}") from error
 
     def state(self) -> State:
-        """What the cluster says of the encoders; blocks, and raises what Ray does if the cluster does not answer."""
-        from ray import serve
+        """What the cluster says of the encoders; blocks, not for long, and raises what Ray does if it does not answer.
 
-        application = serve.status().applications.get(APPLICATION)
+        ``serve.status()`` would wait for ever, and a thread that waits while Ray is left ends the process.
+        """
+        import ray
+        from ray.serve.context import _get_global_client
+        from ray.serve.schema import ServeInstanceDetails
+
+        client = _get_global_client(raise_if_no_controller_running=False)
+        if client is None:
+            return State(0, "they are not deployed")
+        details = ray.get(client._controller.get_serve_instance_details.remote(), timeout=ANSWER_SECONDS)
+        application = ServeInstanceDetails(**details)._get_status().applications.get(APPLICATION)
         if application is None:
             return State(0, "they are not deployed")
         deployment = application.deployments.get(DEPLOYMENT)
@@ -266,7 +282,7 @@ class Cluster:
         return max(cores(), self._settings.ray_replicas * self._replica_cpus())
 
 
-def _prepare_environment(local: bool) -> None:
+def prepare_environment(own: bool, local: bool) -> None:
     """Set what Ray reads when it is imported, and what its processes inherit."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if local:
@@ -274,7 +290,7 @@ def _prepare_environment(local: bool) -> None:
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # else what is still at work in a cluster that was left starts a Ray
     os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
-    for name, value in (QUICK | NODE).items():
+    for name, value in (QUICK | (NODE if own else JOINED)).items():
         os.environ.setdefault(name, value)
 
 

@@ -104,11 +104,9 @@ class Nodes:
 
 def main(port: int) -> None:
     """Start nodes as the input says."""
-    from core.frames.images import Limits
-    from service.ray_serve.cluster import Cluster as Joined
-    from service.settings import Settings
+    from service.ray_serve.cluster import prepare_environment
 
-    Joined(Settings(ray_address=f"127.0.0.1:{port}"), Limits())  # prepares the environment
+    prepare_environment(own=True, local=True)
     import ray._private.utils
     from ray.cluster_utils import Cluster
 
