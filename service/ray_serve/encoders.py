@@ -147,6 +147,8 @@ class RayEncoders:
         if handle is not None:
             with suppress(Exception):
                 await asyncio.wait_for(handle.shutdown_async(), 1.0)
+        for task in asyncio.all_tasks() - self._tasks - {asyncio.current_task()}:
+            task.cancel()  # Ray Serve's own, which would go on asking for what is gone
 
     async def _watch(self) -> None:
         """Open the cluster, then look at it until the end."""

@@ -198,7 +198,7 @@ class Campaign:
         self._client = ProcessClient(servers.milvus_address, servers.postgres_address, servers.bucket)
         self._may: list[May] = [{f"{letter}{number}": {None} for number in range(IDS)} for letter in "pq"]
         self.parts = {name: made(servers, self._client) for name, made in PARTS.items()}
-        self.tally, self._kills = Tally(), Counter[str]()
+        self.tally, self._kills, self._served = Tally(), Counter[str](), dict[str, float]()
 
     def kill(self, part: str) -> Recovery:
         """Kill a part under the load, start it again, wait until both are served, and compare."""
@@ -212,6 +212,7 @@ class Campaign:
         with running(loads):
             time.sleep(random.Random(seed).uniform(0.2, 2.0))
             killed = self.parts[part]
+            time.sleep(max(0.0, self._served.get(part, 0.0) + killed.lives - time.monotonic()))
             self._store.sweep_objects()  # must not take anything that counts
             killed.kill()
             began = time.monotonic()
@@ -222,6 +223,7 @@ class Campaign:
             asking = threading.Thread(target=lambda: worked.append(_works_at(killed) - began))
             asking.start()
             first, served = (_served_at(loads, before, times, began + GIVEN_UP, part) - began for times in (1, SERVED))
+            self._served[part] = time.monotonic()
             asking.join()
             recovery = Recovery(answered, min(worked[0], first), first, served, os.getloadavg()[0])
             self.tally.recoveries.setdefault(part, []).append(recovery)
