@@ -23,10 +23,6 @@ def refused(*words: object, **settings: object) -> str:
     return done.stderr
 
 
-def test_it_does_not_start_on_the_data_of_another(server: Server) -> None:
-    assert "Error: " in refused("--port", 0, data_dir=server.data_dir)
-
-
 def test_it_does_not_start_on_a_port_in_use(server: Server, tmp_path: Path) -> None:
     said = refused("--port", server.port, "--data-dir", tmp_path)
     assert f"Error: Cannot listen on port {server.port} of 127.0.0.1" in said
