@@ -96,6 +96,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "pictures"
 
 
+@pytest.mark.thorough
 def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
     shutil.copytree(pictures, tmp_path / "pictures")
     (program,) = PYTHON.findall((ROOT / "README.md").read_text())
