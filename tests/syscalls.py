@@ -71,6 +71,7 @@ def strace_arguments(trace_file: Path, *extra: str) -> list[str]:
     return [
         strace() or "strace",
         "-f",
+        "--seccomp-bpf",  # what is not traced runs at its own speed
         "-y",
         "-s",
         "96",

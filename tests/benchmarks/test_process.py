@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.process import service
 from core.evaluation.samples import fill_map, jpeg, sample_frame
 from core.method.catalogue import EncoderCatalogue
 
 
+@pytest.mark.thorough
 def test_a_filled_map_is_served(tmp_path: Path) -> None:
     encoder = EncoderCatalogue().get("m-region-vlad")
     fill_map(tmp_path, "full", encoder, 5)

@@ -9,10 +9,16 @@ import pytest
 
 from benchmarks import report
 from benchmarks.thesis.regions import main
-from core.method.catalogue import EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 
 
-@pytest.mark.parametrize("encoder", [summary.name for summary in EncoderCatalogue().describe()])
+@pytest.mark.parametrize(
+    "encoder",
+    [
+        pytest.param(summary.name, marks=() if summary.name == DEFAULT_ENCODER else pytest.mark.thorough)
+        for summary in EncoderCatalogue().describe()
+    ],
+)
 def test_both_passes_are_measured(encoder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     main(encoder=encoder, step=None, rounds=3)

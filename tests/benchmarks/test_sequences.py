@@ -12,6 +12,7 @@ DATA = ROOT.parent / "shared" / "datasets" / "eval"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the evaluation images are not at hand")
 
 
+@pytest.mark.thorough
 @needs_data
 def test_a_stretch_of_railway_in_another_season() -> None:
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)

@@ -31,7 +31,14 @@ def test_what_the_user_has_set_stays(before: dict[str, str], after: dict[str, st
 
 
 @pytest.mark.parametrize(
-    "module", ["core.method.catalogue", "service.engine.queue", "benchmarks.encode", "service.commands"]
+    "module",
+    [
+        "service.engine.queue",
+        *(
+            pytest.param(module, marks=pytest.mark.thorough)
+            for module in ("core.method.catalogue", "benchmarks.encode", "service.commands")
+        ),
+    ],
 )
 def test_it_is_set_before_torch_is_imported(module: str) -> None:
     code = f"import os, sys, importlib.abc\n{WATCH}\nimport {module}\nassert os.environ['GOMP_SPINCOUNT'] == '{SPINS}'"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shutil
@@ -9,14 +10,18 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
 
+from service.commands import application
 from tests.service.command_forks import ForkedCommands
 from tests.service.server import ROOT, Server
 
 BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+SHOWN = re.compile(r"\bplacerec (.*)")
 WRITTEN_ADDRESS = "http://127.0.0.1:8000"
 """The address in the documents; the service under test listens on another port."""
 
@@ -37,8 +42,50 @@ OF_KEYS = ROOT / "docs" / "how-to" / "keys-and-tls.md"
 """After its commands every request needs a key."""
 
 
+LONG = (
+    "docs/how-to/align-traverses",
+    "docs/how-to/bring-your-own-network",
+    "docs/how-to/calibrate-a-map",
+    "docs/how-to/enrol-bags-and-videos",
+    "docs/how-to/evaluate",
+    "docs/how-to/look-after-maps",
+    "docs/how-to/tune-for-a-machine",
+    "docs/tutorials/from-bag-to-robot",
+    "docs/tutorials/session",
+    "docs/tutorials/traverse",
+)
+"""Pages that take from five to eighteen seconds of a processor, most of it to encode frames."""
+
+
 def name_of(page: Path) -> str:
     return page.relative_to(ROOT).with_suffix("").as_posix()
+
+
+CASES = [
+    pytest.param(page, id=name_of(page), marks=pytest.mark.thorough if name_of(page) in LONG else ())
+    for page in PAGES
+    if page != OF_KEYS
+]
+
+
+def test_long_pages_are_pages() -> None:
+    assert set(LONG) < {name_of(page) for page in PAGES}
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_what_the_commands_name_is_there(document: Path) -> None:
+    """Every ``placerec`` of a page is a command with these options, also where the page itself is not run."""
+    for line in SHOWN.findall(commands(document).replace("\\\n", " ")):
+        command: Any = typer.main.get_command(application)
+        for word in itertools.takewhile(lambda word: not word.startswith(("|", ">", "&", ";", "#")), line.split()):
+            if word.startswith("--"):
+                options = [
+                    option for parameter in command.params for option in parameter.opts + parameter.secondary_opts
+                ]
+                assert word.partition("=")[0] in [*options, "--help"], line
+            elif commands_below := getattr(command, "commands", None):
+                assert word in commands_below, line
+                command = commands_below[word]
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +96,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "pictures"
 
 
+@pytest.mark.thorough
 def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
     shutil.copytree(pictures, tmp_path / "pictures")
     (program,) = PYTHON.findall((ROOT / "README.md").read_text())
@@ -59,6 +107,7 @@ def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path, pictures
 OF_THE_CLIENT = ROOT / "docs" / "how-to" / "use-the-python-client.md"
 
 
+@pytest.mark.thorough
 def test_the_python_of_the_client_runs_as_it_is_written(shared: Server, tmp_path: Path, pictures: Path) -> None:
     shutil.copytree(pictures, tmp_path / "pictures")
     programs = PYTHON.findall(OF_THE_CLIENT.read_text())
@@ -101,7 +150,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     forked.close()
 
 
-@pytest.mark.parametrize("document", [page for page in PAGES if page != OF_KEYS], ids=name_of)
+@pytest.mark.parametrize("document", CASES)
 def test_the_commands_run_as_they_are_written(
     document: Path, shared: Server, tmp_path: Path, pictures: Path, environment: Path
 ) -> None:
@@ -112,6 +161,7 @@ def test_the_commands_run_as_they_are_written(
             shared.client.delete(f"/v1/maps/{item['id']}")
 
 
+@pytest.mark.thorough
 def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
     """With the ``placerec`` that is installed."""
     service = Server(tmp_path / "service").wait()

@@ -32,7 +32,9 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, st
 FEW = ("--max-examples", "2", "--generation-deterministic", "--no-shrink")
 
 
-@pytest.mark.parametrize(("phase", "operations"), [("examples", 35), ("fuzzing", 45)])
+@pytest.mark.parametrize(
+    ("phase", "operations"), [("examples", 35), pytest.param("fuzzing", 45, marks=pytest.mark.thorough)]
+)
 def test_every_operation_keeps_to_its_description(keyed: tuple[Server, str], phase: str, operations: int) -> None:
     server, key = keyed
     done = api.run(str(server.client.base_url), seed=1, phases=phase, more=FEW, key=key)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -57,6 +59,7 @@ def encoded(pixels: Pixels, extension: str = ".jpg", quality: int = 90) -> bytes
     return bytes(data)
 
 
+@cache
 def jpeg(seed: int, width: int = 320, height: int = 240) -> bytes:
     """A scene as a JPEG file."""
     return encoded(scene(seed, width, height))

@@ -85,6 +85,7 @@ def test_corridor(encoder: Encoder, corridor: list[Trials]) -> None:
     assert held.recall.value is not None and held.recall.value >= 0.5, held.recall
 
 
+@pytest.mark.thorough
 def test_lip6(encoder: Encoder, lip6: list[Trials]) -> None:
     exact, near = (measured(encoder, of, precision) for of, precision in zip(lip6, (0.9, 0.98), strict=True))
     assert_honest(exact)

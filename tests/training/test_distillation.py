@@ -45,6 +45,7 @@ def teacher_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_a_run_in_two_sittings_equals_one(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
     whole = small_run(photographs, teacher_weights, tmp_path / "one", crops=48)
     small_run(photographs, teacher_weights, tmp_path / "two", crops=48, stop_after=3)

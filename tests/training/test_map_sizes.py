@@ -68,6 +68,7 @@ def test_trials_are_of_known_places_and_of_strangers(size: int) -> None:
     assert ((trials.imagined > 0) & (trials.imagined <= 1)).all()
 
 
+@pytest.mark.thorough
 def test_what_is_fitted_makes_probabilities_of_small_maps_honest() -> None:
     """On traverses of other seeds; in half of the environments strangers score as known places do in the others."""
     fitted = [(f"made {seed}", traverse(mean, seed)) for seed, mean in enumerate((0.1, 0.14, 0.18, 0.22))]

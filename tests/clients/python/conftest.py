@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from placerec_client import Client, Map
+from tests.fuzz.encoder import install_small_encoder
 from tests.service.server import Server
 
 _numbers = itertools.count()
@@ -16,7 +17,9 @@ _numbers = itertools.count()
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """The service with its default settings."""
-    running = Server(tmp_path_factory.mktemp("client")).wait()
+    folder = tmp_path_factory.mktemp("client")
+    install_small_encoder(folder / "models")
+    running = Server(folder).wait()
     yield running
     assert running.stop() == 0
 

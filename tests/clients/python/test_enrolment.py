@@ -6,12 +6,14 @@ import asyncio
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from uuid import uuid4
 
 import httpx
 import pytest
 
-from placerec_client import AsyncClient, ConnectionFailed, Enrolled, NewPlace, Retry, batches, problems
+from placerec_client import AsyncClient, Client, ConnectionFailed, Enrolled, NewPlace, Retry, batches, problems
 from tests.clients.python.test_retries import problem
+from tests.fuzz.encoder import SMALL
 from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -77,6 +79,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "LARGEST_BATCH", 4)
 
 
+@pytest.fixture
+def map_id(client: Client) -> str:
+    """The id of a new, empty map, whose encoder takes next to no time."""
+    return client.maps.create(f"line-{uuid4().hex}", encoder=SMALL).id
+
+
 def test_two_at_a_time_in_line(server: Server, map_id: str) -> None:
     way = Mischief({})
     told = enrol(server, map_id, 26, way)
@@ -122,7 +130,7 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, f
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("moment", [9, 20])
+@pytest.mark.parametrize("moment", [9, pytest.param(20, marks=pytest.mark.thorough)])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, moment: int) -> None:
     server = Server(tmp_path / "service").wait()
     server.create_map("walk")

@@ -10,6 +10,7 @@ import pytest
 
 from placerec_client import AsyncClient, AsyncMap, NewPlace, Retry
 from tests.clients.python.fault_proxy import FAULTS, FaultProxy
+from tests.fuzz.encoder import SMALL
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -97,7 +98,7 @@ class Campaign:
 
 def campaign(server: Server, map_id: str, operations: int, seed: int) -> FaultProxy:
     """Do so many operations through a bad network, and compare what the service then has with what it must have."""
-    server.create_map(map_id, keep="none")
+    server.create_map(map_id, keep="none", encoder=SMALL)
     for number in range(SCENES):
         server.enrol(map_id, f"base-{number}", jpeg(number, 64, 48), sequence="base")
     with FaultProxy(server.port, seed=seed) as proxy:

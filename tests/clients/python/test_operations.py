@@ -222,6 +222,7 @@ def jobs(client: Client, folder: Path) -> None:
     assert first.id in [job.id for job in client.jobs.list(map="tour", kind="verify")]
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(300)
 def test_every_call_is_there_asynchronously(guarded: tuple[str, str], tmp_path: Path) -> None:
     """The halves have the same names, so the same tour goes through both: each await is done for it."""

@@ -107,6 +107,7 @@ def scene(seed: int) -> Pixels:
     return canvas
 
 
+@pytest.mark.thorough
 def test_places_are_recognized_after_training() -> None:
     system = FabMap()
     assert isinstance(system, Trainable)

@@ -52,7 +52,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.mark.timeout(300)
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("prefix", ["", "/robots/placerec"])
+@pytest.mark.parametrize("prefix", [pytest.param("", marks=pytest.mark.thorough), "/robots/placerec"])
 def test_a_browser_shows_every_operation(published: Server, prefix: str, tmp_path: Path) -> None:
     described = published.client.get("/openapi.json").json()
     address = f"http://127.0.0.1:{published.port}{prefix}/docs"

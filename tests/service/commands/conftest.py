@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Protocol
 
 import pytest
+import typer.main
 from typer.testing import CliRunner, Result
 
 from service.commands import application
 from tests.service.scenes import encoded, scene
+
+COMMAND = typer.main.get_command(application)
+"""Made once; typer's runner would make it for every run, which takes longer than most of them."""
 
 
 class Placerec(Protocol):
@@ -27,6 +31,7 @@ def placerec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Placer
         monkeypatch.delenv(name)
     monkeypatch.setenv("PLACEREC_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("typer.testing._get_command", lambda _: COMMAND)
     runner = CliRunner()
 
     def run(*words: object, status: int = 0, stdin: str | None = None) -> Result:

@@ -28,7 +28,7 @@ def test_the_figures(placerec: Placerec, tmp_path: Path) -> None:
 
 def test_a_frame_of_ones_own(placerec: Placerec, tmp_path: Path) -> None:
     (tmp_path / "frame.png").write_bytes(encoded(scene(0), ".png"))
-    placerec("bench", "--image", tmp_path / "frame.png", "--rounds", 3, "--places", 2)
+    placerec("bench", "--image", tmp_path / "frame.png", "--rounds", 3, "--places", 2, "--encoder", "region-vlad")
     (tmp_path / "frame.png").write_bytes(b"nothing")
     refused = placerec("bench", "--image", tmp_path / "frame.png", "--rounds", 3, status=1)
     assert refused.stderr.count("Error: ") == 1

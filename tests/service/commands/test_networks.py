@@ -35,6 +35,10 @@ DIMENSIONS = {
 }
 
 
+KINDS = ("cosplace", "salad", "anyloc")
+"""One of one descriptor, one of several parts, and one whose words are learned here."""
+
+
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pictures")
@@ -49,7 +53,10 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     use(monkeypatch, onnx_import.__name__)
 
 
-@pytest.mark.parametrize("preset", PUBLISHED)
+@pytest.mark.parametrize(
+    "preset",
+    [pytest.param(name, marks=() if name in KINDS else pytest.mark.thorough) for name in PUBLISHED],
+)
 def test_from_a_checkpoint_to_the_verdict(
     preset: str, placerec: Placerec, server: Server, pictures: Path, tmp_path: Path
 ) -> None:

@@ -53,7 +53,13 @@ def stored(data: Path, name: str) -> tuple[list[dict[str, Any]], Any]:
         atlas.close()
 
 
-@pytest.mark.parametrize("writer", ["sqlite", "mcap-zstd", "mcap-of-rosbags", "ros1-lz4"])
+@pytest.mark.parametrize(
+    "writer",
+    [
+        "sqlite",
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("mcap-of-rosbags", "ros1-lz4")),
+    ],
+)
 def test_a_bag_gives_the_map_that_its_frames_in_a_folder_give(writer: str, placerec: Placerec, tmp_path: Path) -> None:
     bag = WRITERS[writer](tmp_path, walk(5))
     done = placerec("enroll", bag, "--map", "of-bag", "--create", "--pose-topic", ODOMETRY, "--sequence", "walk")

@@ -123,22 +123,38 @@ Visit = Callable[..., Operator]
 Theme = Literal["light", "dark"]
 
 
+@pytest.fixture(scope="package")
+def desk(browser: Browser) -> Iterator[BrowserContext]:
+    """Where one page a test is opened: in a context of its own it would load and compile the whole console again."""
+    made = new_context(browser)
+    made.new_page()  # as long as there is one, what others have compiled is kept
+    yield made
+    made.close()
+
+
+def new_context(browser: Browser) -> BrowserContext:
+    context = browser.new_context(permissions=["clipboard-write", "camera"])
+    context.set_default_timeout(15_000)
+    return context
+
+
 @pytest.fixture
-def visit(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Visit]:
-    """Makes operators: ``visit("admin")``; at the end no page may have complained."""
+def visit(browser: Browser, desk: BrowserContext, keyed: Server, keys: dict[str, str]) -> Iterator[Visit]:
+    """Makes operators, who know nothing of each other: ``visit("admin")``; at the end no page may have complained."""
     contexts: list[BrowserContext] = []
     made: list[Operator] = []
 
     def open_page(
         role: str | None = "admin", *, server: Server = keyed, size: str = "laptop", theme: Theme = "light"
     ) -> Operator:
-        width, height = SIZES[size]
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, color_scheme=theme, permissions=["clipboard-write", "camera"]
-        )
-        context.set_default_timeout(15_000)
-        contexts.append(context)
+        context = desk
+        if made:  # somebody else, at another machine
+            context = new_context(browser)
+            contexts.append(context)
         page = context.new_page()
+        width, height = SIZES[size]
+        page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=theme)
         if role is not None:
             page.add_init_script(given_key(keys[role]))
         operator = Operator(page, f"http://127.0.0.1:{server.port}")
@@ -147,6 +163,11 @@ def visit(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Vis
         return operator
 
     yield open_page
+    for operator in made[:1]:
+        desk.set_offline(False)
+        forget = {"origin": operator.root, "storageTypes": "local_storage"}
+        desk.new_cdp_session(operator.page).send("Storage.clearDataForOrigin", forget)
+        operator.page.close()
     for context in contexts:
         context.close()
     assert [one for operator in made for one in operator.unforeseen()] == []

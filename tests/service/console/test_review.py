@@ -114,6 +114,7 @@ def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     assert left == 2
 
 
+@pytest.mark.thorough
 def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> None:
     # A map comes from elsewhere: imported in the console.
     exported = keyed.client.get(f"/v1/maps/{world.LAB}/export").content

@@ -55,6 +55,7 @@ def test_the_main_job(tmp_path: Path) -> None:
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_the_corridor(tmp_path: Path) -> None:
     """The same with every third frame of a corridor and every sixth of its second traverse."""
     corridor = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
@@ -174,6 +175,7 @@ def check_full_disk(server: Server, verification: bool = True) -> dict[str, dict
     return kept
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path: Path) -> None:
     server = Server(tmp_path, wrapper=LIMITED).wait()
     # With keypoints, SQLite's log would be the first file at the limit; SQLite takes that for a broken disk.

@@ -354,7 +354,7 @@ def test_sessions_expire_and_are_bounded(small: Server) -> None:
     assert (answer["frames"], answer["single"]["reason"]) == (1, "no-regions")
 
 
-@pytest.mark.parametrize("end", ["kill", "stop"])
+@pytest.mark.parametrize("end", ["kill", pytest.param("stop", marks=pytest.mark.thorough)])
 def test_a_session_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
     install_coarse_encoder(tmp_path / "models")
     settings = {"encoder": COARSE}

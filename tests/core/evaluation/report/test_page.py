@@ -163,6 +163,7 @@ def test_without_a_wrong_match_there_is_nothing_to_reject_and_without_negatives_
     assert not (tmp_path / "report" / "roc.png").exists()
 
 
+@pytest.mark.thorough
 def test_without_a_right_match_there_is_no_curve(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     backwards = make_run("backwards", -np.eye(8, dtype=np.float32), comparison.kept, comparison.truth)
@@ -172,6 +173,7 @@ def test_without_a_right_match_there_is_no_curve(tmp_path: Path) -> None:
     assert (tmp_path / "report" / "recall.png").exists()
 
 
+@pytest.mark.thorough
 def test_every_query_is_a_negative(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     nothing = [np.array([], np.int64)] * 8
@@ -182,12 +184,14 @@ def test_every_query_is_a_negative(tmp_path: Path) -> None:
     assert "True reference" in page.named("article")[0].text
 
 
+@pytest.mark.thorough
 def test_one_query_and_one_reference(tmp_path: Path) -> None:
     html, page = page_of(tmp_path / "report", make_comparison(tmp_path, systems=1, count=1))
     assert "1 query" in html
     assert len(page.named("article")) == 1
 
 
+@pytest.mark.thorough
 def test_more_systems_than_hues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Two plots of each system, which take most of the time and know of no other system.
     monkeypatch.setattr("core.evaluation.report.closeup.plot_fates", lambda *_: [])
@@ -200,6 +204,7 @@ def test_more_systems_than_hues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert len(list((tmp_path / "report").glob("similarity-*.png"))) == 10
 
 
+@pytest.mark.thorough
 def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, kept=range(6))
     second = comparison.runs[1]
@@ -218,6 +223,7 @@ def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
     assert ["regions of interest" in section.text for section in sections] == [False, True]
 
 
+@pytest.mark.thorough
 def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     comparison.queries[3].unlink()
@@ -226,6 +232,7 @@ def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
     assert sum(article.text.count("no image") for article in page.named("article")) >= len(page.named("article")) * 2
 
 
+@pytest.mark.thorough
 def test_same_comparison_same_bytes(tmp_path: Path, written: Written) -> None:
     write_report(tmp_path, written.comparison)
     first, second = (

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from core.evaluation.report.table import columns, stages
 from core.frames.traverses import tolerance_truth
@@ -26,6 +27,7 @@ def test_stages_of_all_systems_matching_last(tmp_path: Path) -> None:
     assert stages(runs) == ["forward", "regions", "gradients", "match"]
 
 
+@pytest.mark.thorough
 def test_best_figure_of_a_column_stands_out(tmp_path: Path) -> None:
     kept, truth = np.arange(3), tolerance_truth(3, 3, 0)
     good = make_run("good", np.eye(3, dtype=np.float32), kept, truth, nbytes=9000)
@@ -39,6 +41,7 @@ def test_best_figure_of_a_column_stands_out(tmp_path: Path) -> None:
     assert not written_page(tmp_path / "one", replace(comparison, runs=[good])).named("td", "best")
 
 
+@pytest.mark.thorough
 def test_a_missing_figure_cannot_be_mistaken_for_a_number(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=2)
     first, second = comparison.runs

@@ -225,6 +225,7 @@ def test_one_class_has_a_word_in_the_table(placerec: Placerec, traverses: tuple[
     assert (figures["auc_pr"], figures["one_class"]) == (0.0, "none right")  # a number, for those that read one
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason="the corridor traverses (../shared/datasets) are not here")
 @pytest.mark.timeout(600)
 def test_the_default_encoder_on_the_corridor(placerec: Placerec, tmp_path: Path) -> None:
