@@ -3,9 +3,9 @@
     scripts/soak ray --kills 20 --seed 7 [--minutes 15]
 
 A head that computes nothing and two nodes; robots ask a front without a pause.  What is killed, and when, is drawn at
-random: a process that encodes, a node that has such processes, or the head with all nodes, which a machine would take
-with it.  A front loses no frame with the first two, and refuses some with the last; each answer has the same bits as
-without Ray; and all are served again within ``MOST_SECONDS`` of the return of what was killed.
+random: a process that encodes, or a node that has such processes.  No frame is lost; each answer has the same bits as
+without Ray; and all are served again within ``MOST_SECONDS`` of the return of what was killed.  The front is on the
+machine of the head, for Ray may end a process whose own machine leaves the cluster.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tests.service.ray_serve.nodes import Node, Nodes
 from tests.service.ray_serve.robots import Robots
 from tests.service.ray_serve.test_ray_serve import pids, wait_for_replicas
 
-PARTS = ("encoder", "node", "head")
+PARTS = ("encoder", "node")
 MOST_SECONDS = 30.0
 """From the return of what was killed until every robot is answered again."""
 
@@ -46,9 +46,11 @@ class Campaign:
 
     def __init__(self, nodes: Nodes, queue: EncoderQueue, chance: random.Random) -> None:
         self._nodes, self._queue, self._chance = nodes, queue, chance
+        while "no encoder runs" not in queue.encoders.state:  # it has joined, by the only machine that there is
+            time.sleep(0.1)
         self._workers = [nodes.add(1), nodes.add(1)]
         self.seconds: dict[str, list[float]] = {}
-        self.answered = self.refused = 0
+        self.answered = 0
 
     async def kill(self, part: str) -> None:
         """Kill a part under the load, start it again, and wait until all are served."""
@@ -56,18 +58,14 @@ class Campaign:
             await asyncio.sleep(self._chance.uniform(0.2, 2.0))
             if part == "encoder":
                 os.kill(self._chance.choice(sorted(await asyncio.to_thread(pids, 2))), signal.SIGKILL)
-            elif part == "node":
+            else:
                 self._workers.pop(self._chance.randrange(2)).kill()
                 self._workers.append(await self._added())
-            else:
-                self._nodes.kill()
-                await asyncio.sleep(self._chance.uniform(0.0, 30.0))
-                await asyncio.to_thread(self._nodes.start_head)
-                self._workers = [await self._added(), await self._added()]
             self.seconds.setdefault(part, []).append(await robots.all_served())
-        assert part == "head" or not robots.refused, f"{robots.refused} refused"
-        self.answered, self.refused = self.answered + robots.answered, self.refused + robots.refused
-        await asyncio.to_thread(wait_for_replicas, self._queue, 2)
+        assert not robots.refused, f"{robots.refused} refused"
+        self.answered += robots.answered
+        while len(await asyncio.to_thread(pids, 2)) < 2:  # else the next kill could leave none, and frames be refused
+            await asyncio.sleep(0.2)
 
     async def _added(self) -> Node:
         return await asyncio.to_thread(self._nodes.add, 1)
@@ -78,7 +76,7 @@ class Campaign:
             for part, these in self.seconds.items()
         ]
         kills = sum(map(len, self.seconds.values()))
-        return f"{kills} kills, {self.answered} answered, {self.refused} refused; {'; '.join(times)}"
+        return f"{kills} kills, {self.answered} answered, none refused; {'; '.join(times)}"
 
 
 async def run(nodes: Nodes, chosen: argparse.Namespace, seed: str) -> int:

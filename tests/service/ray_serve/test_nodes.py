@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from benchmarks.ray_serve.waiting import WaitingReplica, prepare
-from core.frames.images import Limits
+from core.frames.images import Limits, decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from service.engine.queue import EncoderQueue
-from service.errors.faults import NotReady
 from service.ray_serve import encoders_for
 from service.ray_serve.cluster import Cluster
 from service.ray_serve.encoders import RayEncoders
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from tests.service.ray_serve.front import Front
 from tests.service.ray_serve.nodes import Node, Nodes
 from tests.service.ray_serve.robots import Robots
 from tests.service.ray_serve.test_ray_serve import BATCH, IDENTITY, deadline, pids, value, wait_for_replicas
@@ -109,19 +111,26 @@ async def test_encoders_grow_with_the_queue_and_shrink_without(queue: EncoderQue
     await asyncio.to_thread(wait_for_replicas, queue, 2)
 
 
-async def test_a_front_joins_again_when_its_cluster_returns(
-    queue: EncoderQueue, nodes: tuple[Nodes, list[Node]]
-) -> None:
-    cluster, _ = nodes
-    await asyncio.to_thread(cluster.kill)
-    with pytest.raises(NotReady):
-        while True:
-            await queue.encode(IDENTITY, jpeg(1), deadline())
-    while queue.encoders.state == "ok":
-        await asyncio.sleep(0.2)
-    await asyncio.to_thread(cluster.start_head)
-    await asyncio.to_thread(cluster.add, 2)
-    await asyncio.to_thread(wait_for_replicas, queue, 2)
-    async with Robots(queue) as robots:
-        await robots.all_served()
-    assert not robots.refused
+async def test_a_front_serves_again_when_its_cluster_returns(tmp_path: Path) -> None:
+    wanted = EncoderCatalogue(precision="float32").get(DEFAULT_ENCODER).encode(decode(jpeg(1))).descriptor
+    expected = hashlib.sha256(wanted.tobytes()).hexdigest()
+
+    def served(front: Front, within: float) -> None:
+        until = time.monotonic() + within
+        while not (found := front.ask(1)):
+            assert time.monotonic() < until, "no frame is encoded"
+            time.sleep(0.5)
+        assert found == expected
+
+    def run() -> None:
+        with Nodes() as cluster, Front(cluster.address, tmp_path) as front:
+            cluster.add(1)
+            served(front, 180)
+            cluster.kill()
+            while front.ask(1):
+                pass
+            cluster.start_head()
+            cluster.add(1)
+            served(front, 180)
+
+    await asyncio.to_thread(run)
