@@ -8,7 +8,7 @@ chosen by it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,9 +21,7 @@ from safetensors.torch import load_file
 
 from core.frames.preprocessing import Pixels
 from core.judgement.curves import auc_pr
-from core.method.agreement import Cells, local_descriptors
 from core.method.encoder import Encoder, EncoderDefinition
-from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.presets import PRESETS
 from core.method.projection import Projection
@@ -53,6 +51,10 @@ WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
 """Directions fitted of each layer; every configuration takes the first so many."""
 THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
 COARSE = {**THESIS, "steps": DEFAULT.steps}
+
+
+LIGHT = (0.45, 0.45, 0.1)
+"""Weights of the layers with less for conv4."""
 
 
 def _stage(**change: Any) -> dict[str, Any]:
@@ -91,48 +93,21 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: 60 candidates": _stage(candidates=60),
     "second stage: share 0.5": _stage(share=0.5),
     "second stage: share 0.85": _stage(share=0.85),
-}
-STANDARDIZED = "second stage: cells standardized"
-STANDARDIZED_CHANGES: dict[str, dict[str, Any]] = {
-    STANDARDIZED: {},
-    f"{STANDARDIZED}, weights 0.45, 0.45, 0.1": _stage(weights=(0.45, 0.45, 0.1)),
-    f"{STANDARDIZED}, these weights, reach 3, 5, 60 candidates": _stage(
-        weights=(0.45, 0.45, 0.1), reach=(3, 5), candidates=60
+    "second stage: cells standardized": _stage(centred=0.75),
+    "second stage: cells standardized, weights 0.45, 0.45, 0.1": _stage(centred=0.75, weights=LIGHT),
+    "second stage: cells standardized, these weights, reach 3, 5, 60 candidates": _stage(
+        centred=0.75, weights=LIGHT, reach=(3, 5), candidates=60
+    ),
+    "second stage: cells standardized, these weights, reach 3, 5, 15 candidates of 60 screened, share 0.8": _stage(
+        centred=0.75, weights=LIGHT, reach=(3, 5), candidates=15, screened=60, share=0.8
     ),
 }
-"""Changes of an encoder that is :class:`StandardizedEncoder`."""
-CENTERED, FLOOR = 0.75, 0.5
-"""The share of the mean that is taken from each value, and of the mean deviation that is added to each deviation."""
 REFINED = "projections refined by contrastive learning"
 REFINEMENT_CROPS, REFINEMENT_STEPS = 800, 400
 COLUMNS = (
     "lip6 recall@1", "lip6 AUC-PR", "lip6 as stated, recall@1", "webcams recall@1", "night recall@1",
     "corridor recall@1", "corridor AUC-PR",
 )  # fmt: skip
-
-
-class StandardizedEncoder(Encoder):
-    """Compares cells after what all cells of a frame have in common, as its light and weather, is taken from them."""
-
-    def local(self, activations: Sequence[Array], products: Mapping[str, Array]) -> Cells:
-        stage = self.definition.agreement
-        assert stage is not None
-        cells = self.extractor.projected_cells(activations, products, stage.layers, stage.values)
-        return local_descriptors([standardized(layer) for layer in cells], stage)
-
-
-def standardized(cells: Array) -> Array:
-    """Each value less a share of its mean over the cells of a frame, by its deviation over them, to unit length.
-
-    Args:
-        cells: float32 [C, values], rows of unit length or zero; rows of zeros take no part and stay.
-    """
-    seen = cells.any(axis=1)
-    made = np.zeros_like(cells)
-    if seen.any():
-        mean, deviation = cells[seen].mean(axis=0), cells[seen].std(axis=0)
-        made[seen] = (cells[seen] - CENTERED * mean) / (deviation + FLOOR * deviation.mean() + 1e-12)
-    return unit_length(made)
 
 
 class Ablation:
@@ -182,12 +157,12 @@ class Ablation:
             further = self.projections[layer].matrix[:, STAGE.values :]
             self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
 
-    def figures(self, definition: EncoderDefinition, seed: int, kind: type[Encoder] = Encoder) -> list[float]:
+    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
         """One number for each of COLUMNS."""
         extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-        encoder = kind("ablation", extractor, definition, vocabulary, UNCALIBRATED)
+        encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
         references = self.describe(encoder, "lip6 references")
         far = references.part(slice(0, DISTRACTORS))
         lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)
@@ -246,12 +221,11 @@ def main(
     torch.manual_seed(0)
     ablation = Ablation(weights, datasets, images, size)
     rows: dict[str, Sequence[Sequence[float]]] = {}
-    for name, change in {**CHANGES, **STANDARDIZED_CHANGES}.items():
+    for name, change in CHANGES.items():
         if only and name not in only:
             continue
         definition = EncoderDefinition.model_validate({**DEFAULT.model_dump(), **change})
-        kind = StandardizedEncoder if name in STANDARDIZED_CHANGES else Encoder
-        rows[name] = [ablation.figures(definition, seed, kind) for seed in range(seeds)]
+        rows[name] = [ablation.figures(definition, seed) for seed in range(seeds)]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
         typer.echo(table({name: rows[name]}).splitlines()[-1])

@@ -15,7 +15,7 @@ in.  As a program, it fits them again:
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -37,7 +37,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
 from core.places import NO_POSE, Neighborhood, Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import SecondStage, examine
 from core.threads import cores, each, share_cores
 from training.photographs import find_photographs, read
 from training.validation import Encodings, TraverseTask, describe, load_traverses, with_corrected_truth
@@ -76,6 +76,10 @@ STANDING = 1000
 """Two frames of camvid with more evidence than this were taken by a car that stood still, and count as one."""
 
 
+def _nothing() -> Array:
+    return np.zeros((0, 0), np.float32)
+
+
 class Judged(NamedTuple):
     """The judgement of a query, its best match, and how many candidates were verified for it."""
 
@@ -93,6 +97,8 @@ class Traverse:
     truth: bool [Q, R].
     candidates: how many the encoder's second stage examines.
     pairs: of the keypoints; None: nothing can be verified.
+    promised: float32 [Q, R], what the second stage promises to add to the first's scores.
+    screened: among how many places the second stage looks for those that it examines.
     """
 
     first: Array
@@ -101,6 +107,8 @@ class Traverse:
     truth: NDArray[np.bool_]
     candidates: int
     pairs: Pairs | None = None
+    promised: Array = field(default_factory=_nothing)
+    screened: int = 0
 
     def strangers(self, kept: Positions) -> Positions:
         """The queries whose true references are all more than APART frames from the references ``kept``, int64."""
@@ -128,7 +136,11 @@ class Traverse:
         def gains(at: Positions) -> Array:
             return np.asarray(self.both[query, rows[at]] - self.first[query, rows[at]])
 
-        seen = examine(self.first[query, rows], places, NEIGHBORHOOD, self.candidates, gains)
+        def promise(at: Positions) -> Array:
+            return np.asarray(self.promised[query, rows[at]])
+
+        stage = SecondStage(self.candidates, gains, self.screened, promise)
+        seen = examine(self.first[query, rows], places, NEIGHBORHOOD, *stage)
         ranked, places = rows[seen.order], places.take(seen.order)
 
         def of_three_stages(candidates: int) -> tuple[Judgement, int]:
@@ -168,7 +180,10 @@ def scored(
 ) -> Traverse:
     """A traverse with the scores of all its queries and references."""
     first, both = all_scores(encoder, queries, references)
-    return Traverse(first, both, all_scores(encoder, references, references)[1], truth, encoder.candidates, pairs)
+    among, promised = all_scores(encoder, references, references)[1], _nothing()
+    if encoder.screened > encoder.candidates:
+        promised = np.stack([encoder.promise(cells, references.local) for cells in queries.local])
+    return Traverse(first, both, among, truth, encoder.candidates, pairs, promised, encoder.screened)
 
 
 def keypoints_of_frames(frames: Sequence[Pixels]) -> list[Keypoints]:

@@ -16,7 +16,7 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
+from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors, promise
 from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
 from core.method.regions import Regions
@@ -146,6 +146,19 @@ class Encoder:
         """How many of the best matches the second stage examines; 0 without one."""
         stage = self.definition.agreement
         return 0 if stage is None else stage.candidates
+
+    @property
+    def screened(self) -> int:
+        """Among how many of the best matches the second stage looks for those that it examines; 0 without one."""
+        stage = self.definition.agreement
+        return 0 if stage is None else stage.screened or stage.candidates
+
+    def promise(self, query: Cells, candidates: Cells) -> Array:
+        """About what the second stage would add to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
+        stage = self.definition.agreement
+        if stage is None:
+            return np.zeros(len(candidates), np.float32)
+        return promise(query, candidates, self.grid[1], stage)
 
     def agreement(self, query: Cells, candidates: Cells) -> Array:
         """What the second stage adds to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
@@ -286,6 +299,8 @@ class Encoder:
         made = self.encode(canary_frame())
         self._hold_against(made, *self._golden, "its golden values")
         self.agreement(made.local, made.local[np.newaxis])  # compile the second stage now, not in the first query
+        if self.screened > self.candidates:
+            self.promise(made.local, made.local[np.newaxis])
 
 
 def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:

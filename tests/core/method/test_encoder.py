@@ -312,6 +312,25 @@ def test_packaged_encoders_reproduce_their_golden_values(name: str) -> None:
         assert encoding.descriptor[index] == pytest.approx(value, abs=0.01)
 
 
+def test_a_definition_without_later_fields_keeps_its_identity_and_a_changed_second_stage_the_descriptors() -> None:
+    """The identity is that of the default encoder of 0.1.0, which had neither standardized cells nor screening."""
+    packaged = EncoderCatalogue().get("m-region-vlad")
+    assert packaged.identity == "m-region-vlad@9584cde69ac83864efd2ddb560b29b7cf88ea4e9e0c148d190beb8e55a8cde9e"
+    assert packaged.screened == packaged.candidates == 30
+    assert packaged.definition.agreement is not None
+    vocabulary = Vocabulary(packaged.centers, packaged.extractor.origin)
+    frame = packaged.encode(canary_frame())
+    for change, cells_change in ({"centred": 0.75}, True), ({"screened": 60}, False):
+        stage = packaged.definition.agreement.model_copy(update=change)
+        definition = packaged.definition.model_copy(update={"agreement": stage})
+        other = Encoder("m-region-vlad", packaged.extractor, definition, vocabulary, CALIBRATION)
+        assert other.identity != packaged.identity
+        made = other.encode(canary_frame())
+        np.testing.assert_array_equal(made.descriptor, frame.descriptor)
+        assert made.local.shape == frame.local.shape
+        assert np.array_equal(made.local, frame.local) is not cells_change
+
+
 def test_the_golden_check_leaves_nothing_to_compile_for_the_first_query(monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[tuple[int, ...]] = []
 
