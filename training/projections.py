@@ -5,6 +5,9 @@ encoders use these.  :func:`refine` goes on from there by InfoNCE (van den Oord 
 cell under two conditions attract, all others repel.  A cell's negatives are all cells of all crops of the batch but
 its own neighbours; the backbone stays as it is.  The packaged encoders do not use it: its own loss fell while
 recognition did not gain (see the model card).
+
+:func:`fit_cell_projections` is for the second stage alone.  Its pairs are displaced views, and in place of the variance
+of all cells it asks for the difference between a cell and the one that a frame of another place matches it with.
 """
 
 from __future__ import annotations
@@ -21,10 +24,11 @@ from rich.progress import track
 from torch import Tensor, nn
 
 from core.frames.preprocessing import prepare
-from core.method.agreement import AgreementDefinition
+from core.method.agreement import AgreementDefinition, Cells, correspondences, local_descriptors
 from core.method.equations import unit_length
-from core.method.projection import Projection, fit_projection
+from core.method.projection import Projection, discriminant, fit_projection
 from core.networks.network import ShallowNetwork
+from training.displaced_views import COLUMNS, DisplacedViews, displaced_views
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs
 
@@ -40,6 +44,16 @@ RATE = 2e-4
 """Learning rate of the refinement, relative to the norm of each projection."""
 DECAY = 0.997
 BATCH = 12  # crops
+
+VIEWS = 1500
+"""Pairs of displaced views."""
+ANSWERS_PER_PAIR, WRONG_PER_FRAME = 40, 30
+CAMERA_WEIGHT = 2.0
+"""Of the differences between day and night, where those of the other pairs count once."""
+CONFUSABLE, APART = 3, 20
+"""How many other frames a view is matched with; photographs this close in order of names may show one place."""
+SHRINKAGE = 2.0
+"""As in ``core.method.projection``; what single matches differ by needs more of it."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +124,94 @@ def _maps(network: ShallowNetwork, frames: Sequence[NDArray[np.uint8]]) -> dict[
         name: np.ascontiguousarray(output.flatten(2).permute(0, 2, 1).numpy())
         for name, output in zip(network.outputs, outputs, strict=True)
     }
+
+
+Matches = NDArray[np.int64]
+"""Cells that are compared: int64 [n, 4], frame and cell of a second view, and frame and cell of a first one."""
+
+
+def fit_cell_projections(
+    network: ShallowNetwork,
+    stage: AgreementDefinition,
+    photographs: Path,
+    start: Mapping[str, Projection],
+    pairs: int = VIEWS,
+    seed: int = 0,
+) -> dict[str, Projection]:
+    """A projection for each layer of a second stage.
+
+    It has the directions in which the right matches of a cell differ least, relative to the wrong ones.  Right is what
+    shows the same spot; wrong is the mutual match in a frame that looks alike and shows another place.
+
+    Args:
+        network: returns at least these layers.
+        photographs: folder of the training photographs.
+        start: projections of these layers, by which wrong matches are found.
+    """
+    views: list[DisplacedViews] = []
+    sides: tuple[dict[str, list[Array]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
+    cells: tuple[list[Cells], ...] = ([], [])
+    for pair in track(displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET), "displaced views", total=pairs):
+        views.append(pair)
+        maps = _maps(network, (pair.first, pair.second))
+        for number, (side, compared) in enumerate(zip(sides, cells, strict=True)):
+            for layer in stage.layers:
+                side[layer].append(unit_length(maps[layer][number]).astype(np.float16))
+            projected = [start[layer](maps[layer][number], stage.values) for layer in stage.layers]
+            compared.append(local_descriptors(projected, stage))
+    generator = np.random.default_rng(seed)
+    right = _right_matches(views, generator)
+    by_camera = np.array([pair.camera for pair in views])[right[:, 0]]
+    wrong = _wrong_matches(views, cells[1], cells[0], stage, generator)
+    made = {}
+    for layer in stage.layers:
+        first, second = (np.stack(side[layer]) for side in sides)
+        apart = [_differences(first, second, right[chosen]) for chosen in (~by_camera, by_camera) if chosen.any()]
+        within = np.average(apart, axis=0, weights=[1, CAMERA_WEIGHT][: len(apart)])
+        matrix = discriminant(within, _differences(first, second, wrong), stage.values, SHRINKAGE)
+        mean = (first.mean(axis=(0, 1), dtype=np.float64) + second.mean(axis=(0, 1), dtype=np.float64)) / 2
+        made[layer] = Projection(mean.astype(np.float32), matrix)
+    return made
+
+
+def _right_matches(views: Sequence[DisplacedViews], generator: np.random.Generator) -> Matches:
+    """Some cells of each second view and those of its first view that they show."""
+    found = []
+    for number, pair in enumerate(views):
+        drawn = generator.permutation(pair.answers)[:ANSWERS_PER_PAIR]
+        found += [(number, there, number, here) for here, there in drawn.tolist()]
+    return np.array(found, np.int64)
+
+
+def _wrong_matches(
+    views: Sequence[DisplacedViews],
+    queries: Sequence[Cells],
+    references: Sequence[Cells],
+    stage: AgreementDefinition,
+    generator: np.random.Generator,
+) -> Matches:
+    """Some mutual matches of each second view in first views of other places, those most alike in their mean cell."""
+    asked, shown = (unit_length(np.stack([one.mean(axis=0) for one in side])) for side in (queries, references))
+    common = shown.mean(axis=0)
+    likeness = unit_length(asked - common) @ unit_length(shown - common).T
+    photograph = np.array([pair.photograph for pair in views])
+    likeness[np.abs(photograph[:, np.newaxis] - photograph) < APART] = -np.inf
+    found = []
+    for number, row in enumerate(likeness):
+        for other in np.argsort(-row)[:CONFUSABLE].tolist():
+            if row[other] > -np.inf:
+                matched = correspondences(queries[number], references[other], COLUMNS, stage.reach)
+                pairs = generator.permutation(np.stack([matched.query, matched.reference], axis=1))[:WRONG_PER_FRAME]
+                found += [(number, here, other, there) for here, there in pairs.tolist()]
+    return np.array(found, np.int64)
+
+
+def _differences(first: NDArray[np.float16], second: NDArray[np.float16], matches: Matches) -> NDArray[np.float64]:
+    """Half the mean outer product of what matched cells differ by, float64 [K, K], of features float16 [n, C, K]."""
+    here, there = second[matches[:, 0], matches[:, 1]], first[matches[:, 2], matches[:, 3]]
+    seen = here.any(axis=1) & there.any(axis=1)
+    difference = here[seen].astype(np.float32) - there[seen].astype(np.float32)
+    return (difference.T @ difference).astype(np.float64) / max(1, 2 * len(difference))
 
 
 class CellDescriptor(nn.Module):
