@@ -29,7 +29,7 @@ from core.method.vocabulary import pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork
 from training.default_calibration import UNCALIBRATED
 from training.packaging import network_of, vocabulary_pictures
-from training.projections import fit_projections, paired_cells, refine
+from training.projections import fit_cell_projections, fit_projections, paired_cells, refine
 from training.validation import (
     DISTRACTORS,
     Encodings,
@@ -51,10 +51,10 @@ WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
 """Directions fitted of each layer; every configuration takes the first so many."""
 THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
 COARSE = {**THESIS, "steps": DEFAULT.steps}
-
-
 LIGHT = (0.45, 0.45, 0.1)
 """Weights of the layers with less for conv4."""
+PLAIN: dict[str, Any] = {"centred": None, "screened": None, "taught": None, "share": 0.75}
+"""The second stage of 0.1.0, in what differs from the packaged one."""
 
 
 def _stage(**change: Any) -> dict[str, Any]:
@@ -90,16 +90,20 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: reach 1, 3": _stage(reach=(1, 3)),
     "second stage: reach 3, 7": _stage(reach=(3, 7)),
     "second stage: 10 candidates": _stage(candidates=10),
-    "second stage: 60 candidates": _stage(candidates=60),
+    "second stage: 60 candidates": _stage(candidates=60, screened=None),
+    "second stage: 30 candidates, none screened": _stage(screened=None),
+    "second stage: 15 candidates of 60 screened": _stage(candidates=15),
     "second stage: share 0.5": _stage(share=0.5),
-    "second stage: share 0.85": _stage(share=0.85),
-    "second stage: cells standardized": _stage(centred=0.75),
-    "second stage: cells standardized, weights 0.45, 0.45, 0.1": _stage(centred=0.75, weights=LIGHT),
-    "second stage: cells standardized, these weights, reach 3, 5, 60 candidates": _stage(
-        centred=0.75, weights=LIGHT, reach=(3, 5), candidates=60
+    "second stage: share 0.75": _stage(share=0.75),
+    "second stage: cells as they are": _stage(centred=None),
+    "second stage: projections of the regions": _stage(taught=None),
+    "second stage: of 0.1.0": _stage(**PLAIN),
+    "second stage: of 0.1.0, cells standardized": _stage(**{**PLAIN, "centred": 0.75}),
+    "second stage: of 0.1.0, cells standardized, weights 0.45, 0.45, 0.1, reach 3, 5, 60 candidates": _stage(
+        **{**PLAIN, "centred": 0.75}, weights=LIGHT, reach=(3, 5), candidates=60
     ),
-    "second stage: cells standardized, these weights, reach 3, 5, 15 candidates of 60 screened, share 0.8": _stage(
-        centred=0.75, weights=LIGHT, reach=(3, 5), candidates=15, screened=60, share=0.8
+    "second stage: of 0.1.0, cells standardized, these weights and reach, 15 candidates of 60 screened": _stage(
+        **{**PLAIN, "centred": 0.75, "screened": 60}, weights=LIGHT, reach=(3, 5), candidates=15
     ),
 }
 REFINED = "projections refined by contrastive learning"
@@ -117,7 +121,10 @@ class Ablation:
         self.weights, self.size = load_file(weights), size
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
-        self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
+        self.cells = fit_cell_projections(
+            network_of(self.weights, STAGE.layers), STAGE, datasets / "train", self.projections
+        )
+        self.extractor = FeatureExtractor(network, DEFAULT, self.projections, self.cells)
         self.tasks: ValidationTasks = load_tasks(datasets)
         self.corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
@@ -148,7 +155,7 @@ class Ablation:
         return Encodings(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
 
     def refine(self, datasets: Path) -> None:
-        """Refine the projections by contrastive learning; both stages use these from now on."""
+        """Refine the projections by contrastive learning; both stages use these from now on, but for taught cells."""
         network = network_of(self.weights, STAGE.layers)
         pairs = paired_cells(network, datasets / "train", REFINEMENT_CROPS)
         refined, losses = refine(self.projections, STAGE, pairs, REFINEMENT_STEPS)
@@ -159,7 +166,9 @@ class Ablation:
 
     def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
         """One number for each of COLUMNS."""
-        extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
+        extractor = FeatureExtractor(
+            self._network(definition), definition, self._projections(definition), self._cells(definition)
+        )
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
         encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
@@ -184,6 +193,10 @@ class Ablation:
 
     def _projections(self, definition: EncoderDefinition) -> dict[str, Projection]:
         return {layer: self.projections[layer] for layer in definition.projected()}
+
+    def _cells(self, definition: EncoderDefinition) -> dict[str, Projection]:
+        stage = definition.agreement
+        return {layer: self.cells[layer] for layer in stage.layers} if stage is not None and stage.taught else {}
 
 
 def _traverse_figures(truth: NDArray[np.bool_], answers: Array) -> tuple[float, float]:
@@ -231,7 +244,8 @@ def main(
         typer.echo(table({name: rows[name]}).splitlines()[-1])
     if not only or REFINED in only:
         ablation.refine(datasets)
-        rows[REFINED] = [ablation.figures(DEFAULT, seed) for seed in range(seeds)]
+        definition = DEFAULT.model_copy(update=_stage(taught=None))
+        rows[REFINED] = [ablation.figures(definition, seed) for seed in range(seeds)]
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
     typer.echo(table(rows))
 

@@ -8,8 +8,8 @@ needs no match of features, so that also cells answer each other that no matcher
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,9 +27,8 @@ FIRST_CELL, STRIDE, COLUMNS = 17.5, 16.0, 13
 side; the same for pool2, conv3 and conv4."""
 
 
-@dataclass(frozen=True)
-class DisplacedViews:
-    """Two views of one scene, uint8 [side, side, 3].
+class Displacement(NamedTuple):
+    """How two views of one scene belong together.
 
     answers: int64 [n, 2], cells of the first view (row * COLUMNS + column) and the cells of the second in which their
         middles are.
@@ -37,11 +36,17 @@ class DisplacedViews:
     camera: whether they are a day and a night of a fixed camera.
     """
 
-    first: Pixels
-    second: Pixels
     answers: NDArray[np.int64]
     photograph: int
     camera: bool
+
+
+class DisplacedViews(NamedTuple):
+    """Two views of one scene, uint8 [side, side, 3], and how they belong together."""
+
+    first: Pixels
+    second: Pixels
+    displacement: Displacement
 
 
 def displaced_views(photographs: Path, side: int, count: int, seed: int) -> Iterator[DisplacedViews]:
@@ -60,7 +65,7 @@ def displaced_views(photographs: Path, side: int, count: int, seed: int) -> Iter
         first, second, answers = displaced([read(path) for path in chosen], side, generator)
         if generator.random() < (DISTURBED_NIGHTS if camera else DISTURBED):
             second = augment(second, generator)
-        yield DisplacedViews(first, second, answers, numbers[chosen[0]], camera)
+        yield DisplacedViews(first, second, Displacement(answers, numbers[chosen[0]], camera))
 
 
 def displaced(

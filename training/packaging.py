@@ -25,11 +25,12 @@ from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load
 from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.presets import NETWORK, PRESETS
+from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork, save_network
 from training.default_calibration import UNCALIBRATED, assess, for_small_maps
 from training.photographs import read, split_photographs
-from training.projections import fit_projections
+from training.projections import fit_cell_projections, fit_projections
 from training.student import student_definition
 from training.validation import load_tasks
 
@@ -67,7 +68,8 @@ def build(
     """An encoder, not yet calibrated: projections fitted to ``photographs``, a vocabulary trained on ``pictures``."""
     network, wanted = network_of(weights, definition.outputs), definition.projected()
     projections = fit_projections(network, wanted, photographs, seed=seed) if wanted else {}
-    extractor = FeatureExtractor(network, definition, projections)
+    cells = taught_cells(network, definition, projections, photographs, seed)
+    extractor = FeatureExtractor(network, definition, projections, cells)
     frames = (
         extractor.regions(extractor.activations([picture])[0]).features
         for picture in track(pictures, f"features for {name}")
@@ -76,17 +78,34 @@ def build(
     return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
 
 
+def taught_cells(
+    network: ShallowNetwork,
+    definition: EncoderDefinition,
+    projections: dict[str, Projection],
+    photographs: Path,
+    seed: int,
+) -> dict[str, Projection]:
+    """The projections of cells that are taught; none if the definition has none."""
+    stage = definition.agreement
+    if stage is None or not stage.taught:
+        return {}
+    return fit_cell_projections(network, stage, photographs, projections, seed=seed)
+
+
 def with_second_stage(
-    name: str, definition: EncoderDefinition, weights: dict[str, Tensor], folder: Path
+    name: str, definition: EncoderDefinition, weights: dict[str, Tensor], folder: Path, photographs: Path, seed: int
 ) -> tuple[Encoder, Vocabulary]:
     """The encoder of a folder with a second stage as defined, not yet calibrated; the first stays as it is.
+
+    Projections of cells that are taught are fitted to ``photographs``.
 
     Raises:
         WrongVocabulary: the definition changes the first stage, too.
     """
     kept = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
-    network = network_of(weights, definition.outputs)
-    extractor = FeatureExtractor(network, definition, kept.extractor.projections)
+    network, projections = network_of(weights, definition.outputs), kept.extractor.projections
+    cells = taught_cells(network, definition, projections, photographs, seed)
+    extractor = FeatureExtractor(network, definition, projections, cells)
     vocabulary = Vocabulary(kept.centers, kept.extractor.origin)
     return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
 
@@ -126,7 +145,7 @@ def main(
         for name in only or PRESETS:
             definition = PRESETS[name]
             if second_stage:
-                encoder, vocabulary = with_second_stage(name, definition, tensors, output)
+                encoder, vocabulary = with_second_stage(name, definition, tensors, output, datasets / "train", seed)
             else:
                 encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
             calibration, figures = assess(encoder, tasks)

@@ -28,7 +28,7 @@ from core.method.agreement import AgreementDefinition, Cells, correspondences, l
 from core.method.equations import unit_length
 from core.method.projection import Projection, discriminant, fit_projection
 from core.networks.network import ShallowNetwork
-from training.displaced_views import COLUMNS, DisplacedViews, displaced_views
+from training.displaced_views import COLUMNS, Displacement, displaced_views
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs
 
@@ -45,13 +45,15 @@ RATE = 2e-4
 DECAY = 0.997
 BATCH = 12  # crops
 
-VIEWS = 1500
+VIEWS = 2400
 """Pairs of displaced views."""
 ANSWERS_PER_PAIR, WRONG_PER_FRAME = 40, 30
 CAMERA_WEIGHT = 2.0
 """Of the differences between day and night, where those of the other pairs count once."""
-CONFUSABLE, APART = 3, 20
+CONFUSABLE, APART = 3, 8
 """How many other frames a view is matched with; photographs this close in order of names may show one place."""
+WRONG_REACH = (3, 5)
+"""Rows and columns within which wrong matches are looked for."""
 SHRINKAGE = 2.0
 """As in ``core.method.projection``; what single matches differ by needs more of it."""
 
@@ -126,6 +128,7 @@ def _maps(network: ShallowNetwork, frames: Sequence[NDArray[np.uint8]]) -> dict[
     }
 
 
+Features = NDArray[np.float16]
 Matches = NDArray[np.int64]
 """Cells that are compared: int64 [n, 4], frame and cell of a second view, and frame and cell of a first one."""
 
@@ -148,33 +151,56 @@ def fit_cell_projections(
         photographs: folder of the training photographs.
         start: projections of these layers, by which wrong matches are found.
     """
-    views: list[DisplacedViews] = []
-    sides: tuple[dict[str, list[Array]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
-    cells: tuple[list[Cells], ...] = ([], [])
-    for pair in track(displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET), "displaced views", total=pairs):
-        views.append(pair)
-        maps = _maps(network, (pair.first, pair.second))
-        for number, (side, compared) in enumerate(zip(sides, cells, strict=True)):
+    displacements: list[Displacement] = []
+    sides: tuple[dict[str, list[Features]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
+    for views in track(displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET), "displaced views", total=pairs):
+        displacements.append(views.displacement)
+        maps = _maps(network, (views.first, views.second))
+        for number, side in enumerate(sides):
             for layer in stage.layers:
                 side[layer].append(unit_length(maps[layer][number]).astype(np.float16))
-            projected = [start[layer](maps[layer][number], stage.values) for layer in stage.layers]
-            compared.append(local_descriptors(projected, stage))
+    first, second = ({layer: np.stack(side.pop(layer)) for layer in stage.layers} for side in sides)
+    return taught_projections(displacements, first, second, stage, start, seed)
+
+
+def taught_projections(
+    displacements: Sequence[Displacement],
+    first: Mapping[str, Features],
+    second: Mapping[str, Features],
+    stage: AgreementDefinition,
+    start: Mapping[str, Projection],
+    seed: int = 0,
+) -> dict[str, Projection]:
+    """The projections of :func:`fit_cell_projections` from n pairs of views.
+
+    Args:
+        first, second: by layer the features of the views' cells, of unit length, float16 [n, C, K].
+    """
+    compared = [
+        [
+            local_descriptors(
+                [start[layer](side[layer][view].astype(np.float32), stage.values) for layer in stage.layers], stage
+            )
+            for view in range(len(displacements))
+        ]
+        for side in (first, second)
+    ]
     generator = np.random.default_rng(seed)
-    right = _right_matches(views, generator)
-    by_camera = np.array([pair.camera for pair in views])[right[:, 0]]
-    wrong = _wrong_matches(views, cells[1], cells[0], stage, generator)
+    right = _right_matches(displacements, generator)
+    by_camera = np.array([pair.camera for pair in displacements])[right[:, 0]]
+    wrong = _wrong_matches(displacements, compared[1], compared[0], generator)
     made = {}
     for layer in stage.layers:
-        first, second = (np.stack(side[layer]) for side in sides)
-        apart = [_differences(first, second, right[chosen]) for chosen in (~by_camera, by_camera) if chosen.any()]
+        sides = first[layer], second[layer]
+        apart = [_differences(*sides, right[chosen]) for chosen in (~by_camera, by_camera) if chosen.any()]
         within = np.average(apart, axis=0, weights=[1, CAMERA_WEIGHT][: len(apart)])
-        matrix = discriminant(within, _differences(first, second, wrong), stage.values, SHRINKAGE)
-        mean = (first.mean(axis=(0, 1), dtype=np.float64) + second.mean(axis=(0, 1), dtype=np.float64)) / 2
+        matrix = discriminant(within, _differences(*sides, wrong), stage.values, SHRINKAGE)
+        mean = np.mean([side.mean(axis=(0, 1), dtype=np.float64) for side in sides], axis=0)
         made[layer] = Projection(mean.astype(np.float32), matrix)
     return made
 
 
-def _right_matches(views: Sequence[DisplacedViews], generator: np.random.Generator) -> Matches:
+def _right_matches(views: Sequence[Displacement], generator: np.random.Generator) -> Matches:
     """Some cells of each second view and those of its first view that they show."""
     found = []
     for number, pair in enumerate(views):
@@ -184,10 +210,9 @@ def _right_matches(views: Sequence[DisplacedViews], generator: np.random.Generat
 
 
 def _wrong_matches(
-    views: Sequence[DisplacedViews],
+    views: Sequence[Displacement],
     queries: Sequence[Cells],
     references: Sequence[Cells],
-    stage: AgreementDefinition,
     generator: np.random.Generator,
 ) -> Matches:
     """Some mutual matches of each second view in first views of other places, those most alike in their mean cell."""
@@ -200,13 +225,13 @@ def _wrong_matches(
     for number, row in enumerate(likeness):
         for other in np.argsort(-row)[:CONFUSABLE].tolist():
             if row[other] > -np.inf:
-                matched = correspondences(queries[number], references[other], COLUMNS, stage.reach)
+                matched = correspondences(queries[number], references[other], COLUMNS, WRONG_REACH)
                 pairs = generator.permutation(np.stack([matched.query, matched.reference], axis=1))[:WRONG_PER_FRAME]
                 found += [(number, here, other, there) for here, there in pairs.tolist()]
     return np.array(found, np.int64)
 
 
-def _differences(first: NDArray[np.float16], second: NDArray[np.float16], matches: Matches) -> NDArray[np.float64]:
+def _differences(first: Features, second: Features, matches: Matches) -> NDArray[np.float64]:
     """Half the mean outer product of what matched cells differ by, float64 [K, K], of features float16 [n, C, K]."""
     here, there = second[matches[:, 0], matches[:, 1]], first[matches[:, 2], matches[:, 3]]
     seen = here.any(axis=1) & there.any(axis=1)

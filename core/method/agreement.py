@@ -18,6 +18,7 @@ What all cells of a frame have in common, as its light and weather, may be taken
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,8 @@ class AgreementDefinition(BaseModel):
     cosine over all cells makes up ``share`` of their score, the first stage's score the rest.  They are the first of
     the ranking or, if more places are ``screened``, the most promising of these.  ``centred`` is the share of its mean
     over the frame that each value of a cell loses before it is divided by its deviation over the frame; None: cells
-    stay as they are.  Encoders of 0.1.0 have neither.
+    stay as they are.  Cells that are ``taught`` have projections of their own (``training.projections``), others those
+    of the regions.  Encoders of 0.1.0 have none of the three.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -60,6 +62,7 @@ class AgreementDefinition(BaseModel):
     share: float = Field(gt=0, lt=1)
     centred: float | None = Field(default=None, ge=0, le=1)
     screened: int | None = Field(default=None, ge=1, le=1000)
+    taught: Literal[True] | None = None
 
     @model_validator(mode="after")
     def _one_weight_a_layer(self) -> AgreementDefinition:

@@ -40,5 +40,5 @@ def test_views_are_drawn_repeatably_and_those_of_cameras_are_day_and_night(photo
     made, again = (list(displaced_views(photographs, 64, 60, seed=4)) for _ in "ab")
     for one, other in zip(made, again, strict=True):
         np.testing.assert_array_equal(one.second, other.second)
-    assert 0 < sum(pair.camera for pair in made) < 20
-    assert len({pair.photograph for pair in made}) > 20
+    assert 0 < sum(pair.displacement.camera for pair in made) < 20
+    assert len({pair.displacement.photograph for pair in made}) > 20
