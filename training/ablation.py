@@ -8,7 +8,7 @@ chosen by it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,9 +21,7 @@ from safetensors.torch import load_file
 
 from core.frames.preprocessing import Pixels
 from core.judgement.curves import auc_pr
-from core.method.agreement import Cells, local_descriptors
 from core.method.encoder import Encoder, EncoderDefinition
-from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.presets import PRESETS
 from core.method.projection import Projection
@@ -31,7 +29,7 @@ from core.method.vocabulary import pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork
 from training.default_calibration import UNCALIBRATED
 from training.packaging import network_of, vocabulary_pictures
-from training.projections import fit_projections, paired_cells, refine
+from training.projections import fit_cell_projections, fit_projections, paired_cells, refine
 from training.validation import (
     DISTRACTORS,
     Encodings,
@@ -53,6 +51,10 @@ WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
 """Directions fitted of each layer; every configuration takes the first so many."""
 THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
 COARSE = {**THESIS, "steps": DEFAULT.steps}
+LIGHT = (0.45, 0.45, 0.1)
+"""Weights of the layers with less for conv4."""
+PLAIN: dict[str, Any] = {"centred": None, "screened": None, "taught": None, "share": 0.75}
+"""The second stage of 0.1.0, in what differs from the packaged one."""
 
 
 def _stage(**change: Any) -> dict[str, Any]:
@@ -88,51 +90,28 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: reach 1, 3": _stage(reach=(1, 3)),
     "second stage: reach 3, 7": _stage(reach=(3, 7)),
     "second stage: 10 candidates": _stage(candidates=10),
-    "second stage: 60 candidates": _stage(candidates=60),
+    "second stage: 60 candidates": _stage(candidates=60, screened=None),
+    "second stage: 30 candidates, none screened": _stage(screened=None),
+    "second stage: 15 candidates of 60 screened": _stage(candidates=15),
     "second stage: share 0.5": _stage(share=0.5),
-    "second stage: share 0.85": _stage(share=0.85),
-}
-STANDARDIZED = "second stage: cells standardized"
-STANDARDIZED_CHANGES: dict[str, dict[str, Any]] = {
-    STANDARDIZED: {},
-    f"{STANDARDIZED}, weights 0.45, 0.45, 0.1": _stage(weights=(0.45, 0.45, 0.1)),
-    f"{STANDARDIZED}, these weights, reach 3, 5, 60 candidates": _stage(
-        weights=(0.45, 0.45, 0.1), reach=(3, 5), candidates=60
+    "second stage: share 0.75": _stage(share=0.75),
+    "second stage: cells as they are": _stage(centred=None),
+    "second stage: projections of the regions": _stage(taught=None),
+    "second stage: of 0.1.0": _stage(**PLAIN),
+    "second stage: of 0.1.0, cells standardized": _stage(**{**PLAIN, "centred": 0.75}),
+    "second stage: of 0.1.0, cells standardized, weights 0.45, 0.45, 0.1, reach 3, 5, 60 candidates": _stage(
+        **{**PLAIN, "centred": 0.75}, weights=LIGHT, reach=(3, 5), candidates=60
+    ),
+    "second stage: of 0.1.0, cells standardized, these weights and reach, 15 candidates of 60 screened": _stage(
+        **{**PLAIN, "centred": 0.75, "screened": 60}, weights=LIGHT, reach=(3, 5), candidates=15
     ),
 }
-"""Changes of an encoder that is :class:`StandardizedEncoder`."""
-CENTERED, FLOOR = 0.75, 0.5
-"""The share of the mean that is taken from each value, and of the mean deviation that is added to each deviation."""
 REFINED = "projections refined by contrastive learning"
 REFINEMENT_CROPS, REFINEMENT_STEPS = 800, 400
 COLUMNS = (
     "lip6 recall@1", "lip6 AUC-PR", "lip6 as stated, recall@1", "webcams recall@1", "night recall@1",
     "corridor recall@1", "corridor AUC-PR",
 )  # fmt: skip
-
-
-class StandardizedEncoder(Encoder):
-    """Compares cells after what all cells of a frame have in common, as its light and weather, is taken from them."""
-
-    def local(self, activations: Sequence[Array], products: Mapping[str, Array]) -> Cells:
-        stage = self.definition.agreement
-        assert stage is not None
-        cells = self.extractor.projected_cells(activations, products, stage.layers, stage.values)
-        return local_descriptors([standardized(layer) for layer in cells], stage)
-
-
-def standardized(cells: Array) -> Array:
-    """Each value less a share of its mean over the cells of a frame, by its deviation over them, to unit length.
-
-    Args:
-        cells: float32 [C, values], rows of unit length or zero; rows of zeros take no part and stay.
-    """
-    seen = cells.any(axis=1)
-    made = np.zeros_like(cells)
-    if seen.any():
-        mean, deviation = cells[seen].mean(axis=0), cells[seen].std(axis=0)
-        made[seen] = (cells[seen] - CENTERED * mean) / (deviation + FLOOR * deviation.mean() + 1e-12)
-    return unit_length(made)
 
 
 class Ablation:
@@ -142,7 +121,10 @@ class Ablation:
         self.weights, self.size = load_file(weights), size
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
-        self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
+        self.cells = fit_cell_projections(
+            network_of(self.weights, STAGE.layers), STAGE, datasets / "train", self.projections
+        )
+        self.extractor = FeatureExtractor(network, DEFAULT, self.projections, self.cells)
         self.tasks: ValidationTasks = load_tasks(datasets)
         self.corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
@@ -173,7 +155,7 @@ class Ablation:
         return Encodings(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
 
     def refine(self, datasets: Path) -> None:
-        """Refine the projections by contrastive learning; both stages use these from now on."""
+        """Refine the projections by contrastive learning; both stages use these from now on, but for taught cells."""
         network = network_of(self.weights, STAGE.layers)
         pairs = paired_cells(network, datasets / "train", REFINEMENT_CROPS)
         refined, losses = refine(self.projections, STAGE, pairs, REFINEMENT_STEPS)
@@ -182,12 +164,14 @@ class Ablation:
             further = self.projections[layer].matrix[:, STAGE.values :]
             self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
 
-    def figures(self, definition: EncoderDefinition, seed: int, kind: type[Encoder] = Encoder) -> list[float]:
+    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
         """One number for each of COLUMNS."""
-        extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
+        extractor = FeatureExtractor(
+            self._network(definition), definition, self._projections(definition), self._cells(definition)
+        )
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-        encoder = kind("ablation", extractor, definition, vocabulary, UNCALIBRATED)
+        encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
         references = self.describe(encoder, "lip6 references")
         far = references.part(slice(0, DISTRACTORS))
         lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)
@@ -209,6 +193,10 @@ class Ablation:
 
     def _projections(self, definition: EncoderDefinition) -> dict[str, Projection]:
         return {layer: self.projections[layer] for layer in definition.projected()}
+
+    def _cells(self, definition: EncoderDefinition) -> dict[str, Projection]:
+        stage = definition.agreement
+        return {layer: self.cells[layer] for layer in stage.layers} if stage is not None and stage.taught else {}
 
 
 def _traverse_figures(truth: NDArray[np.bool_], answers: Array) -> tuple[float, float]:
@@ -246,18 +234,18 @@ def main(
     torch.manual_seed(0)
     ablation = Ablation(weights, datasets, images, size)
     rows: dict[str, Sequence[Sequence[float]]] = {}
-    for name, change in {**CHANGES, **STANDARDIZED_CHANGES}.items():
+    for name, change in CHANGES.items():
         if only and name not in only:
             continue
         definition = EncoderDefinition.model_validate({**DEFAULT.model_dump(), **change})
-        kind = StandardizedEncoder if name in STANDARDIZED_CHANGES else Encoder
-        rows[name] = [ablation.figures(definition, seed, kind) for seed in range(seeds)]
+        rows[name] = [ablation.figures(definition, seed) for seed in range(seeds)]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
         typer.echo(table({name: rows[name]}).splitlines()[-1])
     if not only or REFINED in only:
         ablation.refine(datasets)
-        rows[REFINED] = [ablation.figures(DEFAULT, seed) for seed in range(seeds)]
+        definition = DEFAULT.model_copy(update=_stage(taught=None))
+        rows[REFINED] = [ablation.figures(definition, seed) for seed in range(seeds)]
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
     typer.echo(table(rows))
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,11 +22,10 @@ from core.judgement.calibration import Held, Target, fit_map_calibration, held_f
 from core.judgement.curves import auc_roc
 from core.judgement.trials import Trial, Trials, gathered
 from core.judgement.verdict import judge
-from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import examine, second_stage
 from training.default_calibration import NEIGHBORHOOD
 from training.validation import Encodings, describe, load_traverses, with_corrected_truth
 
@@ -54,17 +52,13 @@ def half_trials(encoder: Encoder, queries: Encodings, references: Encodings, tru
         for half in (slice(0, middle), slice(middle, end)):
             order = half.start + np.argsort(-scores[number, half], kind="stable")
             places = Whereabouts.along_sequence(order)
-            gains = partial(_gains, encoder, local, references.local[order])
-            seen = examine(scores[number, order], places, NEIGHBORHOOD, encoder.candidates, gains)
+            stage = second_stage(encoder, local, references.local[order].__getitem__)
+            seen = examine(scores[number, order], places, NEIGHBORHOOD, *stage)
             judgement = judge(seen.scores, places.take(seen.order), encoder.calibration, NEIGHBORHOOD, seen.examined)
             best = order[seen.order[0]]
             for truth, kept in zip(truths, found, strict=True):
                 kept.append(Trial(judgement, bool(truth[number, half].any()), bool(truth[number, best]), number))
     return [gathered(kept) for kept in found]
-
-
-def _gains(encoder: Encoder, query: Cells, references: Cells, asked: NDArray[np.int64]) -> NDArray[np.float32]:
-    return encoder.agreement(query, references[asked])
 
 
 def figures(held: Held) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load
 from core.method.encoder import Encoder
 from core.method.presets import NETWORK, PRESETS
 from core.places import Neighborhood, Whereabouts
-from training.map_sizes import fit_environment, fit_small_maps, fitting_traverses
+from training.map_sizes import fit_environment, fit_small_maps, fitting_traverses, widened
 from training.validation import (
     DISTRACTORS,
     CameraTask,
@@ -149,6 +149,7 @@ def for_small_maps(encoder: Encoder, datasets: Path, calibration: Calibration) -
     traverses = list(fitting_traverses(encoder, datasets))
     environment = fit_environment(encoder, datasets, traverses)
     found = calibration.model_copy(update={"environment": environment, "geometry": TERMS})
+    found = found.model_copy(update={"environment": widened(found, traverses)})
     return found.model_copy(update={"curve": fit_small_maps(found, traverses)})
 
 

@@ -1,6 +1,7 @@
 """Turns distilled weights into the packaged encoders: vocabularies, calibration, golden values, files.
 
-With ``--only``, it makes some of the encoders anew for the network that is packaged already, and leaves the rest.
+With ``--only``, it makes some of the encoders anew for the network that is packaged already, and leaves the rest; with
+``--second-stage`` these keep their projections and vocabularies, so that their descriptors stay as they are.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from core.frames.preprocessing import Pixels
-from core.method.catalogue import NETWORK_SUFFIX, PACKAGED, save_encoder
+from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load_encoder, save_encoder
 from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.presets import NETWORK, PRESETS
+from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork, save_network
 from training.default_calibration import UNCALIBRATED, assess, for_small_maps
 from training.photographs import read, split_photographs
-from training.projections import fit_projections
+from training.projections import fit_cell_projections, fit_projections
 from training.student import student_definition
 from training.validation import load_tasks
 
@@ -66,12 +68,45 @@ def build(
     """An encoder, not yet calibrated: projections fitted to ``photographs``, a vocabulary trained on ``pictures``."""
     network, wanted = network_of(weights, definition.outputs), definition.projected()
     projections = fit_projections(network, wanted, photographs, seed=seed) if wanted else {}
-    extractor = FeatureExtractor(network, definition, projections)
+    cells = taught_cells(network, definition, projections, photographs, seed)
+    extractor = FeatureExtractor(network, definition, projections, cells)
     frames = (
         extractor.regions(extractor.activations([picture])[0]).features
         for picture in track(pictures, f"features for {name}")
     )
     vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
+    return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
+
+
+def taught_cells(
+    network: ShallowNetwork,
+    definition: EncoderDefinition,
+    projections: dict[str, Projection],
+    photographs: Path,
+    seed: int,
+) -> dict[str, Projection]:
+    """The projections of cells that are taught; none if the definition has none."""
+    stage = definition.agreement
+    if stage is None or not stage.taught:
+        return {}
+    return fit_cell_projections(network, stage, photographs, projections, seed=seed)
+
+
+def with_second_stage(
+    name: str, definition: EncoderDefinition, weights: dict[str, Tensor], folder: Path, photographs: Path, seed: int
+) -> tuple[Encoder, Vocabulary]:
+    """The encoder of a folder with a second stage as defined, not yet calibrated; the first stays as it is.
+
+    Projections of cells that are taught are fitted to ``photographs``.
+
+    Raises:
+        WrongVocabulary: the definition changes the first stage, too.
+    """
+    kept = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
+    network, projections = network_of(weights, definition.outputs), kept.extractor.projections
+    cells = taught_cells(network, definition, projections, photographs, seed)
+    extractor = FeatureExtractor(network, definition, projections, cells)
+    vocabulary = Vocabulary(kept.centers, kept.extractor.origin)
     return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
 
 
@@ -86,16 +121,22 @@ def main(
     only: Annotated[
         list[str] | None, typer.Option(help="Just these presets, of the network in the output folder.")
     ] = None,
+    second_stage: Annotated[
+        bool, typer.Option("--second-stage", help="Of these presets just the second stage; the first stays.")
+    ] = False,
 ) -> None:
     """Write the network and one encoder file for each preset, and print what they reach."""
     unknown = set(only or ()) - PRESETS.keys()
     if unknown:
         raise typer.BadParameter(f"no preset is named {', '.join(sorted(unknown))}; there are {', '.join(PRESETS)}")
+    if second_stage and not only:
+        raise typer.BadParameter("a second stage is added to the encoders that --only names")
     torch.manual_seed(seed)
     output.mkdir(parents=True, exist_ok=True)
     network = f"{NETWORK}{NETWORK_SUFFIX}"
     tensors = load_file(output / network if only else weights)
-    pictures, tasks = vocabulary_pictures(datasets, images, seed), load_tasks(datasets)
+    pictures = [] if second_stage else vocabulary_pictures(datasets, images, seed)
+    tasks = load_tasks(datasets)
     # The encoders of one network go with it, so all files change together, at the end.
     with TemporaryDirectory(dir=output, prefix="unfinished-") as unfinished:
         folder = Path(unfinished)
@@ -103,10 +144,14 @@ def main(
             save_network(folder / network, student_definition(), tensors)
         for name in only or PRESETS:
             definition = PRESETS[name]
-            encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
+            if second_stage:
+                encoder, vocabulary = with_second_stage(name, definition, tensors, output, datasets / "train", seed)
+            else:
+                encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
             calibration, figures = assess(encoder, tasks)
             calibration = encoder.calibration = for_small_maps(encoder, datasets, calibration)
-            training = {"images": len(pictures), "seed": seed, "source": "training photographs, see MODEL_CARD.md"}
+            source = "training photographs, see MODEL_CARD.md"
+            training = {"images": len(pictures) or images, "seed": seed, "source": source}
             save_encoder(folder, encoder, vocabulary, NETWORK, training)
             made = {"encoder": encoder.identity, "calibration": calibration.model_dump(), **figures}
             typer.echo(json.dumps(made, indent=2))

@@ -5,6 +5,9 @@ encoders use these.  :func:`refine` goes on from there by InfoNCE (van den Oord 
 cell under two conditions attract, all others repel.  A cell's negatives are all cells of all crops of the batch but
 its own neighbours; the backbone stays as it is.  The packaged encoders do not use it: its own loss fell while
 recognition did not gain (see the model card).
+
+:func:`fit_cell_projections` is for the second stage alone.  Its pairs are displaced views, and in place of the variance
+of all cells it asks for the difference between a cell and the one that a frame of another place matches it with.
 """
 
 from __future__ import annotations
@@ -21,10 +24,11 @@ from rich.progress import track
 from torch import Tensor, nn
 
 from core.frames.preprocessing import prepare
-from core.method.agreement import AgreementDefinition
+from core.method.agreement import AgreementDefinition, Cells, correspondences, local_descriptors
 from core.method.equations import unit_length
-from core.method.projection import Projection, fit_projection
+from core.method.projection import Projection, discriminant, fit_projection
 from core.networks.network import ShallowNetwork
+from training.displaced_views import COLUMNS, Displacement, displaced_views
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs
 
@@ -40,6 +44,18 @@ RATE = 2e-4
 """Learning rate of the refinement, relative to the norm of each projection."""
 DECAY = 0.997
 BATCH = 12  # crops
+
+VIEWS = 2400
+"""Pairs of displaced views."""
+ANSWERS_PER_PAIR, WRONG_PER_FRAME = 40, 30
+CAMERA_WEIGHT = 2.0
+"""Of the differences between day and night, where those of the other pairs count once."""
+CONFUSABLE, APART = 3, 8
+"""How many other frames a view is matched with; photographs this close in order of names may show one place."""
+WRONG_REACH = (3, 5)
+"""Rows and columns within which wrong matches are looked for."""
+SHRINKAGE = 2.0
+"""As in ``core.method.projection``; what single matches differ by needs more of it."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +126,117 @@ def _maps(network: ShallowNetwork, frames: Sequence[NDArray[np.uint8]]) -> dict[
         name: np.ascontiguousarray(output.flatten(2).permute(0, 2, 1).numpy())
         for name, output in zip(network.outputs, outputs, strict=True)
     }
+
+
+Features = NDArray[np.float16]
+Matches = NDArray[np.int64]
+"""Cells that are compared: int64 [n, 4], frame and cell of a second view, and frame and cell of a first one."""
+
+
+def fit_cell_projections(
+    network: ShallowNetwork,
+    stage: AgreementDefinition,
+    photographs: Path,
+    start: Mapping[str, Projection],
+    pairs: int = VIEWS,
+    seed: int = 0,
+) -> dict[str, Projection]:
+    """A projection for each layer of a second stage.
+
+    It has the directions in which the right matches of a cell differ least, relative to the wrong ones.  Right is what
+    shows the same spot; wrong is the mutual match in a frame that looks alike and shows another place.
+
+    Args:
+        network: returns at least these layers.
+        photographs: folder of the training photographs.
+        start: projections of these layers, by which wrong matches are found.
+    """
+    displacements: list[Displacement] = []
+    sides: tuple[dict[str, list[Features]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
+    for views in track(displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET), "displaced views", total=pairs):
+        displacements.append(views.displacement)
+        maps = _maps(network, (views.first, views.second))
+        for number, side in enumerate(sides):
+            for layer in stage.layers:
+                side[layer].append(unit_length(maps[layer][number]).astype(np.float16))
+    first, second = ({layer: np.stack(side.pop(layer)) for layer in stage.layers} for side in sides)
+    return taught_projections(displacements, first, second, stage, start, seed)
+
+
+def taught_projections(
+    displacements: Sequence[Displacement],
+    first: Mapping[str, Features],
+    second: Mapping[str, Features],
+    stage: AgreementDefinition,
+    start: Mapping[str, Projection],
+    seed: int = 0,
+) -> dict[str, Projection]:
+    """The projections of :func:`fit_cell_projections` from n pairs of views.
+
+    Args:
+        first, second: by layer the features of the views' cells, of unit length, float16 [n, C, K].
+    """
+    compared = [
+        [
+            local_descriptors(
+                [start[layer](side[layer][view].astype(np.float32), stage.values) for layer in stage.layers], stage
+            )
+            for view in range(len(displacements))
+        ]
+        for side in (first, second)
+    ]
+    generator = np.random.default_rng(seed)
+    right = _right_matches(displacements, generator)
+    by_camera = np.array([pair.camera for pair in displacements])[right[:, 0]]
+    wrong = _wrong_matches(displacements, compared[1], compared[0], generator)
+    made = {}
+    for layer in stage.layers:
+        sides = first[layer], second[layer]
+        apart = [_differences(*sides, right[chosen]) for chosen in (~by_camera, by_camera) if chosen.any()]
+        within = np.average(apart, axis=0, weights=[1, CAMERA_WEIGHT][: len(apart)])
+        matrix = discriminant(within, _differences(*sides, wrong), stage.values, SHRINKAGE)
+        mean = np.mean([side.mean(axis=(0, 1), dtype=np.float64) for side in sides], axis=0)
+        made[layer] = Projection(mean.astype(np.float32), matrix)
+    return made
+
+
+def _right_matches(views: Sequence[Displacement], generator: np.random.Generator) -> Matches:
+    """Some cells of each second view and those of its first view that they show."""
+    found = []
+    for number, pair in enumerate(views):
+        drawn = generator.permutation(pair.answers)[:ANSWERS_PER_PAIR]
+        found += [(number, there, number, here) for here, there in drawn.tolist()]
+    return np.array(found, np.int64)
+
+
+def _wrong_matches(
+    views: Sequence[Displacement],
+    queries: Sequence[Cells],
+    references: Sequence[Cells],
+    generator: np.random.Generator,
+) -> Matches:
+    """Some mutual matches of each second view in first views of other places, those most alike in their mean cell."""
+    asked, shown = (unit_length(np.stack([one.mean(axis=0) for one in side])) for side in (queries, references))
+    common = shown.mean(axis=0)
+    likeness = unit_length(asked - common) @ unit_length(shown - common).T
+    photograph = np.array([pair.photograph for pair in views])
+    likeness[np.abs(photograph[:, np.newaxis] - photograph) < APART] = -np.inf
+    found = []
+    for number, row in enumerate(likeness):
+        for other in np.argsort(-row)[:CONFUSABLE].tolist():
+            if row[other] > -np.inf:
+                matched = correspondences(queries[number], references[other], COLUMNS, WRONG_REACH)
+                pairs = generator.permutation(np.stack([matched.query, matched.reference], axis=1))[:WRONG_PER_FRAME]
+                found += [(number, here, other, there) for here, there in pairs.tolist()]
+    return np.array(found, np.int64)
+
+
+def _differences(first: Features, second: Features, matches: Matches) -> NDArray[np.float64]:
+    """Half the mean outer product of what matched cells differ by, float64 [K, K], of features float16 [n, C, K]."""
+    here, there = second[matches[:, 0], matches[:, 1]], first[matches[:, 2], matches[:, 3]]
+    seen = here.any(axis=1) & there.any(axis=1)
+    difference = here[seen].astype(np.float32) - there[seen].astype(np.float32)
+    return (difference.T @ difference).astype(np.float64) / max(1, 2 * len(difference))
 
 
 class CellDescriptor(nn.Module):

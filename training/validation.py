@@ -149,7 +149,7 @@ def camera_scores(encoder: Encoder, pictures: Encodings, distractors: Encodings)
     """The pictures of fixed cameras among themselves, float32 [n, n], and against the distractors, float32 [n, m].
 
     A map of these tasks holds all distractors and a few of the pictures.  So a picture gains from the second stage
-    where fewer distractors than there are candidates were ahead of it.
+    where fewer distractors than it examines, or screens, were ahead of it.
     """
     among = encoder.scores_from_inner_products(pictures.descriptors @ pictures.descriptors.T)
     far = encoder.scores_from_inner_products(pictures.descriptors @ distractors.descriptors.T)
@@ -158,9 +158,19 @@ def camera_scores(encoder: Encoder, pictures: Encodings, distractors: Encodings)
     raised = np.empty_like(among)
     for index, cells in enumerate(pictures.local):
         gains = encoder.agreement(cells, pictures.local)
-        ahead = (far[index][:, None] > among[index]).sum(axis=0)
-        raised[index] = among[index] + np.where(ahead < encoder.candidates, gains, 0)
+        ours, theirs = among[index], far[index]
+        examined = _ahead(theirs, ours) < encoder.screened
+        if encoder.screened > encoder.candidates:
+            first = np.argsort(-theirs, kind="stable")[: encoder.screened]
+            rivals = theirs[first] + encoder.promise(cells, distractors.local[first])
+            examined &= _ahead(rivals, ours + encoder.promise(cells, pictures.local)) < encoder.candidates
+        raised[index] = ours + np.where(examined, gains, 0)
     return raised, scores(encoder, pictures, distractors)
+
+
+def _ahead(distractors: Array, pictures: Array) -> NDArray[np.int64]:
+    """How many distractors score more than each picture; float32 [m] and [n] to int64 [n]."""
+    return np.asarray((distractors[:, None] > pictures).sum(axis=0))
 
 
 def camera_recall(task: CameraTask, among: Array, far: Array) -> float:

@@ -56,7 +56,7 @@ from training.validation import describe
 SIZES = (*SMALL, 100)
 MOST_STRANGERS, LEAST_RIGHT = 0.05, {"corridor": 0.3, "lip6": 0.7}
 LEAST_AREA = {"corridor": 0.95, "lip6": 0.93}
-PARTS = ("first", "both", "among", "truth")
+PARTS = ("first", "both", "among", "truth", "promised")
 PRECISION, LEAST_RECALL, MOST_ERROR = 0.98, 0.5, 0.06
 RECALL = {"corridor": 0.95, "lip6": 0.87}
 MODES: tuple[Verify, ...] = ("never", "auto", "always")
@@ -69,7 +69,10 @@ def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool
         with np.load(kept) as read:
             names = sorted({name.rsplit(":", 1)[0] for name in read.files})
             columns = {name: {part: read[f"{name}:{part}"] for part in PARTS} for name in names}
-            return {name: Traverse(**columns[name], candidates=encoder.candidates) for name in names}
+            return {
+                name: Traverse(**columns[name], candidates=encoder.candidates, screened=encoder.screened)
+                for name in names
+            }
     made = {
         name: scored(encoder, describe(encoder, task.queries), describe(encoder, task.references), task.truth)
         for name, task in corridor_and_lip6(datasets)

@@ -28,7 +28,7 @@ from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import METRIC, Neighborhood, Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import examine, second_stage
 from training.ground_truth import corrected_truth
 from training.photographs import find_photographs, read
 from training.validation import Encodings, describe
@@ -57,10 +57,8 @@ def evidences(
         scores = encoder.scores_from_inner_products(references.descriptors @ descriptor)
         rows = np.argsort(-scores, kind="stable")[:HEAD]
 
-        def gains(positions: NDArray[np.int64], local: Any = local, rows: Any = rows) -> NDArray[np.float32]:
-            return encoder.agreement(local, references.local[rows[positions]])
-
-        found = examine(scores[rows], where.take(rows), SAME_PLACE, encoder.candidates, gains)
+        stage = second_stage(encoder, local, references.local[rows].__getitem__)
+        found = examine(scores[rows], where.take(rows), SAME_PLACE, *stage)
         ranked = rows[found.order]
         seen = evidence(ranked, found.scores, where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
         yield int(ranked[0]), seen

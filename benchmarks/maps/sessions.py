@@ -43,7 +43,7 @@ from core.judgement.verdict import Verdict, judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import examine, second_stage
 from training.map_sizes import APART, corridor_and_lip6
 from training.validation import Encodings, describe
 
@@ -104,10 +104,8 @@ class Walk:
         scores = encoder.scores_from_inner_products(self.references.descriptors @ frame.descriptors[0])
         rows = np.argsort(-scores, kind="stable")
 
-        def gains(positions: NDArray[np.int64]) -> NDArray[np.float32]:
-            return encoder.agreement(local, self.references.local[rows[positions]])
-
-        found = examine(scores[rows], self.where.take(rows), SAME_PLACE, encoder.candidates, gains)
+        stage = second_stage(encoder, local, lambda positions: self.references.local[rows[positions]])
+        found = examine(scores[rows], self.where.take(rows), SAME_PLACE, *stage)
         ranked = rows[found.order]
         known = (self.where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
         return Look(

@@ -30,7 +30,7 @@ from core.judgement.verdict import Judgement, judge
 from core.maps import MapSettings
 from core.networks.xfeat import load_xfeat
 from core.places import Neighborhood, Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import examine, second_stage
 
 if TYPE_CHECKING:
     from core.method.encoder import Encoder
@@ -139,10 +139,8 @@ class _Maps:
         rows = part[order]
         places = Whereabouts.along_sequence(self.kept[rows])
 
-        def gains(at: Positions) -> NDArray[np.float32]:
-            return encoder.agreement(self.asked[query], self.local[rows[at]])
-
-        seen = examine(scores[order], places, self.neighborhood, encoder.candidates, gains)
+        stage = second_stage(encoder, self.asked[query], lambda at: self.local[rows[at]])
+        seen = examine(scores[order], places, self.neighborhood, *stage)
         ranked, places = rows[seen.order], places.take(seen.order)
         judged = judge(seen.scores, places, encoder.calibration, self.neighborhood, seen.examined)
         found = [(judged, int(self.kept[ranked[0]]))]

@@ -1,6 +1,7 @@
 """The compiled search for the mutual nearest neighbours among the cells of one frame and of many others, within reach.
 
-``core.method.agreement.correspondences`` says what is computed.
+``core.method.agreement.correspondences`` says what is computed, and ``core.method.agreement.promise`` what of it is
+computed for more frames.
 """
 
 from __future__ import annotations
@@ -70,3 +71,46 @@ def squared_sums(query, references, columns, rows_apart, columns_apart, cosine):
                 total += value * value
         sums[k] = total
     return sums
+
+
+SPACING = 2
+"""Of the cells of a reference those in every second row and column are a sample."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sampled_squares(query, references, columns, rows_apart, columns_apart, cosine):  # type: ignore[no-untyped-def]
+    """Mean of cos² of the query's best cell for each cell of a sample of each of k references, where that is over 0.
+
+    Args:
+        query: int8 [C, L]; C is a multiple of the columns.
+        references: int8 [k, C, L].
+        columns: of the grid.
+        rows_apart, columns_apart: the reach.
+        cosine: float32, by which an inner product is multiplied to become a cosine.
+
+    Returns:
+        float32 [k].
+    """
+    cells, length = query.shape
+    rows = cells // columns
+    wide, cell_values = query.astype(np.int16), np.empty(length, np.int16)
+    means = np.empty(len(references), np.float32)
+    for k in range(len(references)):
+        total, sample = np.float32(0), 0
+        for row in range(0, rows, SPACING):
+            for column in range(0, columns, SPACING):
+                for i in range(length):
+                    cell_values[i] = references[k, row * columns + column, i]
+                left, right = max(0, column - columns_apart), min(columns, column + columns_apart + 1)
+                highest = np.int64(0)
+                for y in range(max(0, row - rows_apart), min(rows, row + rows_apart + 1)):
+                    start = y * columns + left
+                    for j in range(right - left):
+                        product = np.int64(_product(wide[np.uint64(start + j)], cell_values))
+                        if product > highest:
+                            highest = product
+                value = np.float32(highest) * cosine
+                total += value * value
+                sample += 1
+        means[k] = total / np.float32(max(1, sample))
+    return means

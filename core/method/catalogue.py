@@ -35,8 +35,11 @@ from core.networks.identity import canonical_json
 from core.networks.network import NAME
 
 PACKAGED = Path(__file__).parents[1] / "models"
+FORMER = PACKAGED / "former"
+"""Encoders that earlier versions packaged under a name that another has now.  They are found by their identity alone,
+so that maps which were made with them are used as they are."""
 FORMAT = "placerec-encoder/1"
-PROJECTION, WHITENING = "projection.", "whitening."
+PROJECTION, CELLS, WHITENING = "projection.", "cells.", "whitening."
 ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
 
 
@@ -107,6 +110,8 @@ def save_encoder(
     }
     for name, tensor in projection_tensors(encoder.extractor.projections).items():
         tensors[f"{PROJECTION}{name}"] = tensor.numpy()
+    for name, tensor in projection_tensors(encoder.extractor.cells).items():
+        tensors[f"{CELLS}{name}"] = tensor.numpy()
     if encoder.whitening is not None:
         tensors |= {f"{WHITENING}{name}": tensor.numpy() for name, tensor in encoder.whitening.tensors().items()}
     path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
@@ -168,7 +173,8 @@ def load_encoder(path: Path, network: Path) -> Encoder:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
     vocabulary = Vocabulary(centers, header.origin)
     backbone = open_network(network, header.definition.outputs)
-    extractor = FeatureExtractor(backbone, header.definition, _read_projections(path, tensors))
+    projections, cells = (_read_projections(path, tensors, prefix) for prefix in (PROJECTION, CELLS))
+    extractor = FeatureExtractor(backbone, header.definition, projections, cells)
     canary = (golden, tensors.get("golden_local", np.zeros((0, 0), np.int8)))
     whitening = None
     if header.definition.whitening is not None:
@@ -180,8 +186,8 @@ def load_encoder(path: Path, network: Path) -> Encoder:
     return encoder
 
 
-def _read_projections(path: Path, tensors: Mapping[str, NDArray[np.generic]]) -> dict[str, Projection]:
-    parts = {name.removeprefix(PROJECTION): tensor for name, tensor in tensors.items() if name.startswith(PROJECTION)}
+def _read_projections(path: Path, tensors: Mapping[str, NDArray[np.generic]], prefix: str) -> dict[str, Projection]:
+    parts = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
     projections = {}
     for layer in sorted({name.rpartition(".")[0] for name in parts}):
         mean, matrix = parts.get(f"{layer}.mean"), parts.get(f"{layer}.matrix")
@@ -235,9 +241,21 @@ class EncoderCatalogue:
         """All installed encoders by name, including damaged ones; no weights are read."""
         return [self._summary(name, path) for name, path in self._files().items()]
 
+    def summary(self, name_or_identity: str) -> EncoderSummary:
+        """One installed encoder; no weights are read.
+
+        Raises:
+            UnknownEncoder: no encoder has this name or identity.
+            InvalidModel: its file is damaged.
+        """
+        path = self._find(name_or_identity)
+        _read_header(path)
+        return self._summary(path.name.removesuffix(ENCODER_SUFFIX), path)
+
     def _summary(self, name: str, path: Path) -> EncoderSummary:
-        source: Literal["packaged", "installed"] = "packaged" if path.parent == PACKAGED else "installed"
-        common: dict[str, Any] = {"name": name, "source": source, "default": name == DEFAULT_ENCODER}
+        source: Literal["packaged", "installed"] = "packaged" if path.parent in (PACKAGED, FORMER) else "installed"
+        default = name == DEFAULT_ENCODER and path.parent != FORMER
+        common: dict[str, Any] = {"name": name, "source": source, "default": default}
         try:
             header = _read_header(path)
         except InvalidModel as error:
@@ -267,14 +285,15 @@ class EncoderCatalogue:
         files = self._files()
         if name not in files:
             raise UnknownEncoder(f"no encoder {name[:80]!r} is installed; there are {', '.join(files) or 'none'}.")
-        if digest:
-            identity = _read_header(files[name]).identity
-            if identity != name_or_identity:
-                raise UnknownEncoder(
-                    f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
-                    "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."
-                )
-        return files[name]
+        if not digest or (identity := _read_header(files[name]).identity) == name_or_identity:
+            return files[name]
+        former = FORMER / files[name].name
+        if former.is_file() and _read_header(former).identity == name_or_identity:
+            return former
+        raise UnknownEncoder(
+            f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
+            "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."
+        )
 
     def get(self, name_or_identity: str) -> Encoder:
         """The encoder, loaded at its first use.

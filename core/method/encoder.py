@@ -16,9 +16,10 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
+from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors, promise
 from core.method.equations import Normalization
-from core.method.features import FeatureDefinition, FeatureExtractor, content_of
+from core.method.features import FeatureDefinition, FeatureExtractor, content_of, projection_tensors
+from core.method.projection import Projection
 from core.method.regions import Regions
 from core.method.vlad import aggregate, scores
 from core.method.vocabulary import Vocabulary
@@ -93,8 +94,8 @@ class Encoder:
 
     Raises:
         WrongVocabulary: the vocabulary was trained for another extractor.
-        InvalidModel: it has another number of words than the definition says, or the layers of the
-            second stage have different grids.
+        InvalidModel: it has another number of words than the definition says, the layers of the second stage have
+            different grids, or taught cells lack a projection.
     """
 
     def __init__(
@@ -118,11 +119,15 @@ class Encoder:
             raise InvalidModel(f"{name} needs a whitening to {definition.whitening} values.")
         if whitening is not None and len(whitening.mean) != vocabulary.centers.size:
             raise InvalidModel(f"{name}: its whitening is not of vectors of {vocabulary.centers.size} values.")
+        stage = definition.agreement
+        taught = {} if stage is None or not stage.taught else dict.fromkeys(stage.layers, stage.values)
+        if {layer: min(one.matrix.shape[1], taught.get(layer, 0)) for layer, one in extractor.cells.items()} != taught:
+            raise InvalidModel(f"{name} needs projections of its cells in {', '.join(taught) or 'no layer'}.")
         self.name, self.extractor, self.definition = name, extractor, definition
         self.centers, self.whitening = vocabulary.centers, whitening
         self.calibration, self._golden = calibration, golden
         self.dimension = int(self.centers.size) if whitening is None else whitening.values
-        self.identity = encoder_identity(name, definition, vocabulary, whitening)
+        self.identity = encoder_identity(name, definition, vocabulary, whitening, extractor.cells)
         self.grid = self._agreement_grid()
         """Rows and columns of the cells that the second stage compares; (0, 0) without one."""
 
@@ -146,6 +151,19 @@ class Encoder:
         """How many of the best matches the second stage examines; 0 without one."""
         stage = self.definition.agreement
         return 0 if stage is None else stage.candidates
+
+    @property
+    def screened(self) -> int:
+        """Among how many of the best matches the second stage looks for those that it examines; 0 without one."""
+        stage = self.definition.agreement
+        return 0 if stage is None else stage.screened or stage.candidates
+
+    def promise(self, query: Cells, candidates: Cells) -> Array:
+        """About what the second stage would add to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
+        stage = self.definition.agreement
+        if stage is None:
+            return np.zeros(len(candidates), np.float32)
+        return promise(query, candidates, self.grid[1], stage)
 
     def agreement(self, query: Cells, candidates: Cells) -> Array:
         """What the second stage adds to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
@@ -286,6 +304,8 @@ class Encoder:
         made = self.encode(canary_frame())
         self._hold_against(made, *self._golden, "its golden values")
         self.agreement(made.local, made.local[np.newaxis])  # compile the second stage now, not in the first query
+        if self.screened > self.candidates:
+            self.promise(made.local, made.local[np.newaxis])
 
 
 def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
@@ -297,7 +317,11 @@ def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
 
 
 def encoder_identity(
-    name: str, definition: EncoderDefinition, vocabulary: Vocabulary, whitening: Whitening | None = None
+    name: str,
+    definition: EncoderDefinition,
+    vocabulary: Vocabulary,
+    whitening: Whitening | None = None,
+    cells: Mapping[str, Projection] | None = None,
 ) -> str:
     """``<name>@<sha256>`` over everything that can change a descriptor, tensors by content."""
     centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
@@ -308,6 +332,8 @@ def encoder_identity(
     }
     if whitening is not None:
         fields["whitening"] = tensors_digest(whitening.tensors())
+    if cells:
+        fields["cells"] = tensors_digest(projection_tensors(cells))
     return f"{name}@{json_digest(fields)}"
 
 

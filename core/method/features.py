@@ -82,6 +82,7 @@ class FeatureExtractor:
 
     Args:
         projections: by layer, of those layers for which the definition needs one.
+        cells: by layer, the projections of local descriptors that have their own.
 
     Raises:
         InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or has too
@@ -89,14 +90,18 @@ class FeatureExtractor:
     """
 
     def __init__(
-        self, backbone: Backbone, definition: FeatureDefinition, projections: Mapping[str, Projection] | None = None
+        self,
+        backbone: Backbone,
+        definition: FeatureDefinition,
+        projections: Mapping[str, Projection] | None = None,
+        cells: Mapping[str, Projection] | None = None,
     ) -> None:
         if backbone.outputs != definition.outputs:
             raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
         keep_numpy_single_threaded()
         self.backbone, self.definition = backbone, definition
         self.compute()
-        self.projections = dict(projections or {})
+        self.projections, self.cells = dict(projections or {}), dict(cells or {})
         for layer, values in definition.projected().items():
             if layer not in self.projections or self.projections[layer].matrix.shape[1] < values:
                 raise InvalidModel(f"the encoder needs a projection of {layer} to {values} values.")
@@ -162,13 +167,15 @@ class FeatureExtractor:
         return maps
 
     def products(self, activations: Sequence[Array]) -> dict[str, Array]:
-        """The products of the cells with the projection's matrix, of each projected layer: float32 [..., X, Y, d].
+        """The products of the cells with the projection's matrix, float32 [..., X, Y, d], of each layer in use.
 
         Args:
             activations: of each output, of one frame or of several, float32 [..., X, Y, K].
         """
         maps = zip(self.definition.outputs, activations, strict=True)
-        used = self.definition.projected()
+        used = [
+            name for name in self.definition.projected() if name in self.definition.layers or name not in self.cells
+        ]
         return {
             name: self.projections[name].products(_cells(layer)).reshape(*layer.shape[:-1], -1)
             for name, layer in maps
@@ -210,7 +217,12 @@ class FeatureExtractor:
     ) -> list[Array]:
         """The projected local descriptors D^L of the given layers of one frame, float32 [C, values] each."""
         maps = dict(zip(self.definition.outputs, activations, strict=True))
-        return [self.projections[name].finish(_cells(products[name]), _cells(maps[name]), values) for name in layers]
+        made = []
+        for name in layers:
+            features, own = _cells(maps[name]), self.cells.get(name)
+            known = _cells(products[name]) if own is None else own.products(features)
+            made.append((own or self.projections[name]).finish(known, features, values))
+        return made
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
         """Rows and columns of each layer's maps at the network's input size."""

@@ -30,8 +30,11 @@ PRESETS: dict[str, EncoderDefinition] = {
             values=64,
             weights=(0.4, 0.4, 0.2),
             reach=(2, 5),
-            candidates=30,
-            share=0.75,
+            candidates=32,
+            share=0.73,
+            centred=0.75,
+            screened=60,
+            taught=True,
         ),
     ),
     # The same as in the thesis: regional features as they are, and no second stage.

@@ -91,9 +91,24 @@ def fit_projection(clear: Array, changed: Array, values: int) -> Projection:
     difference, centred = a - b, np.concatenate([a, b]) - mean
     within = difference.T @ difference / (2 * len(a))  # S_w
     total = centred.T @ centred / len(centred)  # S_t
-    within[np.diag_indices_from(within)] += SHRINKAGE * np.trace(within) / len(within) + 1e-12
-    variances, directions = np.linalg.eigh(within)
+    return Projection(mean.astype(np.float32), discriminant(within, total, values, SHRINKAGE))
+
+
+def discriminant(within: NDArray[np.float64], between: NDArray[np.float64], values: int, shrinkage: float) -> Array:
+    """The directions of most scatter ``between``, where ``within`` is what it is to be large against.
+
+    Args:
+        within, between: float64 [K, K], symmetric.
+        values: d, how many directions.
+        shrinkage: this share of the mean variance within is added to that of every direction.
+
+    Returns:
+        float32 [K, d], columns by falling importance, each with a shrunk variance within of one.
+    """
+    shrunk = within.copy()
+    shrunk[np.diag_indices_from(shrunk)] += shrinkage * np.trace(within) / len(within) + 1e-12
+    variances, directions = np.linalg.eigh(shrunk)
     whitening = directions / np.sqrt(variances)
-    importance, rotation = np.linalg.eigh(whitening.T @ total @ whitening)
+    importance, rotation = np.linalg.eigh(whitening.T @ between @ whitening)
     kept = np.argsort(-importance)[:values]
-    return Projection(mean.astype(np.float32), np.ascontiguousarray(whitening @ rotation[:, kept], np.float32))
+    return np.ascontiguousarray(whitening @ rotation[:, kept], np.float32)

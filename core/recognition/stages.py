@@ -3,6 +3,8 @@
 The first stage ranks all places of a map by the inner product of their descriptors with the query's (equation 3.12).
 The second stage compares the best places of that ranking with the query cell by cell.
 
+An encoder may screen more places than it compares (``core.method.agreement.promise``), and compare the most promising.
+
 Where frames were taken densely, or the robot stood still, the neighbours of one place can fill the whole list of
 candidates.  If the second stage compared only these, a similar place elsewhere would keep its low first score, the
 best place would always have a large lead, and no answer would ever be ambiguous.  So the second stage goes on past the
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,12 +170,12 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
         order = np.argsort(-ordered, kind="stable")
         rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]
 
-    def gains(positions: Positions) -> Array:
-        return encoder.agreement(local, snapshot.locals_at(rows[positions]))
+    def local_at(positions: Positions) -> Cells:
+        return snapshot.locals_at(rows[positions])
 
     for length in (HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])
-        found = examine(ordered[:length], places, neighborhood, encoder.candidates, gains)
+        found = examine(ordered[:length], places, neighborhood, *second_stage(encoder, local, local_at))
         order = found.order
         candidates = Candidates(
             rows[order],
@@ -227,31 +230,71 @@ class Examined:
     examined: NDArray[np.bool_]
 
 
+class SecondStage(NamedTuple):
+    """How the second stage of an encoder compares a query with the places of a ranking.
+
+    candidates: how many places it examines; 0 if the encoder has no second stage.
+    gains: returns what it adds to the scores at positions in the ranking, int64 [k] to float32 [k], at least 0.
+    screened: among how many of the first places it looks for those that it examines.
+    promise: returns about what it would add; None: the first places are examined.
+    """
+
+    candidates: int
+    gains: Callable[[Positions], Array]
+    screened: int = 0
+    promise: Callable[[Positions], Array] | None = None
+
+
+def second_stage(encoder: Encoder, query: Cells, local_at: Callable[[Positions], Cells]) -> SecondStage:
+    """The second stage of an encoder for one query, int8 [C, L].
+
+    Args:
+        local_at: returns the local descriptors at positions in the ranking, int64 [k] to int8 [k, C, L].
+    """
+
+    read = np.zeros((0, *query.shape), np.int8)  # of the first places, if they were screened
+
+    def promise(positions: Positions) -> Array:
+        nonlocal read
+        read = local_at(positions)
+        return encoder.promise(query, read)
+
+    def gains(positions: Positions) -> Array:
+        known = bool((positions < len(read)).all())
+        return encoder.agreement(query, read[positions] if known else local_at(positions))
+
+    return SecondStage(encoder.candidates, gains, encoder.screened, promise)
+
+
 def examine(
     scores: Array,
     whereabouts: Whereabouts,
     neighborhood: Neighborhood,
     candidates: int,
     gains: Callable[[Positions], Array],
+    screened: int = 0,
+    promise: Callable[[Positions], Array] | None = None,
     others: int = TOP_PLACES,
 ) -> Examined:
     """Raise the scores of the best places of a ranking by the gains of the second stage.
 
-    It examines the first ``candidates`` places.  As long as fewer than ``others`` of the examined places are other than
-    the best place, it then examines the best of the places that are.
+    It examines the first ``candidates`` places or, if more are ``screened``, the most promising of these.  As long as
+    fewer than ``others`` of the examined places are other than the best place, it then examines the next that are.
 
     Args:
         scores: float32 [n], the scores of the first stage, best first.
         whereabouts: the poses and sequences of the n places.
         neighborhood: which places count as the same place.
-        candidates: how many places the encoder's second stage examines; 0 if the encoder has no second stage.
-        gains: returns what the second stage adds to the scores at positions in the ranking, int64 [k] to float32 [k],
-            at least 0.
+        candidates, gains, screened, promise: as of :class:`SecondStage`.
         others: how many of the examined places have to be other than the best place, if the map has so many.
     """
     raised = scores.copy()
     done = np.zeros(len(scores), np.bool_)
-    ahead = np.arange(min(candidates, len(scores)))
+    queue = np.arange(len(scores))  # in the order in which places are examined
+    if promise is not None and candidates < min(screened, len(queue)):
+        first = queue[:screened]
+        queue[:screened] = np.argsort(-(scores[first] + promise(first)), kind="stable")
+    ahead = queue[:candidates]
     for _ in range(ROUNDS):
         if not len(ahead):
             break
@@ -260,7 +303,7 @@ def examine(
         best = int(np.flatnonzero(done)[np.argmax(raised[done])])
         elsewhere = whereabouts.others(best, neighborhood)
         missing = max(0, others - int((done & elsewhere).sum()))
-        ahead = np.flatnonzero(elsewhere & ~done)[:missing]
+        ahead = queue[(elsewhere & ~done)[queue]][:missing]
     order = np.argsort(-raised, kind="stable")
     return Examined(order, raised[order], done[order])
 
@@ -286,9 +329,9 @@ def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, refere
     for row, query in zip(scores, queries, strict=True):
         order = np.argsort(-row, kind="stable")
 
-        def gains(positions: Positions, query: Cells = query, order: Positions = order) -> Array:
-            return encoder.agreement(query, references[order[positions]])
+        def local_at(positions: Positions, order: Positions = order) -> Cells:
+            return references[order[positions]]
 
-        found = examine(row[order], places.take(order), neighborhood, encoder.candidates, gains)
+        found = examine(row[order], places.take(order), neighborhood, *second_stage(encoder, query, local_at))
         row[order[found.order]] = found.scores
     return scores

@@ -11,7 +11,15 @@ from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass, field
 
-from core.errors import MapQuarantined, PlacerecError, StoreUnavailable, UnknownEncoder, UnknownMap, WrongEncoder
+from core.errors import (
+    InvalidModel,
+    MapQuarantined,
+    PlacerecError,
+    StoreUnavailable,
+    UnknownEncoder,
+    UnknownMap,
+    WrongEncoder,
+)
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
@@ -183,10 +191,10 @@ class Engine:
 
     def default_calibration(self, identity: str) -> Calibration | None:
         """The calibration that an encoder ships with; None if the encoder is not installed."""
-        for summary in self.catalogue.describe():
-            if summary.identity == identity:
-                return summary.calibration
-        return None
+        try:
+            return self.catalogue.summary(identity).calibration
+        except (UnknownEncoder, InvalidModel):
+            return None
 
     def load_encoder(self, map_: Map) -> Encoder:
         """The encoder of a map; blocks, so call it in a thread, never on the event loop.

@@ -20,7 +20,15 @@ from typing import Any
 from anyio import CapacityLimiter
 
 from core.disk.files import disk_errors, write_at
-from core.errors import InvalidArchive, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
+from core.errors import (
+    InvalidArchive,
+    InvalidModel,
+    StorageFull,
+    TooManyPixels,
+    UnknownEncoder,
+    UnknownMap,
+    WrongEncoder,
+)
 from core.frames.containers import read_header
 from core.frames.images import Limits
 from core.maps.archives.manifest import Manifest
@@ -154,8 +162,9 @@ class Imports:
         Raises:
             WrongEncoder: it is not installed, or damaged.
         """
-        for installed in self._engine.catalogue.describe():
-            if installed.identity == manifest.map.encoder and installed.damaged is None:
+        with suppress(UnknownEncoder, InvalidModel):
+            installed = self._engine.catalogue.summary(manifest.map.encoder)
+            if installed.identity == manifest.map.encoder:
                 return installed
         raise WrongEncoder(f"The file's map is bound to {manifest.map.encoder[:140]}, which is not installed here.")
 

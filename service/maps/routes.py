@@ -109,7 +109,7 @@ def create_map(
     request.state.noted = {"map": new.id}
     principal.require(new.id)
     identity = engine.resolve(new.encoder)
-    encoder = next(summary for summary in engine.catalogue.describe() if summary.identity == identity)
+    encoder = engine.catalogue.summary(identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
         check_map_count(engine)

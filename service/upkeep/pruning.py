@@ -149,7 +149,8 @@ def _search(
     """
     candidates = np.flatnonzero(queries)
     chosen = candidates[spread_order(len(candidates))[:sample]]
-    depth, stage = min(DEPTH, max(1, len(own))), own.encoder.candidates
+    stage = own.encoder.screened  # the best of them is examined, as good as always
+    depth = min(max(DEPTH, stage), max(1, len(own)))
     found: list[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]] = []
     everything = np.flatnonzero(references)
     for first in range(0, len(chosen), TOGETHER):

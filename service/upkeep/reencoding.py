@@ -93,7 +93,7 @@ class _Reencoding:
         """By id, the places whose frames the new encoder cannot encode, and why."""
 
     def _create(self) -> Map:
-        encoder = next(one for one in self.engine.catalogue.describe() if one.identity == self.identity)
+        encoder = self.engine.catalogue.summary(self.identity)
         record = self.source.record
         return self.engine.maps.create(
             self.target,

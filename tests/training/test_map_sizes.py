@@ -16,12 +16,14 @@ from training.map_sizes import (
     APART,
     CANDIDATES,
     SMALL,
+    STRANGERS,
     Traverse,
     cut,
     fit_geometry,
     fit_small_maps,
     trials_of_halves,
     trials_of_size,
+    widened,
 )
 
 CALIBRATION = Calibration(
@@ -86,6 +88,21 @@ def test_what_is_fitted_makes_probabilities_of_small_maps_honest() -> None:
                 off.append((loss[known].mean() + loss[~known].mean()) / 2)
         errors.append(np.mean(off))
     assert errors[1] < 0.9 * errors[0]
+
+
+def test_an_environment_is_widened_until_strangers_of_small_maps_are_refused() -> None:
+    """Of two kinds of traverses, one whose places score much alike."""
+    alike = [("plain 0", traverse(0.12, 0)), ("alike 0", traverse(0.25, 1))]
+    found = widened(CALIBRATION, alike, repeats=1)
+    assert CALIBRATION.environment is not None and found.deviation > CALIBRATION.environment.deviation
+    assert found.model_copy(update={"deviation": CALIBRATION.environment.deviation}) == CALIBRATION.environment
+    better = CALIBRATION.model_copy(update={"environment": found})
+    shares = []
+    for size in SMALL:
+        trials, _ = trials_of_size(alike[1][1], size, "run", better, 1)
+        shares.append(float(trials.recognized(better)[~trials.known].mean()))
+    assert np.mean(shares) <= 4 * STRANGERS, "the other kind and drawn maps, which count as much, have none"
+    assert widened(CALIBRATION, alike[:1], repeats=1) == CALIBRATION.environment, "nothing has to be refused"
 
 
 def verifiable(mean: float, seed: int) -> Traverse:

@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from core.method.agreement import AgreementDefinition
-from core.method.projection import Projection
+from core.method.projection import Projection, discriminant
 from core.networks.network import ShallowNetwork
 from training.loss_curve import draw_loss_curve
 from training.projections import (
     CellDescriptor,
     PairedCells,
     contrastive_loss,
+    fit_cell_projections,
     fit_projections,
     neighbours,
     paired_cells,
@@ -37,6 +38,25 @@ def test_projections_are_fitted_layer_by_layer_and_repeatably(photographs: Path)
     assert {layer: one.matrix.shape for layer, one in made.items()} == {"pool2": (256, 5), "conv3": (384, 7)}
     for layer, one in made.items():
         np.testing.assert_allclose(one.matrix, again[layer].matrix, rtol=1e-3, atol=1e-5)
+
+
+def test_projections_of_cells_are_fitted_to_the_stage_and_repeatably(photographs: Path) -> None:
+    stage = STAGE.model_copy(update={"layers": ("pool2", "conv3"), "weights": (0.5, 0.5)})
+    start = fit_projections(network(*stage.layers), {"pool2": 4, "conv3": 6}, photographs, 4)
+    made, again = (fit_cell_projections(network(*stage.layers), stage, photographs, start, 5) for _ in "ab")
+    assert {layer: one.matrix.shape for layer, one in made.items()} == {"pool2": (256, 4), "conv3": (384, 4)}
+    for layer, one in made.items():
+        np.testing.assert_allclose(one.matrix, again[layer].matrix, rtol=1e-3, atol=1e-5)
+        assert not np.allclose(one.matrix, start[layer].matrix[:, :4], rtol=0.1)
+
+
+def test_a_discriminant_tells_wrong_matches_from_right_ones() -> None:
+    # The first value differs most between wrong matches, but between right ones, too; the second tells them apart.
+    within, between = np.diag([9.0, 0.1, 1.0]), np.diag([10.0, 2.0, 0.5])
+    plain, shrunk = (discriminant(within, between, 2, shrinkage) for shrinkage in (0.0, 100.0))
+    assert np.abs(plain).argmax(axis=0).tolist() == [1, 0]
+    assert np.abs(shrunk).argmax(axis=0).tolist() == [0, 1]
+    np.testing.assert_allclose(plain.T @ within @ plain, np.eye(2), atol=1e-5)
 
 
 def test_refining_finds_the_directions_that_conditions_leave_alone(photographs: Path) -> None:

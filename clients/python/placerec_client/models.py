@@ -14,7 +14,11 @@ from placerec_client.model import Known, Model
 class AgreementDefinition(Model):
     """The second stage of an encoder. ``layers`` share one grid; ``values`` of each are kept, and its cosine counts
     by its ``weights``. ``reach`` is how far a cell may have moved, in rows and columns. ``candidates`` are examined;
-    the mean squared cosine over all cells makes up ``share`` of their score, the first stage's score the rest.
+    the mean squared cosine over all cells makes up ``share`` of their score, the first stage's score the rest. They
+    are the first of the ranking or, if more places are ``screened``, the most promising of these. ``centred`` is the
+    share of its mean over the frame that each value of a cell loses before it is divided by its deviation over the
+    frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own
+    (``training.projections``), others those of the regions. Encoders of 0.1.0 have none of the three.
     """
 
     layers: list[str]
@@ -23,6 +27,9 @@ class AgreementDefinition(Model):
     reach: tuple[int, int]
     candidates: int
     share: float
+    centred: float | None = None
+    screened: int | None = None
+    taught: str | None = None
 
 
 class AliasView(Model):

@@ -9,10 +9,13 @@ from pydantic import ValidationError
 
 from core.method.agreement import (
     RESOLUTION,
+    STEADINESS,
     AgreementDefinition,
     agreement,
     correspondences,
     local_descriptors,
+    promise,
+    standardized,
 )
 
 ROWS, COLUMNS = 4, 6
@@ -76,6 +79,41 @@ def test_layers_count_by_their_weights() -> None:
     assert query.shape == (1, 8)
 
 
+def test_standardized_cells_by_hand() -> None:
+    cells = np.array([[1, 0], [0, 0], [0.6, 0.8]], np.float32)
+    mean, deviation = np.array([0.8, 0.4]), np.array([0.2, 0.4])
+    wanted = (cells[[0, 2]] - 0.75 * mean) / (deviation + STEADINESS * 0.3)
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    found = standardized(cells, 0.75)
+    np.testing.assert_allclose(found[[0, 2]], wanted, atol=1e-6)
+    assert not found[1].any() and not standardized(np.zeros((3, 2), np.float32), 0.75).any()
+    np.testing.assert_array_equal(standardized(cells[:1], 0.75), cells[:1])  # nothing deviates
+    stage = definition(values=2)
+    made = local_descriptors([cells], stage.model_copy(update={"centred": 0.75}))
+    np.testing.assert_array_equal(made, local_descriptors([found], stage))
+    assert not np.array_equal(made, local_descriptors([cells], stage))
+
+
+def test_a_promise_is_of_every_second_cell_and_of_one_direction() -> None:
+    """Each of the sampled cells of a reference has the best one of the query within reach."""
+    stage, query = definition(), random_cells(1)
+    references = np.stack([random_cells(2), random_cells(3), np.zeros_like(query)])
+    cells = np.arange(ROWS * COLUMNS)
+    row, column = np.divmod(cells, COLUMNS)
+    sample = cells[(row % 2 == 0) & (column % 2 == 0)]
+    wanted = []
+    for reference in references:
+        products = reference[sample].astype(float) @ query.astype(float).T / RESOLUTION**2
+        far = (np.abs(row[sample, None] - row) > stage.reach[0]) | (
+            np.abs(column[sample, None] - column) > stage.reach[1]
+        )
+        best = np.where(far, 0, products).max(axis=1).clip(0)
+        wanted.append(stage.share * (best**2).mean())
+    np.testing.assert_allclose(promise(query, references, COLUMNS, stage), wanted, rtol=1e-5)
+    with pytest.raises(ValueError, match="cannot be compared"):
+        promise(query, references[:, :6], COLUMNS, stage)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -86,6 +124,8 @@ def test_layers_count_by_their_weights() -> None:
         {"share": 0.0},
         {"share": 1.0},
         {"candidates": 0},
+        {"centred": 1.5},
+        {"screened": 1},
     ],
 )
 def test_a_definition_that_makes_no_sense_is_refused(wrong: dict[str, object]) -> None:

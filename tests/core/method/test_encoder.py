@@ -175,7 +175,8 @@ def test_with_a_second_stage_the_score_is_shared_with_the_agreement() -> None:
 def test_a_frame_without_regions_scores_zero_in_the_second_stage_too() -> None:
     packaged = EncoderCatalogue().get("m-region-vlad")
     definition = packaged.definition.model_copy(update={"steps": (1e6, 1e6)})  # levels that nothing reaches
-    extractor = FeatureExtractor(packaged.extractor.backbone, definition, packaged.extractor.projections)
+    projections, cells = packaged.extractor.projections, packaged.extractor.cells
+    extractor = FeatureExtractor(packaged.extractor.backbone, definition, projections, cells)
     vocabulary = Vocabulary(packaged.centers, extractor.origin)
     encoding = Encoder("blind", extractor, definition, vocabulary, CALIBRATION).encode(random_frame(1))
     assert len(encoding.regions) == 0
@@ -310,6 +311,42 @@ def test_packaged_encoders_reproduce_their_golden_values(name: str) -> None:
     assert len(encoding.regions) == pytest.approx(regions, abs=2)  # one may cross a level on another processor
     for index, value in values.items():
         assert encoding.descriptor[index] == pytest.approx(value, abs=0.01)
+
+
+def test_a_definition_without_later_fields_keeps_its_identity_and_a_changed_second_stage_the_descriptors() -> None:
+    """The identity is that of the default encoder of 0.1.0, which had the same first stage and a plainer second one."""
+    packaged = EncoderCatalogue().get("m-region-vlad")
+    plain = AgreementDefinition(
+        layers=("pool2", "conv3", "conv4"), values=64, weights=(0.4, 0.4, 0.2), reach=(2, 5), candidates=30, share=0.75
+    )
+    projections = packaged.extractor.projections
+
+    def with_stage(stage: AgreementDefinition, cells: dict[str, Projection] | None = None) -> Encoder:
+        definition = packaged.definition.model_copy(update={"agreement": stage})
+        extractor = FeatureExtractor(packaged.extractor.backbone, definition, projections, cells)
+        vocabulary = Vocabulary(packaged.centers, extractor.origin)
+        return Encoder("m-region-vlad", extractor, definition, vocabulary, CALIBRATION)
+
+    old = with_stage(plain)
+    assert old.identity == "m-region-vlad@9584cde69ac83864efd2ddb560b29b7cf88ea4e9e0c148d190beb8e55a8cde9e"
+    assert old.screened == old.candidates == 30
+    frame, seen = old.encode(canary_frame()), {old.identity}
+    taught = plain.model_copy(update={"taught": True})
+    for other, same_cells in (
+        (with_stage(plain.model_copy(update={"centred": 0.75})), False),
+        (with_stage(plain.model_copy(update={"screened": 60})), True),
+        (with_stage(taught, {layer: projections[layer] for layer in plain.layers}), True),
+        (packaged, False),
+    ):
+        assert other.identity not in seen
+        seen.add(other.identity)
+        made = other.encode(canary_frame())
+        np.testing.assert_array_equal(made.descriptor, frame.descriptor)
+        assert made.local.shape == frame.local.shape
+        assert np.array_equal(made.local, frame.local) == same_cells
+    for stage, cells in (taught, {}), (taught, {"conv3": projections["conv3"]}), (plain, projections):
+        with pytest.raises(InvalidModel, match="needs projections of its cells in"):
+            with_stage(stage, cells)
 
 
 def test_the_golden_check_leaves_nothing_to_compile_for_the_first_query(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,27 @@ def test_no_more_is_examined_if_the_candidates_are_different_places() -> None:
     assert found.examined.tolist() == [True] * 30 + [False] * 30
 
 
+def test_the_most_promising_of_the_screened_places_are_examined() -> None:
+    """Of six that are screened two, and then the best that are other than those: screened ones first."""
+    scores = np.linspace(0.2, 0.1, 10).astype(np.float32)
+    promises = np.array([0, 0.3, 0, 0, 0.5, 0.1, 9, 9, 9, 9], np.float32)
+    gains = np.linspace(0.1, 0.2, 10).astype(np.float32)
+    asked: list[int] = []
+
+    def examined(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        asked.extend(rows.tolist())
+        return gains[rows]
+
+    found = examine(scores, in_sequence(10), SAME, 2, examined, 6, lambda rows: promises[rows], others=0)
+    assert asked == [4, 1]
+    assert sorted(found.order[found.examined].tolist()) == [1, 4]
+    np.testing.assert_allclose(found.scores[:2], sorted(scores[[1, 4]] + gains[[1, 4]], reverse=True))
+    asked.clear()
+    close = in_sequence(10, [0, 4, 100, 200, 5, 300, 400, 500, 600, 700])  # 1 and 4 are one place
+    examine(scores, close, Neighborhood(5.0, 3), 2, examined, 6, lambda rows: promises[rows], others=3)
+    assert asked == [4, 1, 5, 0, 2]
+
+
 @pytest.mark.parametrize("n", [0, 1, 4])
 def test_maps_smaller_than_the_number_of_candidates(n: int) -> None:
     found = examine(
