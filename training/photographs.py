@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from training.augmentation import augment
+from training.views.augmentation import augment
 
 Pixels = NDArray[np.uint8]
 

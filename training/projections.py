@@ -28,9 +28,9 @@ from core.method.agreement import AgreementDefinition, Cells, correspondences, l
 from core.method.equations import unit_length
 from core.method.projection import Projection, discriminant, fit_projection
 from core.networks.network import ShallowNetwork
-from training.displaced_views import COLUMNS, Displacement, displaced_views
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs
+from training.views.displaced_views import COLUMNS, Displacement, displaced_views
 
 Array = NDArray[np.float32]
 

@@ -46,7 +46,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas
-from training.augmentation import augment
+from training.views.augmentation import augment
 
 Array = NDArray[np.float64]
 FITTED = ("train/camvid", "train/facades", "train/tower")

@@ -18,7 +18,6 @@ What all cells of a frame have in common, as its light and weather, may be taken
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +61,7 @@ class AgreementDefinition(BaseModel):
     share: float = Field(gt=0, lt=1)
     centred: float | None = Field(default=None, ge=0, le=1)
     screened: int | None = Field(default=None, ge=1, le=1000)
-    taught: Literal[True] | None = None
+    taught: bool | None = None
 
     @model_validator(mode="after")
     def _one_weight_a_layer(self) -> AgreementDefinition:

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from training.displaced_views import COLUMNS, STRIDE, answering, displaced, displaced_views
+from training.views.displaced_views import COLUMNS, STRIDE, answering, displaced, displaced_views
 
 
 def test_cells_answer_each_other_where_a_warp_moves_them() -> None:

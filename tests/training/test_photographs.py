@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from training.augmentation import STEPS, augment
 from training.photographs import AugmentedCrops, day_and_night, random_crop, split_photographs
+from training.views.augmentation import STEPS, augment
 
 
 def test_the_split_keeps_whole_cameras_out_and_never_overlaps(photographs: Path) -> None:

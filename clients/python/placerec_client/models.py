@@ -29,7 +29,7 @@ class AgreementDefinition(Model):
     share: float
     centred: float | None = None
     screened: int | None = None
-    taught: str | None = None
+    taught: bool | None = None
 
 
 class AliasView(Model):

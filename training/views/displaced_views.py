@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.augmentation import augment
 from training.photographs import Pixels, day_and_night, read, source_weights, split_photographs
+from training.views.augmentation import augment
 
 CAMERA_SHARE = 0.08
 """How many of the pairs are a day and a night of a fixed camera."""

@@ -1,0 +1,1 @@
+"""What training draws of photographs: disturbed crops, and pairs of displaced views."""
