@@ -8,8 +8,8 @@ compact index returns only about the best hundred, and a second stage compares o
 
 On traverses of camvid and nordland_tiny the true place's score is distributed so that its log likelihood ratio grows by
 about 5 from the mean score to the believable one, and flattens at 7 to 8; a true place that is not listed has -1 to -2.
-Consecutive frames show the same things and lead to the same mistakes, so that half of that is counted.  How much a
-frame shows that the last one did not is for ``view`` to say.
+Consecutive frames show the same things and lead to the same mistakes, so that less than half of that is counted.  How
+much a frame shows that the last one did not is for ``view`` to say.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from core.places import Neighborhood, Whereabouts
 LISTED = 100
 """Without a second stage, this many places are listed; every index returns as many."""
 
-STRENGTH = 2.5
-"""Log likelihood ratio of a place at the believable score against one in the background; ``filter.LEAVING`` says what
-it was chosen on."""
+STRENGTH = 2.0
+"""Log likelihood ratio of a place at the believable score against one in the background.  ``filter.LEAVING`` says what
+2.5 was chosen on, with the second stage of 0.1.0; today's examines the most promising places, whose scores lie closer
+together.  2.0 was chosen on nordland_tiny."""
 
 STRONGEST = 8.0
 """Largest log likelihood ratio that a frame gives to a place; 6 and 12 give the same results."""
