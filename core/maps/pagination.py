@@ -10,11 +10,11 @@ import base64
 import binascii
 import json
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import TypeVar
 
 from core.errors import InvalidCursor
 from core.maps.place_filter import PlaceFilter
+from core.maps.stored_fields import moment_text
 
 Entry = TypeVar("Entry")
 
@@ -81,12 +81,9 @@ def _text_of(wanted: PlaceFilter) -> str | None:
     """Text that is the same for the same conditions; None without any but ``sequence``."""
     ids = None if wanted.ids is None else json.dumps(wanted.ids)
     metadata = json.dumps(dict(wanted.metadata)) if wanted.metadata else None
-    given = [ids, wanted.camera, _moment(wanted.after), _moment(wanted.before), metadata]
+    after, before = (moment and moment_text(moment) for moment in (wanted.after, wanted.before))
+    given = [ids, wanted.camera, after, before, metadata]
     return None if given == [None] * len(given) else json.dumps(given)
-
-
-def _moment(moment: datetime | None) -> str | None:
-    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 
 def one_more(limit: int) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from core.errors import InvalidField
@@ -16,8 +16,8 @@ POSE_VALUES = ("x", "y", "z", "latitude", "longitude", "heading")
 
 
 def moment_text(moment: datetime) -> str:
-    """A moment in UTC as text, which sorts by time."""
-    return moment.isoformat(timespec="microseconds")
+    """A moment as text in UTC, which sorts by time."""
+    return moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 
 def _is_deep(value: Any) -> bool:

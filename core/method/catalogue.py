@@ -186,6 +186,16 @@ def load_encoder(path: Path, network: Path) -> Encoder:
     return encoder
 
 
+def _whose(path: Path) -> dict[str, Any]:
+    """Name, source and default of an encoder, by its file."""
+    name = path.name.removesuffix(ENCODER_SUFFIX)
+    return {
+        "name": name,
+        "source": "packaged" if path.parent in (PACKAGED, FORMER) else "installed",
+        "default": name == DEFAULT_ENCODER and path.parent != FORMER,
+    }
+
+
 def _read_projections(path: Path, tensors: Mapping[str, NDArray[np.generic]], prefix: str) -> dict[str, Projection]:
     parts = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
     projections = {}
@@ -239,7 +249,7 @@ class EncoderCatalogue:
 
     def describe(self) -> list[EncoderSummary]:
         """All installed encoders by name, including damaged ones; no weights are read."""
-        return [self._summary(name, path) for name, path in self._files().items()]
+        return [self._summary(path) for path in self._files().values()]
 
     def summary(self, name_or_identity: str) -> EncoderSummary:
         """One installed encoder; no weights are read.
@@ -249,15 +259,11 @@ class EncoderCatalogue:
             InvalidModel: its file is damaged.
         """
         path = self._find(name_or_identity)
-        _read_header(path)
-        return self._summary(path.name.removesuffix(ENCODER_SUFFIX), path)
+        return self._of_header(path, _read_header(path))
 
-    def _summary(self, name: str, path: Path) -> EncoderSummary:
-        source: Literal["packaged", "installed"] = "packaged" if path.parent in (PACKAGED, FORMER) else "installed"
-        default = name == DEFAULT_ENCODER and path.parent != FORMER
-        common: dict[str, Any] = {"name": name, "source": source, "default": default}
+    def _summary(self, path: Path) -> EncoderSummary:
         try:
-            header = _read_header(path)
+            return self._of_header(path, _read_header(path))
         except InvalidModel as error:
             blank: dict[str, Any] = {
                 "identity": "",
@@ -267,9 +273,11 @@ class EncoderCatalogue:
                 "definition": None,
                 "calibration": None,
             }
-            return EncoderSummary(**common, **blank, training={}, damaged=str(error))
-        fields = header.model_dump(exclude={"origin", "name"})
-        return EncoderSummary(**common, **fields)
+            return EncoderSummary(**_whose(path), **blank, training={}, damaged=str(error))
+
+    @staticmethod
+    def _of_header(path: Path, header: _Header) -> EncoderSummary:
+        return EncoderSummary(**_whose(path), **header.model_dump(exclude={"origin", "name"}))
 
     def resolve(self, name_or_identity: str) -> str:
         """The full identity of an installed encoder.

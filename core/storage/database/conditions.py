@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
 from typing import Any
 
 from core.maps.place_filter import PlaceFilter
+from core.maps.stored_fields import moment_text
 from core.storage.attributes import WANTED
 
 _HAS_VALUES = (
@@ -21,13 +21,8 @@ def conditions(wanted: PlaceFilter) -> dict[str, str]:
         "p.id IN (SELECT value FROM json_each(?))": None if wanted.ids is None else json.dumps(wanted.ids),
         "s.name = ?": wanted.sequence,
         "p.camera = ?": wanted.camera,
-        "p.timestamp >= ?": _moment(wanted.after),
-        "p.timestamp <= ?": _moment(wanted.before),
+        "p.timestamp >= ?": wanted.after and moment_text(wanted.after),
+        "p.timestamp <= ?": wanted.before and moment_text(wanted.before),
         _HAS_VALUES: json.dumps(dict(wanted.metadata)) if wanted.metadata else None,
     }
     return {condition: value for condition, value in given.items() if value is not None}
-
-
-def _moment(moment: datetime | None) -> str | None:
-    """A moment as it is stored."""
-    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")

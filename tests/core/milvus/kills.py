@@ -9,11 +9,9 @@ when both clients have been served again, the map is compared with the model.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import random
-import secrets
 import statistics
 import sys
 import threading
@@ -28,6 +26,7 @@ import numpy as np
 from core.errors import StorageFailure, UnknownMap, UnknownPlace
 from core.milvus import open_store
 from core.milvus.map import MilvusMap
+from tests.campaigns import read_arguments
 from tests.core.milvus.clients import Client, ProcessClient
 from tests.core.milvus.parts import PARTS, Part
 from tests.core.milvus.servers import Servers, running_servers
@@ -268,14 +267,8 @@ def _works_at(part: Part) -> float:
 
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
-    parser = argparse.ArgumentParser(prog="scripts/soak cluster", description=__doc__)
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--seed", default=None)
-    parser.add_argument("--minutes", type=float, default=None, help="begin no further kill after so long")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="which to kill")
-    chosen = parser.parse_args(arguments)
-    seed = chosen.seed or secrets.token_hex(4)
-    print(f"seed {seed}", flush=True)
+    chosen = read_arguments(arguments, "cluster", __doc__, PARTS, kills=100)
+    seed = chosen.seed
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
     draw, began = random.Random(seed), time.monotonic()
     with running_servers() as servers:

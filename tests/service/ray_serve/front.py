@@ -23,15 +23,11 @@ PATIENCE = 60.0
 
 
 class Front:
-    """The process; one that has ended is started again, as what supervises a service does.
-
-    restarts: how often it was.
-    """
+    """The process; one that has ended is started again, as what supervises a service does."""
 
     def __init__(self, address: str, folder: Path) -> None:
         self._arguments = [sys.executable, "-m", "tests.service.ray_serve.front", address, str(folder)]
         self._process = self._started()
-        self.restarts = 0
 
     def _started(self) -> subprocess.Popen[str]:
         root = Path(__file__).parents[3]
@@ -50,7 +46,6 @@ class Front:
             pass
         self._process.wait()
         self._process = self._started()
-        self.restarts += 1
         return ""
 
     def __enter__(self) -> Self:
@@ -61,10 +56,6 @@ class Front:
         self._process.wait()
 
 
-async def _stays() -> None:
-    await asyncio.Event().wait()
-
-
 async def main(address: str, folder: Path) -> None:
     """Encode what is asked for."""
     from core.frames.images import Limits
@@ -73,6 +64,7 @@ async def main(address: str, folder: Path) -> None:
     from service.ray_serve import encoders_for
     from service.settings import Settings
     from service.telemetry.metrics import Metrics
+    from tests.service.ray_serve.robots import stays
     from tests.service.scenes import jpeg
 
     settings = Settings(
@@ -88,7 +80,7 @@ async def main(address: str, folder: Path) -> None:
     identity = catalogue.resolve(DEFAULT_ENCODER)
     while line := await asyncio.to_thread(sys.stdin.readline):
         try:
-            deadline = RequestDeadline(time.monotonic() + PATIENCE, _stays)
+            deadline = RequestDeadline(time.monotonic() + PATIENCE, stays)
             found = await queue.encode(identity, jpeg(int(line)), deadline)
         except NotReady:
             print("answer ", flush=True)

@@ -14,7 +14,6 @@ import argparse
 import asyncio
 import os
 import random
-import secrets
 import signal
 import statistics
 import sys
@@ -29,6 +28,7 @@ from service.engine.queue import EncoderQueue
 from service.ray_serve import encoders_for
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from tests.campaigns import read_arguments
 from tests.service.ray_serve.nodes import Node, Nodes
 from tests.service.ray_serve.robots import Robots
 from tests.service.ray_serve.test_ray_serve import pids, wait_for_replicas
@@ -79,9 +79,9 @@ class Campaign:
         return f"{kills} kills, {self.answered} answered, none refused; {'; '.join(times)}"
 
 
-async def run(nodes: Nodes, chosen: argparse.Namespace, seed: str) -> int:
+async def run(nodes: Nodes, chosen: argparse.Namespace) -> int:
     """Kill until there were enough kills, or the time is over."""
-    draw, began = random.Random(seed), time.monotonic()
+    draw, began = random.Random(chosen.seed), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         settings = Settings(
             data_dir=Path(folder) / "data", ray=True, ray_address=nodes.address, ray_replicas=2, ray_max_replicas=2
@@ -89,7 +89,7 @@ async def run(nodes: Nodes, chosen: argparse.Namespace, seed: str) -> int:
         catalogue = EncoderCatalogue(precision="float32")
         queue = EncoderQueue(catalogue, Limits(), 64, 0, Metrics(), encoders_for(settings))
         try:
-            campaign = await asyncio.to_thread(Campaign, nodes, queue, random.Random(seed))
+            campaign = await asyncio.to_thread(Campaign, nodes, queue, random.Random(chosen.seed))
             await asyncio.to_thread(wait_for_replicas, queue, 2)
             for _ in range(chosen.kills):
                 await campaign.kill(draw.choice(chosen.parts))
@@ -103,16 +103,9 @@ async def run(nodes: Nodes, chosen: argparse.Namespace, seed: str) -> int:
 
 def main(arguments: Sequence[str]) -> int:
     """Start a cluster and kill its parts."""
-    parser = argparse.ArgumentParser(prog="scripts/soak ray", description=__doc__)
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--seed", default=None)
-    parser.add_argument("--minutes", type=float, default=None, help="begin no further kill after so long")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="which to kill")
-    chosen = parser.parse_args(arguments)
-    seed = chosen.seed or secrets.token_hex(4)
-    print(f"seed {seed}", flush=True)
+    chosen = read_arguments(arguments, "ray", __doc__, PARTS, kills=20)
     with Nodes() as nodes:
-        return asyncio.run(run(nodes, chosen, seed))
+        return asyncio.run(run(nodes, chosen))
 
 
 if __name__ == "__main__":

@@ -61,11 +61,6 @@ class Nodes:
         )
         self._nodes = [self._read()]
 
-    @property
-    def head(self) -> Node:
-        """The node that keeps the cluster together."""
-        return self._nodes[0]
-
     def start_head(self) -> None:
         """Start another head at the same address; what the one before it knew is lost."""
         self._nodes[0] = self._ask("head")

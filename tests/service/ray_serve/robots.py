@@ -19,7 +19,8 @@ PATIENCE = 120.0
 """Seconds that a robot waits for an answer."""
 
 
-async def _stays() -> None:
+async def stays() -> None:
+    """A client that does not hang up."""
     await asyncio.Event().wait()
 
 
@@ -59,7 +60,7 @@ class Robots:
 
     async def _ask(self, number: int) -> None:
         while not self._over:
-            deadline = RequestDeadline(time.monotonic() + PATIENCE, _stays)
+            deadline = RequestDeadline(time.monotonic() + PATIENCE, stays)
             try:
                 found = await self._queue.encode(self._identity, jpeg(number), deadline)
             except NotReady:

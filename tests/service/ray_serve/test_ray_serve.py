@@ -26,6 +26,7 @@ from service.ray_serve import encoders_for
 from service.ray_serve.encoders import ATTEMPTS, RayEncoders
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from tests.service.ray_serve.robots import stays
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -92,10 +93,6 @@ def pids(wanted: int) -> set[int]:
         if len(found) < wanted:
             found.add(handle().pid.remote().result(timeout_s=60))
     return found
-
-
-async def stays() -> None:
-    await asyncio.Event().wait()
 
 
 def deadline(seconds: float = 120) -> RequestDeadline:
