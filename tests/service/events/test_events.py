@@ -96,7 +96,7 @@ def test_a_session_is_told_from_its_beginning_to_its_end(quick: Server, lab: str
         session = quick.client.post(f"/v1/maps/{lab}/sessions", json={}).json()["id"]
         frames = f"/v1/maps/{lab}/sessions/{session}"
         answers = [
-            quick.client.post(f"{frames}/frames?frame={n}", content=again(n), headers=typed(again(n))).json()
+            quick.client.post(f"{frames}/frames?frame={n}", content=jpeg(n), headers=typed(jpeg(n))).json()
             for n in range(3)
         ]
         assert quick.client.delete(frames).status_code == 204
