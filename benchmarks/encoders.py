@@ -117,10 +117,10 @@ def main(
             times |= over_http(process, ids, frames, rounds)
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {}
-    for name, (one, other) in times.items():
-        a, b = median(one), median(other)
+    for name, (first, second) in times.items():
+        a, b = median(first), median(second)
         if name == SERVED:  # the system counts it in hundredths of a second
-            a, b = float(np.mean(one)), float(np.mean(other))
+            a, b = float(np.mean(first)), float(np.mean(second))
         rows.append((name, a, b, f"{b / a:.3f}", verdict(b / a, LIMIT) if name in JUDGED else ""))
         figures[name] = {"milliseconds": [a, b], "ratio": b / a}
     identities = [one.identity for one in encoders]
