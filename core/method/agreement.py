@@ -91,34 +91,32 @@ def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> C
     Returns:
         int8 [C, L].
     """
-    made = np.empty((len(layers[0]), sum(layer.shape[1] for layer in layers)), np.int8)
-    start = 0
-    for weight, layer in zip(definition.weights, layers, strict=True):
-        stop = start + layer.shape[1]
-        shown = layer if definition.centred is None else standardized(layer, definition.centred)
-        steps = np.rint(shown * np.float32(RESOLUTION * np.sqrt(weight)))
-        made[:, start:stop] = np.clip(steps, -127, 127)
-        start = stop
-    return made
+    cells = np.stack(layers, axis=1)
+    shown = cells if definition.centred is None else standardized(cells, definition.centred)
+    steps = shown * (np.float32(RESOLUTION) * np.sqrt(np.array(definition.weights)))[:, np.newaxis].astype(np.float32)
+    np.clip(np.rint(steps, out=steps), -127, 127, out=steps)
+    return steps.astype(np.int8).reshape(len(cells), -1)
 
 
 def standardized(cells: Array, centred: float) -> Array:
     """Each value less a share of its mean over the cells of a frame, by its deviation over them, to unit length.
 
     Args:
-        cells: float32 [C, values], rows of unit length or zero; rows of zeros take no part and stay.
+        cells: float32 [C, values] or, of several layers, [C, layers, values]; rows of unit length or zero; rows of
+            zeros take no part and stay.
         centred: the share of the mean.
 
     Returns:
-        float32 [C, values].
+        float32, of the same shape.
     """
-    seen = cells.any(axis=1)
-    made = np.zeros_like(cells)
-    if seen.any():
-        mean, deviation = cells[seen].mean(axis=0), cells[seen].std(axis=0)
-        steady = deviation + np.float32(STEADINESS) * deviation.mean() + np.float32(1e-12)
-        made[seen] = (cells[seen] - np.float32(centred) * mean) / steady
-    return np.asarray(unit_length(made), np.float32)
+    seen = cells.any(axis=-1, keepdims=True)
+    count = np.maximum(seen.sum(axis=0), 1).astype(np.float32)
+    mean = cells.sum(axis=0) / count
+    squares = np.square((cells - mean) * seen)
+    deviation = np.sqrt(squares.sum(axis=0) / count)
+    steady = deviation + np.float32(STEADINESS) * deviation.mean(axis=-1, keepdims=True) + np.float32(1e-12)
+    made = (cells - np.float32(centred) * mean) / steady * seen
+    return np.asarray(unit_length(made.reshape(-1, made.shape[-1])).reshape(made.shape), np.float32)
 
 
 @dataclass(frozen=True)

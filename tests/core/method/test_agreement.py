@@ -88,6 +88,9 @@ def test_standardized_cells_by_hand() -> None:
     np.testing.assert_allclose(found[[0, 2]], wanted, atol=1e-6)
     assert not found[1].any() and not standardized(np.zeros((3, 2), np.float32), 0.75).any()
     np.testing.assert_array_equal(standardized(cells[:1], 0.75), cells[:1])  # nothing deviates
+    for together in (np.stack([cells, cells[::-1]], axis=1), random_cells(4).reshape(-1, 2, 4).astype(np.float32)):
+        each = [standardized(np.ascontiguousarray(together[:, layer]), 0.75) for layer in (0, 1)]
+        np.testing.assert_array_equal(standardized(together, 0.75), np.stack(each, axis=1))  # other layers do not count
     stage = definition(values=2)
     made = local_descriptors([cells], stage.model_copy(update={"centred": 0.75}))
     np.testing.assert_array_equal(made, local_descriptors([found], stage))
