@@ -51,10 +51,12 @@ WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
 """Directions fitted of each layer; every configuration takes the first so many."""
 THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
 COARSE = {**THESIS, "steps": DEFAULT.steps}
-LIGHT = (0.45, 0.45, 0.1)
-"""Weights of the layers with less for conv4."""
-PLAIN: dict[str, Any] = {"centred": None, "screened": None, "taught": None, "share": 0.75}
+PLAIN: dict[str, Any] = {
+    "centred": None, "screened": None, "taught": None, "weights": (0.4, 0.4, 0.2), "share": 0.75,
+}  # fmt: skip
 """The second stage of 0.1.0, in what differs from the packaged one."""
+LIGHT: dict[str, Any] = {**PLAIN, "centred": 0.75, "weights": (0.45, 0.45, 0.1), "reach": (3, 5)}
+"""The same with standardized cells, less weight for conv4 and a longer reach."""
 
 
 def _stage(**change: Any) -> dict[str, Any]:
@@ -88,11 +90,14 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: three layers alike": _stage(weights=(0.34, 0.33, 0.33)),
     "second stage: 32 values": _stage(values=32),
     "second stage: reach 1, 3": _stage(reach=(1, 3)),
+    "second stage: reach 3, 5": _stage(reach=(3, 5)),
     "second stage: reach 3, 7": _stage(reach=(3, 7)),
     "second stage: 10 candidates": _stage(candidates=10),
     "second stage: 60 candidates": _stage(candidates=60, screened=None),
     "second stage: 30 candidates, none screened": _stage(screened=None),
-    "second stage: 15 candidates of 60 screened": _stage(candidates=15),
+    "second stage: 60 screened": _stage(screened=60),
+    "second stage: 20 candidates": _stage(candidates=20),
+    "second stage: weights 0.4, 0.4, 0.2": _stage(weights=(0.4, 0.4, 0.2)),
     "second stage: share 0.5": _stage(share=0.5),
     "second stage: share 0.75": _stage(share=0.75),
     "second stage: cells as they are": _stage(centred=None),
@@ -100,10 +105,10 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: of 0.1.0": _stage(**PLAIN),
     "second stage: of 0.1.0, cells standardized": _stage(**{**PLAIN, "centred": 0.75}),
     "second stage: of 0.1.0, cells standardized, weights 0.45, 0.45, 0.1, reach 3, 5, 60 candidates": _stage(
-        **{**PLAIN, "centred": 0.75}, weights=LIGHT, reach=(3, 5), candidates=60
+        **LIGHT, candidates=60
     ),
     "second stage: of 0.1.0, cells standardized, these weights and reach, 15 candidates of 60 screened": _stage(
-        **{**PLAIN, "centred": 0.75, "screened": 60}, weights=LIGHT, reach=(3, 5), candidates=15
+        **{**LIGHT, "candidates": 15, "screened": 60}
     ),
 }
 REFINED = "projections refined by contrastive learning"
@@ -121,10 +126,7 @@ class Ablation:
         self.weights, self.size = load_file(weights), size
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
-        self.cells = fit_cell_projections(
-            network_of(self.weights, STAGE.layers), STAGE, datasets / "train", self.projections
-        )
-        self.extractor = FeatureExtractor(network, DEFAULT, self.projections, self.cells)
+        self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
         self.tasks: ValidationTasks = load_tasks(datasets)
         self.corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
@@ -137,6 +139,9 @@ class Ablation:
             "night": self.tasks.night.pictures,
         }
         self.activations = {name: self._activations(name, pictures) for name, pictures in shown.items()}
+        self.cells: dict[str, Projection] = {}
+        plain = DEFAULT.model_copy(update=_stage(taught=None))
+        self.cells = fit_cell_projections(self.encoder(plain, 0), STAGE, datasets / "train")
 
     def _activations(self, name: str, pictures: Sequence[Pixels]) -> list[dict[str, NDArray[np.float16]]]:
         made = []
@@ -164,14 +169,18 @@ class Ablation:
             further = self.projections[layer].matrix[:, STAGE.values :]
             self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
 
-    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
-        """One number for each of COLUMNS."""
+    def encoder(self, definition: EncoderDefinition, seed: int) -> Encoder:
+        """The encoder of a configuration with a vocabulary of its own, not calibrated."""
         extractor = FeatureExtractor(
             self._network(definition), definition, self._projections(definition), self._cells(definition)
         )
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-        encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
+        return Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
+
+    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
+        """One number for each of COLUMNS."""
+        encoder = self.encoder(definition, seed)
         references = self.describe(encoder, "lip6 references")
         far = references.part(slice(0, DISTRACTORS))
         lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)

@@ -25,7 +25,6 @@ from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load
 from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.presets import NETWORK, PRESETS
-from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork, save_network
 from training.default_calibration import UNCALIBRATED, assess, for_small_maps
@@ -68,28 +67,35 @@ def build(
     """An encoder, not yet calibrated: projections fitted to ``photographs``, a vocabulary trained on ``pictures``."""
     network, wanted = network_of(weights, definition.outputs), definition.projected()
     projections = fit_projections(network, wanted, photographs, seed=seed) if wanted else {}
-    cells = taught_cells(network, definition, projections, photographs, seed)
-    extractor = FeatureExtractor(network, definition, projections, cells)
+    plain = _untaught(definition)
+    extractor = FeatureExtractor(network, plain, projections)
     frames = (
         extractor.regions(extractor.activations([picture])[0]).features
         for picture in track(pictures, f"features for {name}")
     )
     vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-    return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
+    encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
+    return taught(encoder, vocabulary, definition, photographs, seed), vocabulary
 
 
-def taught_cells(
-    network: ShallowNetwork,
-    definition: EncoderDefinition,
-    projections: dict[str, Projection],
-    photographs: Path,
-    seed: int,
-) -> dict[str, Projection]:
-    """The projections of cells that are taught; none if the definition has none."""
+def _untaught(definition: EncoderDefinition) -> EncoderDefinition:
+    """The same with cells in the projections of the regions."""
     stage = definition.agreement
     if stage is None or not stage.taught:
-        return {}
-    return fit_cell_projections(network, stage, photographs, projections, seed=seed)
+        return definition
+    return definition.model_copy(update={"agreement": stage.model_copy(update={"taught": None})})
+
+
+def taught(
+    encoder: Encoder, vocabulary: Vocabulary, definition: EncoderDefinition, photographs: Path, seed: int
+) -> Encoder:
+    """The encoder as defined, with projections of its cells fitted to ``photographs`` if they are taught."""
+    stage, extractor = definition.agreement, encoder.extractor
+    if stage is None or not stage.taught:
+        return encoder
+    cells = fit_cell_projections(encoder, stage, photographs, seed=seed)
+    extractor = FeatureExtractor(extractor.backbone, definition, extractor.projections, cells)
+    return Encoder(encoder.name, extractor, definition, vocabulary, encoder.calibration)
 
 
 def with_second_stage(
@@ -103,11 +109,11 @@ def with_second_stage(
         WrongVocabulary: the definition changes the first stage, too.
     """
     kept = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
-    network, projections = network_of(weights, definition.outputs), kept.extractor.projections
-    cells = taught_cells(network, definition, projections, photographs, seed)
-    extractor = FeatureExtractor(network, definition, projections, cells)
+    plain = _untaught(definition)
+    extractor = FeatureExtractor(network_of(weights, plain.outputs), plain, kept.extractor.projections)
     vocabulary = Vocabulary(kept.centers, kept.extractor.origin)
-    return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
+    encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
+    return taught(encoder, vocabulary, definition, photographs, seed), vocabulary
 
 
 def main(

@@ -6,14 +6,16 @@ cell under two conditions attract, all others repel.  A cell's negatives are all
 its own neighbours; the backbone stays as it is.  The packaged encoders do not use it: its own loss fell while
 recognition did not gain (see the model card).
 
-:func:`fit_cell_projections` is for the second stage alone.  Its pairs are displaced views, and in place of the variance
-of all cells it asks for the difference between a cell and the one that a frame of another place matches it with.
+:func:`fit_cell_projections` is for the second stage alone.  Its pairs are displaced views and neighbouring frames, and
+in place of the variance of all cells it asks for the difference between a cell and the one that a frame of another
+place matches it with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +27,14 @@ from torch import Tensor, nn
 
 from core.frames.preprocessing import prepare
 from core.method.agreement import AgreementDefinition, Cells, correspondences, local_descriptors
+from core.method.encoder import Encoder
 from core.method.equations import unit_length
 from core.method.projection import Projection, discriminant, fit_projection
 from core.networks.network import ShallowNetwork
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs
-from training.views.displaced_views import COLUMNS, Displacement, displaced_views
+from training.views.displaced_views import COLUMNS, DisplacedViews, Displacement, Kind, displaced_views
+from training.views.neighbouring_views import neighbouring_views
 
 Array = NDArray[np.float32]
 
@@ -45,11 +49,11 @@ RATE = 2e-4
 DECAY = 0.997
 BATCH = 12  # crops
 
-VIEWS = 2400
-"""Pairs of displaced views."""
+VIEWS, NEIGHBOURS = 2400, 1400
+"""Pairs of displaced views, and of neighbouring frames that are drawn."""
 ANSWERS_PER_PAIR, WRONG_PER_FRAME = 40, 30
-CAMERA_WEIGHT = 2.0
-"""Of the differences between day and night, where those of the other pairs count once."""
+WEIGHTS: dict[Kind, float] = {"displaced": 1.0, "neighbours": 2.0, "cameras": 2.0}
+"""Of the mean differences of each kind of pairs."""
 CONFUSABLE, APART = 3, 8
 """How many other frames a view is matched with; photographs this close in order of names may show one place."""
 WRONG_REACH = (3, 5)
@@ -134,66 +138,97 @@ Matches = NDArray[np.int64]
 
 
 def fit_cell_projections(
-    network: ShallowNetwork,
+    encoder: Encoder,
     stage: AgreementDefinition,
     photographs: Path,
-    start: Mapping[str, Projection],
     pairs: int = VIEWS,
+    neighbours: int = NEIGHBOURS,
     seed: int = 0,
 ) -> dict[str, Projection]:
     """A projection for each layer of a second stage.
 
     It has the directions in which the right matches of a cell differ least, relative to the wrong ones.  Right is what
-    shows the same spot; wrong is the mutual match in a frame that looks alike and shows another place.
+    shows the same spot; wrong is the mutual match in a frame that the first stage confuses and that shows another
+    place.
 
     Args:
-        network: returns at least these layers.
+        encoder: whose first stage it is; it has all layers of the stage, and projections of them.
         photographs: folder of the training photographs.
-        start: projections of these layers, by which wrong matches are found.
+        pairs, neighbours: how many displaced views and neighbouring frames are drawn.
     """
-    displacements: list[Displacement] = []
-    sides: tuple[dict[str, list[Features]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
-    for views in track(displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET), "displaced views", total=pairs):
-        displacements.append(views.displacement)
-        maps = _maps(network, (views.first, views.second))
-        for number, side in enumerate(sides):
-            for layer in stage.layers:
-                side[layer].append(unit_length(maps[layer][number]).astype(np.float16))
-    first, second = ({layer: np.stack(side.pop(layer)) for layer in stage.layers} for side in sides)
-    return taught_projections(displacements, first, second, stage, start, seed)
+    views = Views.of(
+        encoder,
+        stage,
+        track(
+            chain(
+                displaced_views(photographs, SIDE, pairs, seed + SEED_OFFSET),
+                neighbouring_views(photographs, SIDE, neighbours, seed + SEED_OFFSET),
+            ),
+            "pairs of views",
+            total=pairs + neighbours,
+        ),
+    )
+    return taught_projections(views, stage, encoder.extractor.projections, seed)
+
+
+@dataclass(frozen=True)
+class Views:
+    """n pairs of views as an encoder sees them.
+
+    first, second: by layer the features of the views' cells, of unit length, float16 [n, C, K].
+    likeness: inner products of the descriptors of second views and of first ones, float32 [n, n].
+    """
+
+    displacements: Sequence[Displacement]
+    first: Mapping[str, Features]
+    second: Mapping[str, Features]
+    likeness: Array
+
+    @classmethod
+    def of(cls, encoder: Encoder, stage: AgreementDefinition, pairs: Iterable[DisplacedViews]) -> Views:
+        """Encode pairs of views; what the second stage compares of them stays unprojected."""
+        outputs = encoder.definition.outputs
+        displacements: list[Displacement] = []
+        sides: tuple[dict[str, list[Features]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")
+        descriptors: tuple[list[Array], ...] = [], []
+        for views in pairs:
+            displacements.append(views.displacement)
+            seen = encoder.extractor.activations((views.first, views.second))
+            for activations, side, described in zip(seen, sides, descriptors, strict=True):
+                described.append(encoder.describe(activations).descriptor)
+                for layer in stage.layers:
+                    cells = activations[outputs.index(layer)]
+                    side[layer].append(unit_length(cells.reshape(-1, cells.shape[-1])).astype(np.float16))
+        first, second = ({layer: np.stack(side.pop(layer)) for layer in stage.layers} for side in sides)
+        return cls(displacements, first, second, np.stack(descriptors[1]) @ np.stack(descriptors[0]).T)
 
 
 def taught_projections(
-    displacements: Sequence[Displacement],
-    first: Mapping[str, Features],
-    second: Mapping[str, Features],
-    stage: AgreementDefinition,
-    start: Mapping[str, Projection],
-    seed: int = 0,
+    views: Views, stage: AgreementDefinition, start: Mapping[str, Projection], seed: int = 0
 ) -> dict[str, Projection]:
-    """The projections of :func:`fit_cell_projections` from n pairs of views.
+    """The projections of :func:`fit_cell_projections` from pairs of views.
 
     Args:
-        first, second: by layer the features of the views' cells, of unit length, float16 [n, C, K].
+        start: projections of the stage's layers, by which wrong matches are found.
     """
     compared = [
         [
             local_descriptors(
                 [start[layer](side[layer][view].astype(np.float32), stage.values) for layer in stage.layers], stage
             )
-            for view in range(len(displacements))
+            for view in range(len(views.displacements))
         ]
-        for side in (first, second)
+        for side in (views.first, views.second)
     ]
     generator = np.random.default_rng(seed)
-    right = _right_matches(displacements, generator)
-    by_camera = np.array([pair.camera for pair in displacements])[right[:, 0]]
-    wrong = _wrong_matches(displacements, compared[1], compared[0], generator)
+    right = _right_matches(views.displacements, generator)
+    kind = np.array([pair.kind for pair in views.displacements])[right[:, 0]]
+    wrong = _wrong_matches(views, compared[1], compared[0], generator)
     made = {}
     for layer in stage.layers:
-        sides = first[layer], second[layer]
-        apart = [_differences(*sides, right[chosen]) for chosen in (~by_camera, by_camera) if chosen.any()]
-        within = np.average(apart, axis=0, weights=[1, CAMERA_WEIGHT][: len(apart)])
+        sides = views.first[layer], views.second[layer]
+        apart = {one: _differences(*sides, right[kind == one]) for one in WEIGHTS if (kind == one).any()}
+        within = np.average(list(apart.values()), axis=0, weights=[WEIGHTS[one] for one in apart])
         matrix = discriminant(within, _differences(*sides, wrong), stage.values, SHRINKAGE)
         mean = np.mean([side.mean(axis=(0, 1), dtype=np.float64) for side in sides], axis=0)
         made[layer] = Projection(mean.astype(np.float32), matrix)
@@ -210,17 +245,14 @@ def _right_matches(views: Sequence[Displacement], generator: np.random.Generator
 
 
 def _wrong_matches(
-    views: Sequence[Displacement],
-    queries: Sequence[Cells],
-    references: Sequence[Cells],
-    generator: np.random.Generator,
+    views: Views, queries: Sequence[Cells], references: Sequence[Cells], generator: np.random.Generator
 ) -> Matches:
-    """Some mutual matches of each second view in first views of other places, those most alike in their mean cell."""
-    asked, shown = (unit_length(np.stack([one.mean(axis=0) for one in side])) for side in (queries, references))
-    common = shown.mean(axis=0)
-    likeness = unit_length(asked - common) @ unit_length(shown - common).T
-    photograph = np.array([pair.photograph for pair in views])
-    likeness[np.abs(photograph[:, np.newaxis] - photograph) < APART] = -np.inf
+    """Some mutual matches of each second view in the first views of other places that are most like it."""
+    photograph = np.array([pair.photograph for pair in views.displacements])
+    camera = np.array([pair.camera for pair in views.displacements])
+    one_place = (camera[:, np.newaxis] == camera) & (camera != "")
+    one_place |= np.abs(photograph[:, np.newaxis] - photograph) < APART
+    likeness = np.where(one_place, -np.inf, views.likeness)
     found = []
     for number, row in enumerate(likeness):
         for other in np.argsort(-row)[:CONFUSABLE].tolist():

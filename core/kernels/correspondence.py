@@ -73,8 +73,8 @@ def squared_sums(query, references, columns, rows_apart, columns_apart, cosine):
     return sums
 
 
-SPACING = 2
-"""Of the cells of a reference those in every second row and column are a sample."""
+SPACING = 3
+"""Of the cells of a reference those in every third row and column are a sample."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

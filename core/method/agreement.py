@@ -173,8 +173,8 @@ def agreement(query: Cells, candidates: Cells, columns: int, definition: Agreeme
 def promise(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> Array:
     """About what each candidate's score would gain: ``share`` times the mean squared cosine of a sample of its cells.
 
-    Each cell of the sample has the query's best one within reach, which need not be mutual.  It takes a quarter of the
-    time of :func:`agreement`.
+    Each cell of the sample has the query's best one within reach, which need not be mutual.  It takes an eighth
+    of the time of :func:`agreement`.
 
     Args:
         query: int8 [C, L].

@@ -40,5 +40,8 @@ def test_views_are_drawn_repeatably_and_those_of_cameras_are_day_and_night(photo
     made, again = (list(displaced_views(photographs, 64, 60, seed=4)) for _ in "ab")
     for one, other in zip(made, again, strict=True):
         np.testing.assert_array_equal(one.second, other.second)
-    assert 0 < sum(pair.displacement.camera for pair in made) < 20
+    kinds = [pair.displacement.kind for pair in made]
+    assert 0 < kinds.count("cameras") < 20 and kinds.count("displaced") + kinds.count("cameras") == 60
+    cameras = [pair.displacement.camera for pair in made if pair.displacement.kind == "cameras"]
+    assert set(cameras) <= {"b", "c"}
     assert len({pair.displacement.photograph for pair in made}) > 20

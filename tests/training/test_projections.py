@@ -10,12 +10,18 @@ import pytest
 import torch
 
 from core.method.agreement import AgreementDefinition
+from core.method.encoder import Encoder, EncoderDefinition
+from core.method.features import FeatureExtractor
 from core.method.projection import Projection, discriminant
+from core.method.vocabulary import Vocabulary
 from core.networks.network import ShallowNetwork
+from training.default_calibration import UNCALIBRATED
 from training.loss_curve import draw_loss_curve
 from training.projections import (
     CellDescriptor,
     PairedCells,
+    Views,
+    _wrong_matches,
     contrastive_loss,
     fit_cell_projections,
     fit_projections,
@@ -24,6 +30,7 @@ from training.projections import (
     refine,
 )
 from training.student import student_definition
+from training.views.displaced_views import Displacement
 
 STAGE = AgreementDefinition(layers=("a",), values=4, weights=(1.0,), reach=(1, 1), candidates=3, share=0.5)
 
@@ -40,14 +47,51 @@ def test_projections_are_fitted_layer_by_layer_and_repeatably(photographs: Path)
         np.testing.assert_allclose(one.matrix, again[layer].matrix, rtol=1e-3, atol=1e-5)
 
 
+def encoder(stage: AgreementDefinition, photographs: Path) -> Encoder:
+    """A small encoder with these cells in the projections of its regions."""
+    definition = EncoderDefinition(
+        layers=("conv3",),
+        regions=20,
+        steps=(2.0,),
+        unit_features=True,
+        projection=6,
+        words=4,
+        gamma=0.5,
+        normalization="intra",
+        agreement=stage,
+    )
+    made = network(*definition.outputs)
+    projections = fit_projections(made, definition.projected(), photographs, 4)
+    extractor = FeatureExtractor(made, definition, projections)
+    centers = np.random.default_rng(0).standard_normal((4, 6)).astype(np.float32)
+    return Encoder("small", extractor, definition, Vocabulary(centers, extractor.origin), UNCALIBRATED)
+
+
 def test_projections_of_cells_are_fitted_to_the_stage_and_repeatably(photographs: Path) -> None:
     stage = STAGE.model_copy(update={"layers": ("pool2", "conv3"), "weights": (0.5, 0.5)})
-    start = fit_projections(network(*stage.layers), {"pool2": 4, "conv3": 6}, photographs, 4)
-    made, again = (fit_cell_projections(network(*stage.layers), stage, photographs, start, 5) for _ in "ab")
+    small = encoder(stage, photographs)
+    made, again = (fit_cell_projections(small, stage, photographs, 5, 0) for _ in "ab")
     assert {layer: one.matrix.shape for layer, one in made.items()} == {"pool2": (256, 4), "conv3": (384, 4)}
     for layer, one in made.items():
         np.testing.assert_allclose(one.matrix, again[layer].matrix, rtol=1e-3, atol=1e-5)
-        assert not np.allclose(one.matrix, start[layer].matrix[:, :4], rtol=0.1)
+        assert not np.allclose(one.matrix, small.extractor.projections[layer].matrix[:, :4], rtol=0.1)
+
+
+def test_wrong_matches_are_of_other_places_that_the_first_stage_confuses() -> None:
+    # Three photographs far apart, one of them twice, and two pictures of one fixed camera.
+    photograph, camera = (0, 1, 100, 200, 300, 400), ("", "", "", "", "lane", "lane")
+    nothing = np.zeros((0, 2), np.int64)
+    displacements = [
+        Displacement(nothing, number, "displaced", name) for number, name in zip(photograph, camera, strict=True)
+    ]
+    likeness = np.random.default_rng(0).random((6, 6), np.float32)
+    likeness[0, :] = (1, 0.9, 0.5, 0.6, 0.1, 0.7)  # its own, the next photograph, and others
+    likeness[4, :] = (0.5, 0.1, 0.6, 0.2, 1, 0.9)
+    cells = [np.eye(169, 8, k=-number, dtype=np.int8) + 1 for number in range(6)]
+    wrong = _wrong_matches(Views(displacements, {}, {}, likeness), cells, cells, np.random.default_rng(1))
+    assert {(asked, shown) for asked, _, shown, _ in wrong.tolist() if asked in (0, 4)} == {
+        (0, 5), (0, 3), (0, 2), (4, 2), (4, 0), (4, 3),
+    }  # fmt: skip
 
 
 def test_a_discriminant_tells_wrong_matches_from_right_ones() -> None:

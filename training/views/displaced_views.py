@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.photographs import Pixels, day_and_night, read, source_weights, split_photographs
+from training.photographs import DAY_NIGHT, Pixels, day_and_night, read, source_weights, split_photographs
 from training.views.augmentation import augment
 
 CAMERA_SHARE = 0.08
@@ -27,18 +27,23 @@ FIRST_CELL, STRIDE, COLUMNS = 17.5, 16.0, 13
 side; the same for pool2, conv3 and conv4."""
 
 
+Kind = Literal["displaced", "cameras", "neighbours"]
+"""Two views of one photograph, a day and a night of a fixed camera, or two frames of one walk or drive."""
+
+
 class Displacement(NamedTuple):
     """How two views of one scene belong together.
 
-    answers: int64 [n, 2], cells of the first view (row * COLUMNS + column) and the cells of the second in which their
-        middles are.
+    answers: int64 [n, 2], cells of the first view (row * COLUMNS + column) and the cells of the second that show the
+        same.
     photograph: the number of the first view's photograph, in order of names.
-    camera: whether they are a day and a night of a fixed camera.
+    camera: the fixed camera that took it; empty: none did.
     """
 
     answers: NDArray[np.int64]
     photograph: int
-    camera: bool
+    kind: Kind
+    camera: str
 
 
 class DisplacedViews(NamedTuple):
@@ -65,7 +70,13 @@ def displaced_views(photographs: Path, side: int, count: int, seed: int) -> Iter
         first, second, answers = displaced([read(path) for path in chosen], side, generator)
         if generator.random() < (DISTURBED_NIGHTS if camera else DISTURBED):
             second = augment(second, generator)
-        yield DisplacedViews(first, second, Displacement(answers, numbers[chosen[0]], camera))
+        kind: Kind = "cameras" if camera else "displaced"
+        yield DisplacedViews(first, second, Displacement(answers, numbers[chosen[0]], kind, fixed_camera(chosen[0])))
+
+
+def fixed_camera(photograph: Path) -> str:
+    """The fixed camera that took a photograph; empty: none did."""
+    return photograph.parent.name if photograph.parent.parent.name == DAY_NIGHT else ""
 
 
 def displaced(
