@@ -171,7 +171,10 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     assert f"{now:.1%}" != f"{stated[doubted]:.1%}"
     expect(answer).to_contain_text(f"{100 * now:.1f}\u00a0%")
 
-    # It is pruned, and saved.
+    # It is pruned of what was enrolled twice, and saved.
+    for number in range(6):
+        pose = world.pose_of(number, 0.2)
+        assert keyed.enrol("day", f"again-{number}", world.frame(number), **pose, sequence="again").is_success
     page = admin.go("maps/day/health")
     prune = page.get_by_role("region", name="Prune")
     prune.get_by_role("slider").fill("10")

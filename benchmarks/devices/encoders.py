@@ -1,6 +1,6 @@
 """What a query costs with one encoder and with another: the default of 0.1.0 beside that of today.
 
-    python -m benchmarks.encoders [--encoder NAME] [--encoder NAME] [--places 300] [--rounds 60]
+    python -m benchmarks.devices.encoders [--encoder NAME] [--encoder NAME] [--places 300] [--rounds 60]
 
 In this process a frame is encoded and the second stage compares it with the places of a map, in turn with either
 encoder; medians of processor time.  Then one service has both maps, and one robot asks for either in turn, ``BLOCK``
