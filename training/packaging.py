@@ -75,7 +75,7 @@ def build(
     )
     vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
     encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
-    return taught(encoder, vocabulary, definition, photographs, seed), vocabulary
+    return taught(encoder, definition, photographs, seed), vocabulary
 
 
 def _untaught(definition: EncoderDefinition) -> EncoderDefinition:
@@ -86,14 +86,13 @@ def _untaught(definition: EncoderDefinition) -> EncoderDefinition:
     return definition.model_copy(update={"agreement": stage.model_copy(update={"taught": None})})
 
 
-def taught(
-    encoder: Encoder, vocabulary: Vocabulary, definition: EncoderDefinition, photographs: Path, seed: int
-) -> Encoder:
+def taught(encoder: Encoder, definition: EncoderDefinition, photographs: Path, seed: int) -> Encoder:
     """The encoder as defined, with projections of its cells fitted to ``photographs`` if they are taught."""
     stage, extractor = definition.agreement, encoder.extractor
     if stage is None or not stage.taught:
         return encoder
     cells = fit_cell_projections(encoder, stage, photographs, seed=seed)
+    vocabulary = Vocabulary(encoder.centers, extractor.origin)
     extractor = FeatureExtractor(extractor.backbone, definition, extractor.projections, cells)
     return Encoder(encoder.name, extractor, definition, vocabulary, encoder.calibration)
 
@@ -113,7 +112,7 @@ def with_second_stage(
     extractor = FeatureExtractor(network_of(weights, plain.outputs), plain, kept.extractor.projections)
     vocabulary = Vocabulary(kept.centers, kept.extractor.origin)
     encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
-    return taught(encoder, vocabulary, definition, photographs, seed), vocabulary
+    return taught(encoder, definition, photographs, seed), vocabulary
 
 
 def main(

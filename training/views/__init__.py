@@ -1,1 +1,1 @@
-"""What training draws of photographs: disturbed crops, and pairs of displaced views."""
+"""What training draws of photographs: disturbed crops, pairs of displaced views, and pairs of neighbouring frames."""
