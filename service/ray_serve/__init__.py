@@ -17,21 +17,30 @@ if TYPE_CHECKING:
     from core.frames.images import Limits
     from service.telemetry.metrics import Metrics
 
-__all__ = ["check_usable", "encoders_for"]
+__all__ = ["check_installed", "check_usable", "encoders_for"]
 
 
-def check_usable(settings: Settings) -> None:
-    """Check, without importing Ray, that it is installed and that the settings fit each other.
+def check_installed() -> None:
+    """Check, without importing Ray, that it is installed.
 
     Raises:
         MissingExtra: Ray Serve is not installed.
-        SettingsError: the encoders are to compute on GPUs of which they get none.
     """
     if importlib.util.find_spec("ray") is None:  # to look for ray.serve would import ray
         raise MissingExtra(
             "Encoders in a Ray cluster need Ray Serve, which others do not: pip install 'placerec[ray]', or in a"
             " checkout .venv/bin/pip install --editable '.[ray]'."
         )
+
+
+def check_usable(settings: Settings) -> None:
+    """As :func:`check_installed`, and that the settings fit each other.
+
+    Raises:
+        MissingExtra: Ray Serve is not installed.
+        SettingsError: the encoders are to compute on GPUs of which they get none.
+    """
+    check_installed()
     if settings.device == "cuda" and not settings.ray_replica_gpus:
         raise SettingsError(f"{PREFIX}DEVICE is cuda, and {PREFIX}RAY_REPLICA_GPUS gives no process a GPU.")
 

@@ -9,11 +9,13 @@ import logging
 import math
 import os
 import socket
+from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from core.frames.images import Limits
+from core.silence import SWITCHES
 from core.threads import cores
 from service.ray_serve.replica import Replica, ReplicaSettings
 from service.settings import Settings
@@ -42,7 +44,7 @@ QUICK = {
 NODE = {
     "RAY_worker_niceness": "0",  # else 15: replicas would wait for whatever else the machine does
 }
-"""Variables of a Ray that is started here; where others start it, they set them."""
+"""Variables of a Ray that is started here; where ``ray start`` starts it, others set them."""
 
 JOINED = {
     "RAY_gcs_rpc_server_reconnect_timeout_s": "86400",  # else a process ends whose head has been away for a minute
@@ -123,6 +125,7 @@ class Cluster:
                 "include_dashboard": False,
                 "object_store_memory": OBJECT_STORE_BYTES,
             }
+            start_no_dashboards()
         said = io.StringIO()
         try:
             with redirect_stdout(said), redirect_stderr(said):
@@ -171,7 +174,7 @@ class Cluster:
         chosen = self._settings
         options: dict[str, Any] = {"num_cpus": chosen.ray_replica_cpus, "num_gpus": chosen.ray_replica_gpus}
         if not self._own:
-            options["runtime_env"] = {"env_vars": QUICK}
+            options["runtime_env"] = {"env_vars": QUICK | SWITCHES}
         least = chosen.ray_replicas
         most = max(least, chosen.ray_max_replicas or self._room())
         made: Any = serve.deployment(
@@ -284,7 +287,6 @@ class Cluster:
 
 def prepare_environment(own: bool, local: bool) -> None:
     """Set what Ray reads when it is imported, and what its processes inherit."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if local:
         # By this variable Ray chooses the loopback address for its ports; its name tells where that is the default.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
@@ -292,6 +294,30 @@ def prepare_environment(own: bool, local: bool) -> None:
     os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
     for name, value in (QUICK | (NODE if own else JOINED)).items():
         os.environ.setdefault(name, value)
+
+
+def start_node(words: Sequence[str]) -> None:
+    """Do as ``ray start`` with these words does, and start no dashboard."""
+    for name, value in NODE.items():
+        os.environ.setdefault(name, value)
+    start_no_dashboards()
+    from ray.scripts.scripts import start
+
+    start.main(list(words), prog_name="placerec ray start")
+
+
+def start_no_dashboards() -> None:
+    """Let heads of Ray that this process starts from now on have no process of the dashboard.
+
+    Ray starts it also where no dashboard is wanted.  It then serves the usage statistics alone, and even if these are
+    off it asks addresses beyond this machine which cloud this is.
+    """
+    from ray._private.node import Node
+
+    def start_none(node: Any, **_: object) -> None:
+        node._webui_url = ""
+
+    Node.start_api_server = start_none  # type: ignore[assignment,method-assign]
 
 
 def caller() -> DeploymentHandle[Replica]:

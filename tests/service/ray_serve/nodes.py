@@ -99,9 +99,10 @@ class Nodes:
 
 def main(port: int) -> None:
     """Start nodes as the input says."""
-    from service.ray_serve.cluster import prepare_environment
+    from service.ray_serve.cluster import prepare_environment, start_no_dashboards
 
     prepare_environment(own=True, local=True)
+    start_no_dashboards()
     import ray._private.utils
     from ray.cluster_utils import Cluster
 
