@@ -25,7 +25,7 @@ from core.frames.preprocessing import Pixels, second_look
 from core.frames.traverses import SUPPORTED_SUFFIXES
 from core.geometry.detection import find_keypoints, shown_size
 from core.geometry.keypoints import MOST, record_bytes
-from core.geometry.verification import fitting, mutual_matches, verify
+from core.geometry.verification import fitting_plane, fitting_scene, mutual_matches, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
 from core.threads import cores, each, share_cores
@@ -84,7 +84,8 @@ def main(
             "forward pass of XFeat": lambda: network(shown),
             "keypoints of a frame": lambda: find_keypoints(network, frames[0]),
             "matches of one candidate": lambda: mutual_matches(ours, theirs),
-            "fundamental matrix of one candidate": lambda: fitting(*points),
+            "fundamental matrix of one candidate": lambda: fitting_scene(*points),
+            "homography of one candidate": lambda: fitting_plane(*points),
             f"verification of {len(candidates)} candidates": lambda: verify(query, candidates),
             "all in": lambda: verify(find_keypoints(network, frames[0]), candidates),
             "encoding of the frames": lambda: encoder.encode_batch(frames),

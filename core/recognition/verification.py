@@ -20,7 +20,7 @@ from core.geometry.keypoints import Keypoints
 from core.geometry.pose import RelativeView, relative_view
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
-from core.judgement.verdict import Judgement, worth_verifying
+from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.places import NO_POSE
@@ -96,17 +96,42 @@ def third_stage(
         InvalidModel: the network of keypoints cannot be loaded.
         StorageFailure: the map's files cannot be read.
     """
+
+    def tells_pose(judgement: Judgement) -> bool:
+        return verifier is not None and _tells_pose(map_, candidates, judgement, verifier)
+
+    calibration = calibration_of(map_, encoder)
+    return verify_candidates(candidates, judged, verifier, calibration, map_.keypoints_at, tells_pose)
+
+
+def verify_candidates(
+    candidates: Candidates,
+    judged: Judge,
+    verifier: Verifier | None,
+    calibration: Calibration,
+    keypoints_at: Callable[[list[int]], list[Keypoints | None]],
+    tells_pose: Callable[[Judgement], bool] = lambda _: False,
+) -> tuple[Candidates, Judgement, ThirdStage]:
+    """The third stage over candidates of any origin, see :func:`third_stage`.
+
+    Args:
+        calibration: by which they are judged.
+        keypoints_at: returns the keypoints of places by their rows; None for one that has none.
+        tells_pose: whether they are verified after a judgement for the sake of the pose.
+    """
     judgement = judged(candidates)
     if verifier is None or verifier.when == "never" or not len(candidates.rows):
         return candidates, judgement, NOT_VERIFIED
-    calibration, automatic = calibration_of(map_, encoder), verifier.when == "auto"
-    if automatic and not (
-        worth_verifying(judgement, calibration) or _tells_pose(map_, candidates, judgement, verifier)
-    ):
+    automatic = verifier.when == "auto"
+    if automatic and not (worth_verifying(judgement, calibration) or tells_pose(judgement)):
         return candidates, judgement, ThirdStage("not-needed")
     began = time.perf_counter()
-    count = min(CANDIDATES, len(candidates.rows))
-    stored = map_.keypoints_at(candidates.rows[:count].tolist())
+    # Of several frames of one view the best is enough.
+    chosen = np.flatnonzero(~candidates.whereabouts.repeats(np.arange(len(candidates.rows))))[:CANDIDATES].tolist()
+    count = chosen[-1] + 1
+    stored: list[Keypoints | None] = [None] * count
+    for at, keypoints in zip(chosen, keypoints_at(candidates.rows[chosen].tolist()), strict=True):
+        stored[at] = keypoints
     if all(keypoints is None for keypoints in stored) or len(verifier.keypoints) < LEAST_MATCHES:
         return candidates, judgement, ThirdStage("no-keypoints", milliseconds=1e3 * (time.perf_counter() - began))
     found: list[Verification | None] = [None] * count

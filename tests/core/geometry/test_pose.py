@@ -228,6 +228,17 @@ def test_without_intrinsics_the_spread_covers_the_range_of_lenses(focal: float, 
     assert nothing_known is not None and (nothing_known.heading_spread > 1) == (degrees != 0)
 
 
+@pytest.mark.parametrize("degrees", [-10, 0, 10])
+def test_a_camera_that_stands_or_only_turns_is_not_said_to_have_moved(degrees: float) -> None:
+    query, place = pair(Motion((degrees, 0, 0), (0, 0, 0)), LENSES["none"], np.random.default_rng(17))
+    query = query if degrees else place  # the very same frame, which leaves the fundamental matrix open
+    found = relative_view(query, place, verify(query, [place])[0], LENSES["none"], LENSES["none"])
+    assert found is not None and found.heading_offset == pytest.approx(degrees, abs=0.3)
+    assert 0.01 < found.heading_spread < 0.5
+    spread = np.sqrt(np.diag(found.covariance)[3:])
+    assert (np.abs(found.shift) < 4 * spread).all() and np.abs(found.shift).max() < 0.02 and spread.max() < 0.02
+
+
 def test_intrinsics_are_scaled_to_the_frame_or_refused() -> None:
     camera = LENSES["barrel"]
     query, place = pair(Motion((10, 0, 0), (0.5, 0, 0)), camera, np.random.default_rng(15))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,47 @@ def test_twins_are_ambiguous(server: Server, map_id: str) -> None:
     answer = server.query(map_id, jpeg(1), verify="always")
     assert answer["verdict"] == "ambiguous" and answer["place"] is None
     assert {place for group in answer["rivals"] for place in group["places"]} <= {"here", "there"}
+
+
+FLAT = (37, 39, 42, 47)
+"""Scenes of which OpenCV finds no fundamental matrix between the picture and itself."""
+REAL = (
+    "eval/corridor/query/0000015.jpg",
+    "eval/lip6_outdoor/query/000615.jpg",
+    "train/camvid/0001TP_006690.jpg",
+    "train/tower/floor12/f12_elevator_main_frame_000010.jpg",
+)
+"""Likewise."""
+DATASETS = Path(__file__).parents[4] / "shared/datasets"
+
+
+@pytest.mark.parametrize("seed", FLAT)
+def test_a_place_is_recognized_by_its_own_picture(server: Server, map_id: str, seed: int) -> None:
+    server.enrol(map_id, "only", jpeg(seed))
+    for verify in ("auto", "always"):
+        answer = server.query(map_id, jpeg(seed), verify=verify)
+        assert answer["verdict"] == "recognized" and answer["place"]["id"] == "only", answer
+        (told,) = parts(answer)
+        assert told["inliers"] > 0.9 * told["keypoints"] and told["evidence"] > 1000
+
+
+@pytest.mark.parametrize("picture", REAL)
+@pytest.mark.skipif(not DATASETS.is_dir(), reason="the pictures of ../shared/datasets are not here")
+def test_a_real_place_is_recognized_by_its_own_picture(server: Server, map_id: str, picture: str) -> None:
+    data = (DATASETS / picture).read_bytes()
+    server.enrol(map_id, "only", data)
+    assert server.query(map_id, data)["place"]["id"] == "only"
+    server.enrol(map_id, "elsewhere", data + b"\0", x=500, y=0)
+    assert server.query(map_id, data, verify="always")["verdict"] == "ambiguous"
+
+
+@pytest.mark.parametrize("seed", FLAT[:2])
+def test_equal_pictures_that_are_apart_are_rivals(server: Server, map_id: str, seed: int) -> None:
+    for x in (0, 500):
+        server.enrol(map_id, f"at-{x}", jpeg(seed) + b"\0" * (x > 0), x=x, y=0)
+    answer = server.query(map_id, jpeg(seed), verify="always")
+    assert answer["verdict"] == "ambiguous" and answer["place"] is None, answer
+    assert {place for group in answer["rivals"] for place in group["places"]} <= {"at-0", "at-500"}
 
 
 def test_a_batch_is_verified_too(server: Server, verified: str) -> None:

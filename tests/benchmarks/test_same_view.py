@@ -1,0 +1,56 @@
+"""Verification recognizes the view that it was shown: pictures, compared with themselves and with near copies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.geometry.same_view import SETS, TRAVERSES, VIEWS, Comparison, compared, pictures, same_views
+from core.geometry.detection import find_keypoints
+from core.networks.xfeat import XFeat, load_xfeat
+from tests.service.scenes import scene, stranger
+from training.photographs import read
+
+DATASETS = Path(__file__).parents[3] / "shared/datasets"
+PICTURES, EVERY = 200, 14
+HERE = all(
+    (DATASETS / part).is_dir()
+    for part in (*(f"eval/{name}" for name in TRAVERSES), *(f"train/{name}" for name in SETS))
+)
+
+
+@pytest.fixture(scope="module")
+def network() -> XFeat:
+    return load_xfeat()
+
+
+def failed(made: list[Comparison]) -> list[Comparison]:
+    return [one for one in made if one.fails(one.inliers)]
+
+
+def test_a_drawn_picture_is_recognized_in_every_view(network: XFeat) -> None:
+    made = same_views(network, scene(37), "scene 37")
+    assert [one.kind for one in made] == list(VIEWS)
+    assert all(one.counts for one in made) and not failed(made)
+    assert not any(one.evidence < one.evidence_before for one in made)
+    assert made[0].inliers == made[0].matches
+
+
+def test_strangers_have_no_more_evidence(network: XFeat) -> None:
+    shown = find_keypoints(network, scene(37))
+    for seed in range(60, 66):
+        one = compared("stranger", str(seed), find_keypoints(network, stranger(seed)), shown)
+        assert one.evidence == one.evidence_before < 40
+
+
+@pytest.mark.skipif(not HERE, reason="the pictures of ../shared/datasets are not here")
+def test_real_pictures_are_recognized(network: XFeat) -> None:
+    """Each is compared with itself, and some with one other view, all of which have their turn."""
+    others = iter(name for name in VIEWS if name != "the same")
+    made: list[Comparison] = []
+    for number, path in enumerate(pictures(DATASETS, PICTURES)):
+        views = ["the same", next(others, "the same")] if number % EVERY == 0 else ["the same"]
+        made += same_views(network, read(path), path.relative_to(DATASETS).as_posix(), views)
+    assert {one.kind for one in made} == set(VIEWS) and sum(one.counts for one in made) > 0.95 * len(made)
+    assert not failed(made), "\n".join(map(str, failed(made)))
