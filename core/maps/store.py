@@ -264,7 +264,7 @@ class Map(Protocol):
         """The ids of the places that fulfil some conditions, in the order of their enrolment.
 
         Raises:
-            TooManyToForget: there are more than ``most``.
+            TooManyToDelete: there are more than ``most``.
         """
 
     def digest(self, place_id: str) -> bytes | None:
@@ -378,7 +378,7 @@ class Map(Protocol):
         """Delete the places that fulfil some conditions, all or none; returns their ids.
 
         Raises:
-            TooManyToForget: there are more than ``most``.
+            TooManyToDelete: there are more than ``most``.
         """
 
     def forget_sequence(self, name: str) -> int:

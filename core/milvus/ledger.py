@@ -75,7 +75,7 @@ class PlaceEntry:
     key: of its entity in Milvus.
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
-    ordinal: its position in its sequence.
+    ordinal: its position in its sequence (``core.maps.views``).
     track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     """
 
@@ -398,11 +398,60 @@ def _moment(microseconds_since_1970: int | None) -> datetime | None:
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=microseconds_since_1970)
 
 
-def next_in_sequence(connection: Connection[Any], map_number: int, name: str | None) -> tuple[int, int]:
-    """The code of a sequence, which is made if there is none, and the ordinal of its next place."""
+def latest_in_sequence(
+    connection: Connection[Any], map_number: int, name: str, positions: int
+) -> tuple[tuple[int, int] | None, dict[int, int]]:
+    """The end of a sequence: ordinal and row of its last place, and the row of the first place at each last ordinal.
+
+    Args:
+        positions: so many ordinals before the last one are looked at, too.
+    """
+    query = "SELECT code, next_ordinal FROM sequences WHERE map = %s AND name = %s"
+    found = connection.execute(query, (map_number, name)).fetchone()
+    if found is None:
+        return None, {}
+    code, following = found
+    query = "SELECT ordinal, row FROM places WHERE map = %s AND sequence = %s ORDER BY number DESC LIMIT 1"
+    last = connection.execute(query, (map_number, code)).fetchone()
+    if last is None:
+        return None, {}
+    first = {}
+    for ordinal in sorted({last[0], *range(max(0, following - 1 - positions), following)}):
+        row = first_at(connection, map_number, code, ordinal)
+        if row is not None:
+            first[int(ordinal)] = row
+    return (int(last[0]), int(last[1])), first
+
+
+def first_at(
+    connection: Connection[Any], map_number: int, code: int, ordinal: int, without: int | None = None
+) -> int | None:
+    """The row of the first place at a position of a sequence; None if none is there.
+
+    Args:
+        without: the number of a place that does not count.
+    """
+    query = (
+        "SELECT row FROM places WHERE map = %s AND sequence = %s AND ordinal = %s AND number <> %s"
+        " ORDER BY number LIMIT 1"
+    )
+    found = connection.execute(query, (map_number, code, ordinal, -1 if without is None else without)).fetchone()
+    return None if found is None else int(found[0])
+
+
+def next_in_sequence(
+    connection: Connection[Any], map_number: int, name: str | None, ordinal: int | None = None
+) -> tuple[int, int]:
+    """The code of a sequence, which is made if there is none, and the ordinal of its next place.
+
+    Args:
+        ordinal: of a place that shows a view which is there already; None: of one at the end.
+    """
     code = NO_SEQUENCE if name is None else sequence_codes(connection, map_number, [name]).get(name)
     if name is not None and code is None:
         code = new_sequence(connection, map_number, name)
+    if ordinal is not None and code is not None:
+        return code, ordinal
     query = (
         "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE map = %s AND code = %s RETURNING next_ordinal - 1"
     )

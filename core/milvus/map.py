@@ -16,7 +16,7 @@ from core.errors import (
     NoThumbnail,
     RevisionMismatch,
     StorageFailure,
-    TooManyToForget,
+    TooManyToDelete,
     UnknownPlace,
     UnknownSequence,
 )
@@ -215,7 +215,7 @@ class MilvusMap:
         """The ids of the places that fulfil some conditions, in the order of their enrolment.
 
         Raises:
-            TooManyToForget: there are more than ``most``.
+            TooManyToDelete: there are more than ``most``.
         """
         with self._reading() as connection:
             found = ledger.entries_after(connection, self.number, -1, most + 1, wanted)
@@ -483,7 +483,7 @@ class MilvusMap:
         """Delete the places that fulfil some conditions, all or none; returns their ids.
 
         Raises:
-            TooManyToForget: there are more than ``most``.
+            TooManyToDelete: there are more than ``most``.
         """
         with self.writing() as write:
             found = _not_more(write.all_of(wanted, most + 1), most)
@@ -507,9 +507,9 @@ class MilvusMap:
 
 
 def _not_more(entries: list[PlaceEntry], most: int) -> list[PlaceEntry]:
-    """The places; raises TooManyToForget if they are more than ``most``."""
+    """The places; raises TooManyToDelete if they are more than ``most``."""
     if len(entries) > most:
-        raise TooManyToForget(f"More than {most} places fulfil the conditions. Forget them in several requests.")
+        raise TooManyToDelete(f"More than {most} places fulfil the conditions. Delete them in several requests.")
     return entries
 
 

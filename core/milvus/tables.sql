@@ -57,7 +57,9 @@ CREATE TABLE IF NOT EXISTS places (
     UNIQUE (map, id),
     UNIQUE (map, row)
 );
-CREATE INDEX IF NOT EXISTS places_of_sequence ON places (map, sequence, ordinal);
+DROP INDEX IF EXISTS places_of_sequence;
+CREATE INDEX IF NOT EXISTS places_at_position ON places (map, sequence, ordinal, number);
+CREATE INDEX IF NOT EXISTS places_in_order ON places (map, sequence, number);
 CREATE INDEX IF NOT EXISTS places_by_metadata ON places USING gin (tokens);
 
 -- Apart from the places, so that a listing need not read them.

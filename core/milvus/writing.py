@@ -15,6 +15,7 @@ from core.maps.enrolling import picture_of
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.maps.stored_fields import metadata_text, same_fields
+from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, shows_same
 from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
@@ -52,6 +53,7 @@ class Write:
         self._before, self._form = state, Form(state.record)
         self._entities: dict[int, Callable[[], Entity]] = {}  # by the number of the place
         self._changed = False
+        self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
         self._now = datetime.now(UTC)
         self._object_key: tuple[str, int] | None = None
 
@@ -67,11 +69,12 @@ class Write:
         """Places that fulfil some conditions, in the order of their enrolment, behind the number ``after``."""
         return ledger.entries_after(self.connection, self.state.number, after, limit, wanted)
 
-    def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
+    def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
             keep: what to keep of the frame; by default what the map's settings say.
+            ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, self.state.number, item.id)
         keypoints = None if item.keypoints is None or not self.state.record.verification else item.keypoints.record()
@@ -89,16 +92,39 @@ class Write:
             **dict(item.fields), id=item.id, regions=item.regions, picture=kept[0],
             created_at=self._now if stored is None else stored.place.created_at, updated_at=self._now,
         )  # fmt: skip
+        look = Look(item.descriptor, item.local)
         if stored is None:
-            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
-            entry = PlaceEntry(self.new_key(), row, self.new_key(), item.digest, code, ordinal, place)
+            at = self._position(place.sequence, look) if ordinal is None else ordinal
+            code, at = ledger.next_in_sequence(self.connection, self.state.number, place.sequence, at)
+            entry = PlaceEntry(self.new_key(), row, self.new_key(), item.digest, code, at, place)
             self.state = replace(self.state, places=self.state.places + 1)
             self._put(entry, descriptor)
+            if (views := self._latest.get(place.sequence or "")) is not None:
+                views.note(at, look)
             return place, "created"
-        shown = replace(self._placed(stored, place), row=row, digest=item.digest, track=None, station=None)
+        shown = replace(self._placed(stored, place, look), row=row, digest=item.digest, track=None, station=None)
         self._put(shown, descriptor)
         self._let_go(stored, stored.row)
         return place, "replaced"
+
+    def _position(self, sequence: str | None, look: Look) -> int | None:
+        """The position at the end of a sequence of a frame that shows a view which is there already, else None."""
+        if sequence is None:
+            return None
+        if sequence not in self._latest:
+            positions = min(self.state.record.same_place_frames, MOST_HIDDEN)
+            last, first = ledger.latest_in_sequence(self.connection, self.state.number, sequence, positions)
+            self._latest[sequence] = latest_views(last, first, positions, self._looks)
+        return self._latest[sequence].position_of(look)
+
+    def _looks(self, rows: list[int]) -> list[Look]:
+        """What the frames in some rows show."""
+        columns = ("descriptor", self._form.descriptors), ("local", self._form.locals)
+        kept = [
+            (ledger.of_frames(self.connection, self.state.number, column, rows), unpacked)
+            for column, unpacked in columns
+        ]
+        return [Look(*(unpacked([found[row]])[0] for found, unpacked in kept)) for row in rows]
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
@@ -129,7 +155,8 @@ class Write:
 
     def adopt(self, item: Enrolment, history: History) -> None:
         """Store a place of another map with its history."""
-        self.enrol(item, history.picture)
+        self.enrol(item, history.picture, history.ordinal)
+        self._latest.clear()
         stored = self.expect(item.id)
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
@@ -170,16 +197,28 @@ class Write:
         self._changed = True
         return ledger.put_keypoints(self.connection, self.state.number, stored.row, found.record())
 
-    def _placed(self, stored: PlaceEntry, place: Place) -> PlaceEntry:
-        """A place with other fields, under a new key; its position in its sequence changes only with the sequence."""
-        code, ordinal = stored.sequence, stored.ordinal
+    def _placed(self, stored: PlaceEntry, place: Place, look: Look | None = None) -> PlaceEntry:
+        """A place with other fields, under a new key; its position in its sequence changes only with the sequence.
+
+        Args:
+            look: what its new frame shows, which leaves the view of the others at its position if it shows another;
+                None: its frame stays.
+        """
+        number, code, ordinal = self.state.number, stored.sequence, stored.ordinal
         if place.sequence != stored.place.sequence:
-            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
+            at = self._position(place.sequence, look or self._looks([stored.row])[0])
+            code, ordinal = ledger.next_in_sequence(self.connection, number, place.sequence, at)
+        elif look is not None and place.sequence is not None:
+            other = ledger.first_at(self.connection, number, code, ordinal, without=stored.number)
+            if other is not None and not shows_same(look, self._looks([other])[0], about=True):
+                code, ordinal = ledger.next_in_sequence(self.connection, number, place.sequence)
+        self._latest.clear()
         return replace(stored, key=self.new_key(), sequence=code, ordinal=ordinal, place=place)
 
     def forget(self, stored: PlaceEntry) -> None:
         """Delete a place."""
         ledger.remove(self.connection, self.state.number, stored)
+        self._latest.clear()
         self._entities.pop(stored.number, None)
         self.state = replace(self.state, places=self.state.places - 1)
         self._let_go(stored, stored.row)

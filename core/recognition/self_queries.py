@@ -52,9 +52,14 @@ class SelfQueries:
     def __len__(self) -> int:
         return len(self.places)
 
-    def near(self, position: int, others: Positions) -> NDArray[np.bool_]:
-        """Which of the places at ``others``, int64 [n], are the same place as the one at ``position``; bool [n]."""
-        return self.where.take(np.concatenate([[position], others])).near(0, self.neighborhood)[1:]
+    def near(self, position: int, others: Positions, times: float = 1) -> NDArray[np.bool_]:
+        """Which of the places at ``others``, int64 [n], are the same place as the one at ``position``; bool [n].
+
+        Args:
+            times: so many times as far as the map says.
+        """
+        neighborhood = self.neighborhood if times == 1 else self.neighborhood.times(times)
+        return self.where.take(np.concatenate([[position], others])).near(0, neighborhood)[1:]
 
     def local_descriptors(self, positions: Positions) -> Cells:
         """The local descriptors of the places at some positions, int64 [k]; int8 [k, C, L]."""

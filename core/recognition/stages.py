@@ -13,7 +13,7 @@ neighbours of the best place until it has compared a few other places, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -152,7 +152,7 @@ def agree(
     """
     neighborhood = neighborhood_of(map_)
     candidates = _examined(map_, encoder, scope, local, ranking)
-    if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
+    if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates):
         return candidates
     more = scope.search_elsewhere(descriptor, ranking, int(candidates.rows[0]), neighborhood)
     if not len(more[0]):  # the ranking has all places
@@ -187,7 +187,7 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
             found.scores,
             len(snapshot),
         )
-        if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
+        if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates):
             break
     return candidates
 
@@ -206,14 +206,32 @@ def likeness(map_: Map, encoder: Encoder, candidates: Candidates, positions: Pos
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
     except UnknownPlace:
         return np.zeros(len(positions), np.float32)
+    return likeness_of_first(encoder, descriptors, local)
+
+
+def likeness_of_first(encoder: Encoder, descriptors: Array, local: Cells) -> Array:
+    """The scores of the first of n frames, as if it were the query, at the others, float32 [n - 1].
+
+    Args:
+        descriptors: float32 [n, D].
+        local: int8 [n, C, L].
+    """
     scores = encoder.scores_from_inner_products(descriptors[1:] @ descriptors[0])
     return scores + encoder.agreement(local[0], local[1:])
 
 
-def _is_enough(candidates: Candidates, neighborhood: Neighborhood, has_second_stage: bool) -> bool:
-    """Whether the candidates have as many places other than the best place as a verdict considers."""
-    others = candidates.whereabouts.others(0, neighborhood)
-    return int((others & candidates.examined if has_second_stage else others).sum()) >= TOP_PLACES
+def _is_enough(candidates: Candidates, neighborhood: Neighborhood, examined: int) -> bool:
+    """Whether the candidates have as many places other than the best place as a verdict considers.
+
+    Among many frames of few views there are to be half as many as the second stage examines elsewhere.
+
+    Args:
+        examined: how many places the second stage examines; 0: there is none.
+    """
+    others, places = candidates.whereabouts.others(0, neighborhood), candidates.whereabouts
+    crowded = bool(places.repeats(np.arange(len(places))).any())
+    wanted = max(TOP_PLACES, examined // 2) if crowded else TOP_PLACES
+    return int((others & candidates.examined if examined else others).sum()) >= wanted
 
 
 @dataclass(frozen=True)
@@ -252,16 +270,18 @@ def second_stage(encoder: Encoder, query: Cells, local_at: Callable[[Positions],
         local_at: returns the local descriptors at positions in the ranking, int64 [k] to int8 [k, C, L].
     """
 
-    read = np.zeros((0, *query.shape), np.int8)  # of the first places, if they were screened
+    read = np.zeros((0, *query.shape), np.int8)  # of the places that were screened
+    numbers: dict[int, int] = {}
 
     def promise(positions: Positions) -> Array:
         nonlocal read
         read = local_at(positions)
+        numbers.update(zip(positions.tolist(), range(len(positions)), strict=True))
         return encoder.promise(query, read)
 
     def gains(positions: Positions) -> Array:
-        known = bool((positions < len(read)).all())
-        return encoder.agreement(query, read[positions] if known else local_at(positions))
+        known = [numbers[position] for position in positions.tolist() if position in numbers]
+        return encoder.agreement(query, read[known] if len(known) == len(positions) else local_at(positions))
 
     return SecondStage(encoder.candidates, gains, encoder.screened, promise)
 
@@ -278,8 +298,9 @@ def examine(
 ) -> Examined:
     """Raise the scores of the best places of a ranking by the gains of the second stage.
 
-    It examines the first ``candidates`` places or, if more are ``screened``, the most promising of these.  As long as
-    fewer than ``others`` of the examined places are other than the best place, it then examines the next that are.
+    It examines the first ``candidates`` places or, if more are ``screened``, the most promising of these; of several
+    frames of one view first one.  As long as fewer than ``others`` of the examined places are other than the best
+    place, it then examines the next that are.
 
     Args:
         scores: float32 [n], the scores of the first stage, best first.
@@ -290,10 +311,11 @@ def examine(
     """
     raised = scores.copy()
     done = np.zeros(len(scores), np.bool_)
-    queue = np.arange(len(scores))  # in the order in which places are examined
+    queue = _views_first(whereabouts, np.arange(len(scores)))  # in the order in which places are examined
     if promise is not None and candidates < min(screened, len(queue)):
         first = queue[:screened]
-        queue[:screened] = np.argsort(-(scores[first] + promise(first)), kind="stable")
+        promising = first[np.argsort(-(scores[first] + promise(first)), kind="stable")]
+        queue[:screened] = _views_first(whereabouts, promising)
     ahead = queue[:candidates]
     for _ in range(ROUNDS):
         if not len(ahead):
@@ -306,6 +328,12 @@ def examine(
         ahead = queue[(elsewhere & ~done)[queue]][:missing]
     order = np.argsort(-raised, kind="stable")
     return Examined(order, raised[order], done[order])
+
+
+def _views_first(whereabouts: Whereabouts, queue: Positions) -> Positions:
+    """The places in their order, but further frames of a view behind the first ones of all views."""
+    again = whereabouts.repeats(queue)
+    return np.concatenate([queue[~again], queue[again]])
 
 
 def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, references: Cells) -> Array:
@@ -321,17 +349,36 @@ def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, refere
         Scores, float32 [Q, R].
     """
     scores = encoder.scores_from_inner_products(inner_products)
-    if not encoder.candidates:
-        return scores
-    places = Whereabouts.along_sequence(np.arange(len(references)))
+    if encoder.candidates:
+        for row, found in zip(scores, traverse_candidates(encoder, inner_products, queries, references), strict=True):
+            row[found.rows] = found.scores
+    return scores
+
+
+def traverse_neighborhood() -> Neighborhood:
+    """Which frames of a traverse are the same place, as in a map with the settings of a new one."""
     settings = MapSettings()
-    neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
-    for row, query in zip(scores, queries, strict=True):
-        order = np.argsort(-row, kind="stable")
+    return Neighborhood(settings.same_place_radius, settings.same_place_frames)
+
+
+def traverse_candidates(
+    encoder: Encoder, inner_products: Array, queries: Cells, references: Cells
+) -> Iterator[Candidates]:
+    """The ranking of every query after both stages, as a map of the references would give it; its rows are all of them.
+
+    Args:
+        encoder: with a second stage.
+        inner_products, queries, references: as of :func:`score_matrix`.
+    """
+    places = Whereabouts.along_sequence(np.arange(len(references)))
+    neighborhood = traverse_neighborhood()
+    for first, query in zip(encoder.scores_from_inner_products(inner_products), queries, strict=True):
+        order = np.argsort(-first, kind="stable")
 
         def local_at(positions: Positions, order: Positions = order) -> Cells:
             return references[order[positions]]
 
-        found = examine(row[order], places.take(order), neighborhood, *second_stage(encoder, query, local_at))
-        row[order[found.order]] = found.scores
-    return scores
+        found = examine(first[order], places.take(order), neighborhood, *second_stage(encoder, query, local_at))
+        rows = order[found.order]
+        ranked = rows, found.scores, first[rows], places.take(rows), found.examined
+        yield Candidates(*ranked, weights=None, ordered=found.scores, places=len(references))

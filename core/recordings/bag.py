@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import tempfile
 import threading
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -159,8 +161,7 @@ class Bag:
 
         The id of a frame is made of the topic and its stamp.
         """
-        found = self._entries(name)
-        entries = self._in_time(name, found)
+        entries = self._once(name, self._in_time(name, self._entries(name)))
         start = make_id(name.strip("/"))[:LONGEST_TOPIC]
         frames, seen = [], Counter[int]()
         for file, entry in entries:
@@ -172,6 +173,39 @@ class Bag:
             load = partial(self._picture, file, name, entry)
             frames.append(Frame(f"{start}-{written}{again}", f"{name} at {written}", load, None, utc(taken), taken))
         return frames
+
+    def _once(self, name: str, entries: Sequence[tuple[int, Entry]]) -> list[tuple[int, Entry]]:
+        """Entries in the order of their times, each message once; messages of one time are compared by their bytes."""
+        kept, repeated, alike = list[tuple[int, Entry]](), 0, 0
+        for _, group in groupby(entries, lambda one: one[1].stamp or one[1].received):
+            together, seen = list(group), set[bytes]()
+            for number, (file, entry) in enumerate(together):
+                if len(together) > 1:
+                    digest = self._digest(file, entry)
+                    if digest in seen:
+                        repeated += 1
+                        continue
+                    seen.add(digest)
+                    alike += number > 0
+                kept.append((file, entry))
+        if repeated:
+            self.remarks.append(
+                f"{repeated} messages of {name} repeat another one, with its stamp and its bytes, and are left out."
+            )
+        if alike:
+            self.remarks.append(
+                f"{alike} messages of {name} have the stamp of another one, but other bytes: they are taken, and their "
+                "ids end with ~2 and so on."
+            )
+        return kept
+
+    def _digest(self, file: int, entry: Entry) -> bytes:
+        """The digest of a message; one that cannot be read is like no other."""
+        try:
+            with self._lock:
+                return hashlib.sha256(self._files[file][1].read(entry.key)).digest()
+        except (OSError, InvalidRecording):
+            return repr((file, entry.key)).encode()
 
     def _picture(self, file: int, name: str, entry: Entry) -> bytes:
         storage = self._files[file][1]

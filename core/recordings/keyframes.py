@@ -1,23 +1,36 @@
-"""Keyframes: the frames of a recording that show something new, by distance, angle, time or change of descriptor."""
+"""Keyframes: the frames of a recording that show something new, by distance, angle, time or change of descriptor.
+
+Without any choice of them, the frames in which nothing changes at all are told from the others by :func:`moving`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.places import Pose
 from core.recordings.frame import NANOSECONDS, Frame
 
 Describe = Callable[[Frame], NDArray[np.float32] | None]
 """Gives the descriptor of a frame, float32 [D], of length 1; None if it has none."""
 
 
+STANDING = 1.0
+"""Metres: a robot whose poses are farther apart has moved, whatever it sees."""
+
+Look = TypeVar("Look")
+
+
 @dataclass(frozen=True)
 class Spacing:
     """How far a keyframe is from the one before: it is enough that one of the measures that are given is reached.
+
+    Metres, degrees and seconds are reached by the frame that is nearest to them if the next step is as the last: half
+    of the step from the frame before may be missing, and a tenth of the measure at most.  So frames two metres apart,
+    whose poses are never quite exact, give one keyframe every four metres if four are asked for.
 
     metres, degrees, seconds: of their positions, headings and times.
     change: 1 less the inner product of their descriptors: 0 for equal frames, about 1 for frames of different places.
@@ -30,6 +43,10 @@ class Spacing:
 
     def __bool__(self) -> bool:
         return any(measure is not None for measure in vars(self).values())
+
+
+SLACK = 0.1
+"""Of a measure, what may be missing at most."""
 
 
 @dataclass
@@ -52,6 +69,7 @@ def keyframes(
         left: counts the frames that could not be judged.
     """
     last: tuple[Frame, NDArray[np.float32] | None] | None = None
+    previous: Frame | None = None
     for frame in frames:
         described = frame.described()
         descriptor = describe(described) if spacing.change is not None and describe is not None else None
@@ -59,9 +77,32 @@ def keyframes(
             if left is not None:
                 left.unjudged += 1
             continue
-        if last is None or _is_far(described, descriptor, *last, spacing):
+        if last is None or previous is None or _is_far(described, descriptor, *last, previous, spacing):
             last = described, descriptor
             yield described
+        previous = described
+
+
+def moving(
+    frames: Iterable[Frame], look: Callable[[Frame], Look | None], same: Callable[[Look, Look], bool]
+) -> Iterator[Frame]:
+    """The frames without those that show the same as the last frame before them that is not left out.
+
+    Args:
+        look: gives what a frame shows; None: it cannot be read, and the frame stays.
+        same: whether two frames show the same.
+    """
+    last: tuple[Frame, Look] | None = None
+    for frame in frames:
+        shown = look(frame)
+        if last is not None and shown is not None and same(shown, last[1]) and not _moved(frame, last[0]):
+            continue
+        last = None if shown is None else (frame, shown)
+        yield frame
+
+
+def _moved(frame: Frame, before: Frame) -> bool:
+    return (_metres(frame, before) or 0.0) > STANDING
 
 
 def _judgeable(frame: Frame, descriptor: NDArray[np.float32] | None, spacing: Spacing) -> bool:
@@ -76,25 +117,44 @@ def _is_far(
     descriptor: NDArray[np.float32] | None,
     before: Frame,
     last: NDArray[np.float32] | None,
+    previous: Frame,
     spacing: Spacing,
 ) -> bool:
-    """Whether one of the measures is reached; one that is known of the frame and not of the keyframe counts as such."""
-    reached = []
-    if spacing.metres is not None and frame.pose is not None:
-        reached.append(before.pose is None or _distance(frame.pose, before.pose) >= spacing.metres)
-    if spacing.degrees is not None and frame.pose is not None and frame.pose.heading is not None:
-        heading = None if before.pose is None else before.pose.heading
-        reached.append(heading is None or abs((frame.pose.heading - heading + 180) % 360 - 180) >= spacing.degrees)
-    if spacing.seconds is not None and frame.nanoseconds is not None:
-        elapsed = None if before.nanoseconds is None else frame.nanoseconds - before.nanoseconds
-        reached.append(elapsed is None or elapsed >= spacing.seconds * NANOSECONDS)
-    if spacing.change is not None and descriptor is not None:
-        reached.append(last is None or 1 - float(descriptor @ last) >= spacing.change)
-    return any(reached)
+    """Whether one of the measures is reached; one that is known of the frame and not of the keyframe counts as such.
+
+    Args:
+        before: the keyframe before, of the descriptor ``last``.
+        previous: the frame before, which may be the keyframe.
+    """
+    for measure, between in ((spacing.metres, _metres), (spacing.degrees, _degrees), (spacing.seconds, _seconds)):
+        if measure is not None and between(frame, frame) is not None:  # it is known of the frame
+            gone, step = between(frame, before), between(frame, previous)
+            if gone is None or gone >= measure - min(abs(step or 0.0) / 2, SLACK * measure):
+                return True
+    return (
+        spacing.change is not None
+        and descriptor is not None
+        and (last is None or 1 - float(descriptor @ last) >= spacing.change)
+    )
 
 
-def _distance(one: Pose, other: Pose) -> float:
-    """Metres between two poses; endless if one is in metres and the other in degrees."""
-    if one.kind() != other.kind():
+def _metres(one: Frame, other: Frame) -> float | None:
+    """Between two frames; endless if the pose of one is in metres and that of the other in degrees."""
+    if one.pose is None or other.pose is None:
+        return None
+    if one.pose.kind() != other.pose.kind():
         return float("inf")
-    return float(np.linalg.norm(one.position() - other.position()))
+    return float(np.linalg.norm(one.pose.position() - other.pose.position()))
+
+
+def _degrees(one: Frame, other: Frame) -> float | None:
+    headings = [None if frame.pose is None else frame.pose.heading for frame in (one, other)]
+    if headings[0] is None or headings[1] is None:
+        return None
+    return abs((headings[0] - headings[1] + 180) % 360 - 180)
+
+
+def _seconds(one: Frame, other: Frame) -> float | None:
+    if one.nanoseconds is None or other.nanoseconds is None:
+        return None
+    return (one.nanoseconds - other.nanoseconds) / NANOSECONDS

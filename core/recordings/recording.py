@@ -44,11 +44,13 @@ class Recording:
 
     name: of its file or folder, without the suffix.
     remarks: sentences about what was found that a user must know.
+    continuous: whether its frames were taken by a clock, as those of a bag or a video, and not chosen by somebody.
     """
 
     name: str
     frames: list[Frame]
     remarks: list[str] = field(default_factory=list)
+    continuous: bool = False
     _close: Callable[[], None] = lambda: None
 
     def close(self) -> None:
@@ -124,6 +126,7 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
         recording = Recording(
             path.resolve().name if path.is_dir() else path.name.removesuffix(".zstd").rpartition(".")[0],
             bag.frames(bag.choose(topic, IMAGE_TYPES, "pictures")),
+            continuous=True,
             _close=bag.close,
         )
         if poses.topic is not None:
@@ -147,7 +150,7 @@ def _open_video(path: Path) -> Recording:
     except BaseException:
         video.close()
         raise
-    return Recording(path.stem, frames, remarks, video.close)
+    return Recording(path.stem, frames, remarks, continuous=True, _close=video.close)
 
 
 def _place(recording: Recording, trajectory: Trajectory, by_frame: bool, largest_gap: float) -> None:

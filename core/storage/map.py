@@ -19,7 +19,7 @@ from core.errors import (
     PlacerecError,
     RevisionMismatch,
     StorageFailure,
-    TooManyToForget,
+    TooManyToDelete,
     UnknownMap,
     UnknownSequence,
 )
@@ -429,7 +429,7 @@ class Map:
         """Delete the places that fulfil some conditions, all in one commit; returns their ids.
 
         Raises:
-            TooManyToForget: there are more than ``most``; none is deleted.
+            TooManyToDelete: there are more than ``most``; none is deleted.
         """
         with self._writing() as write:
             found = _not_more(ledger.ids_of(write.connection, wanted, most + 1), most)
@@ -500,7 +500,7 @@ class Map:
         """The ids of the places that fulfil some conditions, in the order of their enrolment.
 
         Raises:
-            TooManyToForget: there are more than ``most``.
+            TooManyToDelete: there are more than ``most``.
         """
         with self._reading() as connection:
             return _not_more(ledger.ids_of(connection, wanted, most + 1), most)
@@ -604,7 +604,7 @@ class Map:
 
 
 def _not_more(ids: list[str], most: int) -> list[str]:
-    """The ids; raises TooManyToForget if they are more than ``most``."""
+    """The ids; raises TooManyToDelete if they are more than ``most``."""
     if len(ids) > most:
-        raise TooManyToForget(f"More than {most} places fulfil the conditions. Forget them in several requests.")
+        raise TooManyToDelete(f"More than {most} places fulfil the conditions. Delete them in several requests.")
     return ids

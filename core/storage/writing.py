@@ -15,6 +15,7 @@ from core.disk.files import Damage, primary_code
 from core.geometry.keypoints import Keypoints
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.maps.stored_fields import same_fields
+from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, shows_same
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, microseconds
 from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
@@ -95,6 +96,7 @@ class Write:
         self._locations: list[Location] = []
         self._moved: dict[int, Location] = {}
         self._dead: list[int] = []
+        self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
         self._now = datetime.now(UTC)
 
     def expect(self, frames: int) -> None:
@@ -104,11 +106,12 @@ class Write:
             records[: self._appended] = self._records[: self._appended]
             self._records = records
 
-    def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
+    def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
             keep: what to keep of the frame; by default what the map's settings say.
+            ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, item.id)
         if stored is not None and stored.digest == item.digest:
@@ -121,19 +124,64 @@ class Write:
         record = self._records[self._appended]
         self._layout.pack(record, item.descriptor, item.local, row)
         checksum = int(record["checksum"])
-        keep = self.record.keep if keep is None else keep
+        keep, look = self.record.keep if keep is None else keep, Look(item.descriptor, item.local)
         if stored is None:
-            now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
+            at = self._position(item.fields.sequence, look) if ordinal is None else ordinal
+            now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now, at)
+            self._note_last(now_stored, look)
         else:
             ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
             keypoints.delete(self.connection, stored.number)
-            now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
+            now_stored = self._with_fields(stored, item.fields, look)
             self._mark_dead(stored.row)
         if item.keypoints is not None:
             self._put_keypoints(now_stored, item.keypoints)
         self._appended += 1
         self._locations.append(_location(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
+
+    def _position(self, sequence: str | None, look: Look) -> int | None:
+        """The position at the end of a sequence of a frame that shows a view which is there already, else None."""
+        if sequence is None:
+            return None
+        if sequence not in self._latest:
+            positions = min(self.record.same_place_frames, MOST_HIDDEN)
+            last, first = ledger.latest_in_sequence(self.connection, sequence, positions)
+            self._latest[sequence] = latest_views(last, first, positions, self._looks)
+        return self._latest[sequence].position_of(look)
+
+    def _note_last(self, stored: StoredPlace, look: Look) -> None:
+        if (views := self._latest.get(stored.place.sequence or "")) is not None:
+            views.note(stored.ordinal, look)
+
+    def _looks(self, rows: list[int]) -> list[Look]:
+        """What the frames in some rows show, those of this write included."""
+        before = self._snapshot.rows
+        old = np.array([row for row in rows if row < before], np.int64)
+        new = self._records[[row - before for row in rows if row >= before]]
+        kept = map(Look, self._snapshot.descriptors_at(old), self._snapshot.locals_at(old))
+        pending = map(Look, self._layout.descriptors_of(new), self._layout.locals_of(new))
+        shown = dict(zip(old.tolist(), kept, strict=True))
+        shown |= dict(zip([row for row in rows if row >= before], pending, strict=True))
+        return [shown[row] for row in rows]
+
+    def _with_fields(self, stored: StoredPlace, fields: PlaceFields, look: Look | None = None) -> StoredPlace:
+        """Change the fields of a place.
+
+        Args:
+            look: what its new frame shows, which leaves the view of the others at its position if it shows another;
+                None: its frame stays.
+        """
+        moves = fields.sequence != stored.place.sequence
+        at = self._position(fields.sequence, look or self._looks([stored.row])[0]) if moves else None
+        self._latest.clear()
+        now_stored = ledger.set_fields(self.connection, stored, fields, self._now, at)
+        if look is not None and not moves and fields.sequence is not None:
+            other = ledger.first_at(self.connection, stored.sequence, stored.ordinal, without=stored.number)
+            if other is not None and not shows_same(look, self._looks([other])[0], about=True):
+                ledger.move_to_end(self.connection, stored)
+                now_stored = ledger.expect(self.connection, stored.place.id)
+        return now_stored
 
     def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
         if self.record.verification:
@@ -154,7 +202,8 @@ class Write:
 
     def adopt(self, item: Enrolment, history: History) -> None:
         """Store a place of another map with its history."""
-        self.enrol(item, history.picture)
+        self.enrol(item, history.picture, history.ordinal)
+        self._latest.clear()
         stored = ledger.set_history(self.connection, item.id, history)
         appended = stored.row - self._snapshot.rows
         if appended >= 0:
@@ -166,7 +215,7 @@ class Write:
         """Change the fields of a place; its frame stays."""
         if same_fields(stored.place, fields):
             return stored.place, "unchanged"
-        now_stored = ledger.set_fields(self.connection, stored, fields, self._now)
+        now_stored = self._with_fields(stored, fields)
         self._moved[stored.row] = _location(now_stored)
         return now_stored.place, "updated"
 
@@ -182,6 +231,7 @@ class Write:
     def forget(self, stored: StoredPlace) -> None:
         """Delete a place."""
         ledger.delete(self.connection, stored)
+        self._latest.clear()
         self._mark_dead(stored.row)
 
     def forget_sequence(self, name: str) -> int:
@@ -189,6 +239,7 @@ class Write:
         rows = ledger.rows_of_sequence(self.connection, name)
         if rows:
             ledger.delete_sequence(self.connection, name)
+            self._latest.clear()
             for row in rows:
                 self._mark_dead(row)
         return len(rows)

@@ -31,6 +31,7 @@ from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
 from core.maps.records import MapRecord, validation_message
+from core.names import TEXT
 from core.places import check_map_id
 
 FORMAT = "placerec map"
@@ -65,7 +66,7 @@ class ArchivedRecord(MapRecord):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    encoder: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=1024)]
+    encoder: Annotated[str, Field(pattern=f"^{TEXT}$", max_length=1024)]
     dimension: Annotated[int, Field(gt=0, le=1 << 24, strict=True)]
     local_cells: Annotated[int, Field(ge=0, le=1 << 20, strict=True)] = 0
     local_values: Annotated[int, Field(ge=0, le=1 << 16, strict=True)] = 0

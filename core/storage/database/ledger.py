@@ -40,7 +40,7 @@ class StoredPlace:
     row: of its descriptor.
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
-    ordinal: its position in its sequence.
+    ordinal: its position in its sequence (``core.maps.views``).
     track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     """
 
@@ -208,6 +208,47 @@ def new_track(connection: sqlite3.Connection) -> int:
     return code
 
 
+def latest_in_sequence(
+    connection: sqlite3.Connection, name: str, positions: int
+) -> tuple[tuple[int, int] | None, dict[int, int]]:
+    """The end of a sequence: ordinal and row of its last place, and the row of the first place at each last ordinal.
+
+    Args:
+        positions: so many ordinals before the last one are looked at, too.
+    """
+    found = connection.execute("SELECT code, next_ordinal FROM sequences WHERE name = ?", (name,)).fetchone()
+    if found is None:
+        return None, {}
+    code, following = found
+    last = connection.execute(
+        "SELECT ordinal, row FROM places WHERE sequence = ? ORDER BY number DESC LIMIT 1", (code,)
+    ).fetchone()
+    if last is None:
+        return None, {}
+    first = {}
+    for ordinal in sorted({last[0], *range(max(0, following - 1 - positions), following)}):
+        row = first_at(connection, code, ordinal)
+        if row is not None:
+            first[int(ordinal)] = row
+    return (int(last[0]), int(last[1])), first
+
+
+def first_at(connection: sqlite3.Connection, code: int, ordinal: int, without: int | None = None) -> int | None:
+    """The row of the first place at a position of a sequence; None if none is there.
+
+    Args:
+        without: the number of a place that does not count.
+    """
+    query = "SELECT row FROM places WHERE sequence = ? AND ordinal = ? AND number <> ? ORDER BY number LIMIT 1"
+    found = connection.execute(query, (code, ordinal, -1 if without is None else without)).fetchone()
+    return None if found is None else int(found[0])
+
+
+def move_to_end(connection: sqlite3.Connection, stored: StoredPlace) -> None:
+    """Put a place at the end of its sequence."""
+    _set(connection, stored.number, ordinal=_next_ordinal(connection, stored.sequence))
+
+
 def _next_ordinal(connection: sqlite3.Connection, code: int) -> int:
     query = "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE code = ? RETURNING next_ordinal - 1"
     ((ordinal,),) = connection.execute(query, (code,)).fetchall()
@@ -230,9 +271,15 @@ def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | N
 
 
 def insert(
-    connection: sqlite3.Connection, item: Enrolment, row: int, checksum: int, keep: Keep, now: datetime
+    connection: sqlite3.Connection,
+    item: Enrolment,
+    row: int,
+    checksum: int,
+    keep: Keep,
+    now: datetime,
+    ordinal: int | None = None,
 ) -> StoredPlace:
-    """Insert a new place at the end of its sequence."""
+    """Insert a new place, at a position in its sequence or (None) at its end."""
     code = _sequence_code(connection, item.fields.sequence)
     picture, content = picture_of(item, keep)
     columns = {
@@ -243,7 +290,7 @@ def insert(
         "regions": item.regions,
         "picture": picture,
         "sequence": code,
-        "ordinal": _next_ordinal(connection, code),
+        "ordinal": _next_ordinal(connection, code) if ordinal is None else ordinal,
         "created_at": moment_text(now),
         "updated_at": moment_text(now),
         **field_columns(item.fields),
@@ -288,12 +335,18 @@ def replace_descriptor(
     )
 
 
-def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: PlaceFields, now: datetime) -> StoredPlace:
-    """Change the fields of a place.  Its position in its sequence changes only with the sequence."""
+def set_fields(
+    connection: sqlite3.Connection, stored: StoredPlace, fields: PlaceFields, now: datetime, ordinal: int | None = None
+) -> StoredPlace:
+    """Change the fields of a place.  Its position in its sequence changes only with the sequence.
+
+    Args:
+        ordinal: its position in another sequence; None: the end.
+    """
     columns = field_columns(fields)
     if fields.sequence != stored.place.sequence:
-        columns["sequence"] = _sequence_code(connection, fields.sequence)
-        columns["ordinal"] = _next_ordinal(connection, columns["sequence"])
+        code = columns["sequence"] = _sequence_code(connection, fields.sequence)
+        columns["ordinal"] = _next_ordinal(connection, code) if ordinal is None else ordinal
     if fields.pose != stored.place.pose:
         columns["pose_of"] = None
     _set(connection, stored.number, updated_at=moment_text(now), **columns)

@@ -179,7 +179,7 @@ class StoreContract(RuleBasedStateMachine):
             found = [name for name, place in model.places.items()
                      if place.fields.get("camera") == camera and _has(place, where)]  # fmt: skip
             if len(found) > 2:
-                raise Refused("TooManyToForget")
+                raise Refused("TooManyToDelete")
             for name in found:
                 model.forget(name)
             return found

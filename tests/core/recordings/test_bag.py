@@ -267,12 +267,27 @@ def test_clocks_that_jump_and_stamps_that_are_missing_are_remarked(tmp_path: Pat
     said = [compressed(stamp * SECOND, jpeg(index), received=START + index) for index, stamp in enumerate(stamps)]
     frames, _, remarks = loaded(write_mcap(tmp_path / "a.mcap", said))
     assert "jump ahead 1 times, by up to 1699999993 s" in remarks[0]
+    assert remarks[1].startswith(f"1 messages of {CAMERA} have the stamp of another one, but other bytes")
     assert [frame.id.rpartition("-")[2] for frame in frames][-2:] == ["1700000001.000000000", "1700000001.000000000~2"]
 
     said = [compressed(0, jpeg(index), received=START + index * SECOND) for index in range(3)]
     frames, _, remarks = loaded(write_rosbag2(tmp_path / "b", said))
     assert "3 of 3 messages" in remarks[0] and "have no stamp" in remarks[0]
     assert [frame.nanoseconds for frame in frames] == [START + index * SECOND for index in range(3)]
+
+
+@pytest.mark.parametrize("writer", ["sqlite", "mcap-zstd", "ros1"])
+def test_a_message_that_is_repeated_is_taken_once_and_remarked(writer: str, tmp_path: Path) -> None:
+    """As a bag that was recorded by two recorders, or merged with a part of itself, has them."""
+    taken = [(0, 0), (1, 1), (1, 1), (1, 2), (2, 1), (1, 1), (2, 3)]  # second, picture
+    said = [compressed(START + at * SECOND, jpeg(seed), received=START + n) for n, (at, seed) in enumerate(taken)]
+    frames, data, remarks = loaded(WRITERS[writer](tmp_path, said))
+    assert data == [jpeg(seed) for seed in (0, 1, 2, 1, 3)]
+    ends = [frame.id.rpartition("-17000000")[2] for frame in frames]
+    assert ends == ["00.000000000", "01.000000000", "01.000000000~2", "02.000000000", "02.000000000~2"]
+    told = [remark for remark in remarks if "another one" in remark]
+    assert told[0].startswith(f"2 messages of {CAMERA} repeat another one, with its stamp and its bytes")
+    assert told[1].startswith(f"2 messages of {CAMERA} have the stamp of another one, but other bytes")
 
 
 @pytest.mark.parametrize("kind", ["geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"])

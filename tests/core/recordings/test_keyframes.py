@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.places import Pose
 from core.recordings import Frame
 from core.recordings.frame import NANOSECONDS
-from core.recordings.keyframes import Left, Spacing, keyframes
+from core.recordings.keyframes import SLACK, Left, Spacing, keyframes, moving
 
 
 def frame(number: int, x: float | None = None, heading: float | None = None, seconds: float | None = None) -> Frame:
@@ -32,7 +32,31 @@ def test_every_keyframe_is_far_from_the_one_before_and_no_frame_between_is(place
     assert kept[0] == 0
     for before, after in zip(kept, [*kept[1:], len(places)], strict=True):
         assert all(abs(places[index] - places[before]) < metres for index in range(before + 1, after))
-        assert after == len(places) or abs(places[after] - places[before]) >= metres
+        assert after == len(places) or abs(places[after] - places[before]) >= (1 - SLACK) * metres - 1e-9
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9, 0.03])
+def test_frames_two_metres_apart_give_keyframes_four_metres_apart(noise: float) -> None:
+    generator = np.random.default_rng(0)
+    frames = [frame(index, 2 * index + noise * generator.uniform(-1, 1), seconds=index / 3) for index in range(41)]
+    assert chosen(frames, metres=4) == list(range(0, 41, 2))
+    assert chosen(frames, metres=3) == list(range(0, 41, 2)), "no frame is three metres away, or nearly so"
+    assert chosen(frames, seconds=1) == list(range(0, 41, 3))
+
+
+@pytest.mark.parametrize("side", [6.0, 6.7])
+def test_the_nearest_frame_to_a_measure_is_taken(side: float) -> None:
+    """Dense frames: what was asked for is kept to within half a step, however many keyframes there are."""
+    frames = [frame(index, 0.3 * index, heading=(0.7 * index) % 360) for index in range(600)]
+    assert set(np.diff(chosen(frames, metres=side))) == {round(side / 0.3)}
+    assert set(np.diff(chosen(frames, degrees=10.0))) == {14}
+    standing = [frame(index, min(0.3 * index, 3.9)) for index in range(600)]
+    assert chosen(standing, metres=4) == [0, 13], "a robot that stands still is not nearer to the measure by time"
+
+
+def test_a_robot_that_stands_gives_no_further_keyframe() -> None:
+    jitter = np.random.default_rng(1).uniform(-0.02, 0.02, 200)
+    assert chosen([frame(index, x) for index, x in enumerate(jitter)], metres=1) == [0]
 
 
 def test_one_measure_that_is_reached_is_enough() -> None:
@@ -80,3 +104,15 @@ def test_measures_on_the_earth_are_in_metres() -> None:
     assert pytest.approx(1.11, abs=0.01) == float(
         np.linalg.norm((frames[1].pose or Pose(x=0, y=0)).position() - (frames[0].pose or Pose(x=0, y=0)).position())
     )
+
+
+def test_frames_that_show_what_the_last_one_shows_are_left_out() -> None:
+    seen: dict[str, float | None] = dict(zip("0123456789", [0, 0.1, 0.2, 5, 5.1, None, 5, 0, 0.3, 0.6], strict=True))
+    frames = [frame(number) for number in range(10)]
+    kept = moving(frames, lambda one: seen[one.id], lambda a, b: abs(a - b) < 0.5)
+    assert [one.id for one in kept] == ["0", "3", "5", "6", "7", "9"]
+
+
+def test_a_robot_whose_poses_say_that_it_moves_does_not_stand() -> None:
+    frames = [frame(number, 0.4 * number) for number in range(8)]
+    assert [one.id for one in moving(frames, lambda one: 0, lambda a, b: True)] == ["0", "3", "6"]

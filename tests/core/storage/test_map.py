@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -439,3 +440,22 @@ def test_a_kept_picture_that_cannot_be_shown_is_no_thumbnail(lab: Map, content: 
     lab.enrol([replace(frame("p"), image=content)])
     with pytest.raises(NoThumbnail, match=why):
         lab.thumbnail("p")
+
+
+@pytest.mark.parametrize("name", ["..", ".", "\u202e", "\x85"])
+def test_a_sequence_of_an_older_map_keeps_its_name(directory: Path, name: str) -> None:
+    """No sequence is given such a name any more; a map that has one is read, edited and emptied as ever."""
+    with closing(Atlas(directory)) as atlas:
+        lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
+        old = PlaceFields.model_construct(sequence=name)
+        lab.enrol([replace(frame(one), fields=old) for one in ("p0", "p1", "p2")])
+    with closing(Atlas(directory)) as atlas:
+        lab = atlas.get("lab")
+        assert lab.verify().ok and [one.name for one in lab.sequences(None, 10)[0]] == [name]
+        assert lab.patch("p0", {"pose": {"x": 1, "y": 2}}).sequence == lab.place("p1").sequence == name
+        assert lab.place("p1").fields() == old
+        assert lab.patch("p1", {"sequence": "monday"}).sequence == "monday"
+        with pytest.raises(InvalidField, match="sequence"):
+            lab.patch("p1", {"sequence": name})
+        assert lab.forget_all(PlaceFilter(None, name), 10) == ["p0", "p2"]
+        assert [one.name for one in lab.sequences(None, 10)[0]] == ["monday"]

@@ -149,6 +149,11 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "an endless line": (raw(PLACES, lambda d: b" " * (5 << 20) + d), "a line of more than"),
     "a sequence twice": (counted(SEQUENCES, 0, again), "UNIQUE"),
     "a sequence of nobody": (line(SEQUENCES, 1, name="sunday"), "does not list"),
+    "a sequence named ..": (line(SEQUENCES, 1, name=".."), "name"),
+    "a sequence with a mark of direction": (line(SEQUENCES, 1, name="mon\u202eday"), "name"),
+    "a place of a sequence named .": (place(sequence="."), "sequence"),
+    "a track named ..": (place(track="..", station=1), "track"),
+    "a camera named ..": (line(CAMERAS, 0, name=".."), "name"),
     "an empty sequence": (counted(SEQUENCES, 0, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "is empty"),
     "sequences miscounted": (raw(SEQUENCES, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "lines, not"),
     "more sequences than places": (

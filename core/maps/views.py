@@ -1,0 +1,122 @@
+"""Which frames of a traverse show one view: those of a robot that stands, or of a camera that is faster than it.
+
+The position of a frame in its sequence counts views, not frames, so that neighbours in time are the same whatever the
+rate of a camera, and a stop is one place however long it takes.  A frame is at the position of the frame before it if
+it shows nearly the same as that one, and still about the same as the first frame there.  A view may be hidden for a
+moment, by somebody who passes: a frame that shows nearly the same as the first frame of one of the last few positions
+is there again.
+
+How alike two frames are is told by the cells of the second stage at the same spots of both: freed of what all cells of
+their frame have in common, the mean of their cosines.  Noise, compression and exposure change it hardly, a step of the
+robot does at once.  Encoders without a second stage have descriptors only, which noise changes more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+SAME, ABOUT = 0.9, 0.8
+"""Likenesses of cells from which two frames show nearly the same, and about the same.  Noise of 4 grey levels, JPEG and
+5 % of exposure leave 0.98 and more by day and 0.93 by night (train/day_night); consecutive frames of corridor have 0.88
+at most, those of lip6 0.76.  At 25 frames for each of theirs, a map has about one view for each reference of corridor
+and three for each of lip6 (``python -m benchmarks.day.standing``)."""
+
+SAME_DESCRIPTOR, ABOUT_DESCRIPTOR = 0.74, 0.6
+"""The same for the cosine of descriptors.  The encoders without a second stage have 0.72 and more after such noise;
+consecutive frames of corridor have 0.73 at most."""
+
+
+MOST_HIDDEN = 8
+"""A view may be hidden for so many positions at most, and for no more than a map's ``same_place_frames``."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one frame shows: its descriptor, float32 [D], and local descriptors, int8 [C, L]."""
+
+    descriptor: NDArray[np.float32]
+    local: NDArray[np.int8]
+
+
+def shows_same(one: Look, other: Look, about: bool = False) -> bool:
+    """Whether two frames of one map show nearly the same, or ``about`` the same."""
+    if one.local.size and other.local.size:
+        return likeness(one.local, other.local) >= (ABOUT if about else SAME)
+    return cosine(one.descriptor, other.descriptor) >= (ABOUT_DESCRIPTOR if about else SAME_DESCRIPTOR)
+
+
+def likeness(one: NDArray[np.int8], other: NDArray[np.int8]) -> float:
+    """The mean cosine of the cells that two frames have at the same spots, int8 [C, L] each, freed of their means.
+
+    Cells that are hidden in one of them, which are zero, do not count; with none left it is 0.
+    """
+    seen = one.any(axis=1) & other.any(axis=1)
+    if not seen.any():
+        return 0.0
+    a, b = (_centred(cells[seen].astype(np.float32)) for cells in (one, other))
+    products = np.einsum("cl,cl->c", a, b)
+    lengths = np.sqrt(np.einsum("cl,cl->c", a, a) * np.einsum("cl,cl->c", b, b))
+    return float((products / np.maximum(lengths, 1e-9)).mean())
+
+
+def _centred(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    return cells - cells.mean(axis=0)
+
+
+def cosine(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """The cosine of two vectors, float32 [D], neither of them zero."""
+    return float(one @ other / np.sqrt((one @ one) * (other @ other)))
+
+
+class LatestViews:
+    """The end of a sequence: its last frame, and the first frame of each of its last positions.
+
+    Args:
+        last: the position of the last frame, and what it shows; None: the sequence has no frames.
+        first: what the first frame at each of the last positions shows.
+        positions: so many positions may lie between two frames of one view.
+    """
+
+    def __init__(self, last: tuple[int, Look] | None, first: Mapping[int, Look], positions: int) -> None:
+        self._last, self._first, self._positions = last, dict(first), positions
+
+    def position_of(self, look: Look) -> int | None:
+        """The position of a next frame if it shows a view that is there already, else None."""
+        if self._last is None:
+            return None
+        before, shown = self._last
+        began = self._first.get(before)
+        if began is not None and shows_same(look, shown) and shows_same(look, began, about=True):
+            return before
+        for position in sorted(self._first, reverse=True):
+            if shows_same(look, self._first[position]):
+                return position
+        return None
+
+    def note(self, position: int, look: Look) -> None:
+        """Add the next frame, which is at a position."""
+        self._last = position, look
+        self._first.setdefault(position, look)
+        latest = max(self._first) - self._positions
+        self._first = {at: first for at, first in self._first.items() if at >= latest or at == position}
+
+
+def latest_views(
+    last: tuple[int, int] | None, first: Mapping[int, int], positions: int, looks: Callable[[list[int]], list[Look]]
+) -> LatestViews:
+    """The end of a sequence, whose frames are read by row.
+
+    Args:
+        last: position and row of the last frame; None: the sequence has no frames.
+        first: the row of the first frame at each of the last positions.
+        positions: as of :class:`LatestViews`.
+        looks: reads what the frames in some rows show.
+    """
+    if last is None:
+        return LatestViews(None, {}, positions)
+    shown = looks([last[1], *first.values()])
+    return LatestViews((last[0], shown[0]), dict(zip(first, shown[1:], strict=True)), positions)
