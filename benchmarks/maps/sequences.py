@@ -1,4 +1,4 @@
-"""What following a run is worth: recall@1 of single frames, of the filter and of the path search; and what it costs.
+"""What following a run is worth: recall@1 of single frames and of the filter; and what it costs.
 
     python -m benchmarks.maps.sequences --data ../shared/datasets/eval
 
@@ -20,7 +20,7 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
-from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, evidence, place_graph
+from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, Stride, evidence, place_graph
 from core.evaluation.samples import jpeg, sample_frame
 from core.evaluation.timing import medians
 from core.frames.images import decode
@@ -45,7 +45,6 @@ TRAVERSES = {
     "nordland_tiny": ("winter", "summer"),
     "corridor": ("query", "ref"),
 }
-FILTERS = {"bayes": RunOptions(), "path": RunOptions(filter="path")}
 HALVED, RECALL, SHARE = 0.5, 0.9, 0.2
 
 
@@ -87,7 +86,9 @@ def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -
 
 
 def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) -> dict[str, dict[str, Any]]:
-    """By each truth of a pair of traverses: queries, and wrong answers of single frames and of each filter.
+    """By each truth of a pair of traverses: queries, and wrong answers of single frames and of sessions.
+
+    One session learns the pace, the other is told it: a frame of the map from each frame to the next.
 
     Args:
         frames: of each traverse only the first so many.
@@ -98,7 +99,8 @@ def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) 
     graph = place_graph(where, np.arange(len(known)), len(known), SAME_PLACE)
     told = list(evidences(encoder, describe(encoder, asked), describe(encoder, known), where))
     answers = {"single": [best for best, _ in told]}
-    answers |= {filter_: followed(told, graph, options) for filter_, options in FILTERS.items()}
+    answers["session"] = followed(told, graph, RunOptions())
+    answers["session, told the pace"] = followed(told, graph, RunOptions(Stride()))
     everyone = np.arange(len(asked))
     return {
         truth: {"queries": len(asked)} | {how: int((~right[everyone, best]).sum()) for how, best in answers.items()}
@@ -126,7 +128,6 @@ def costs(encoder: Encoder, places: int, rounds: int) -> dict[str, float]:
         "speed limit": (RunOptions(), Step(reach=4.0)),
         "odometry": (RunOptions(), Step(odometry=Odometry(2.0, variance=0.04))),
         "odometry, lag 5": (RunOptions(lag=5), Step(odometry=Odometry(2.0, variance=0.04))),
-        "path": (FILTERS["path"], Step()),
     }
     data = jpeg(sample_frame(7))
     runs: dict[str, Any] = {"encode": lambda: encoder.encode(decode(data))}
@@ -163,11 +164,11 @@ def main(
         figures["recall"][name] = recalls(chosen, name, data)
         for truth, counts in figures["recall"][name].items():
             queries, single = counts["queries"], counts["single"]
-            for how in ("single", *FILTERS):
+            for how in ("single", "session", "session, told the pace"):
                 held = ""
-                if how == "bayes" and truth == "put right":
+                if how == "session" and truth == "put right":
                     held = "errors " + verdict(counts[how] / single, HALVED)
-                elif how == "bayes" and name == "nordland_tiny":
+                elif how == "session" and name == "nordland_tiny":
                     held = verdict(1 - counts[how] / queries, RECALL, at_least=True)
                 rows.append((f"{name}, {truth}: {how}", f"{1 - counts[how] / queries:.3f}", counts[how], held))
     times = costs(chosen, places, rounds)

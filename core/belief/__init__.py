@@ -1,15 +1,16 @@
 """Where a moving robot is: a belief over the places of a map, carried from frame to frame (thesis 2.1, 2.2.6).
 
 ``graph`` knows which places follow one another, ``evidence`` what one frame's scores say, ``view`` whether the frame
-shows anything new, and ``motion`` how far a robot gets.  ``filter`` is the hidden Markov model and ``paths`` the
-sequence search, which is an alternative to it.  ``estimate`` summarizes a belief, ``run`` puts these together and
-``record`` serializes a run.
+shows anything new, ``motion`` how far a robot gets, and ``odometry`` how far it got between two poses of odometry.
+``filter`` is the hidden Markov model, ``estimate`` summarizes a belief, ``run`` puts these together and ``record``
+serializes a run.
 """
 
 from core.belief.estimate import Candidate, Estimate
 from core.belief.evidence import NOTHING, Evidence, evidence
 from core.belief.graph import PlaceGraph, place_graph
 from core.belief.motion import Odometry, Step, Stride
+from core.belief.odometry import OdometryPose
 from core.belief.record import DamagedRecord, from_bytes, to_bytes
 from core.belief.run import Run, RunOptions, RunState, Sight
 from core.belief.view import View, view_of
@@ -21,6 +22,7 @@ __all__ = [
     "Estimate",
     "Evidence",
     "Odometry",
+    "OdometryPose",
     "PlaceGraph",
     "Run",
     "RunOptions",

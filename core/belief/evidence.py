@@ -96,7 +96,7 @@ def evidence(
     second_stage = examined is not None and bool(examined.any())
     listed = np.flatnonzero(examined) if examined is not None and second_stage else np.arange(min(len(rows), LISTED))
     values = scores[listed].astype(np.float64)
-    others = ~whereabouts.near(int(listed[0]), neighborhood)
+    others = whereabouts.others(int(listed[0]), neighborhood, across=False)
     apart = ~whereabouts.near(int(listed[0]), neighborhood.times(GUARD_FACTOR))
     rest = values[others[listed]]
     ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])

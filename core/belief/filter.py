@@ -13,13 +13,14 @@ for where it must have got to by then: what it saw meanwhile, however little, st
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from core.belief.evidence import Evidence
 from core.belief.graph import PlaceGraph
-from core.belief.motion import Masses, Transition
+from core.belief.motion import AcrossTraverses, Masses, Transition
+from core.belief.speeds import TRACKED, UNKNOWN, Speeds, forward
 
 START_UNKNOWN = 0.5
 """The probability before the first frame that the robot does not see the map."""
@@ -46,6 +47,15 @@ ALIKE = 1.02
 MANY = 1000
 """In maps with fewer places than this, every place is moved: it takes little time there, and the error would count."""
 
+MOST_MOVED = 1024
+"""In maps with so many places or more, the likeliest of them are moved one by one."""
+
+FAINT = 2.0
+"""At an unknown speed, places with at most this times the floor are not moved one by one."""
+
+SLIGHT = 0.25
+"""The mass of one speed at a place is not moved if it is at most this times the floor."""
+
 VANISHING = 1e-30
 """A likelihood below this counts as impossible."""
 
@@ -58,11 +68,13 @@ class Belief:
         sum is 1, or 0 if there is no place.
     unknown: the probability that the robot does not see the map; 1 in an empty map.
     floor: the probability of a place without any evidence, as most places are.
+    speeds: how fast the robot goes, by where it is; as before the first frame where motion was known.
     """
 
     given: Masses
     unknown: float
     floor: float = 0.0
+    speeds: Speeds = UNKNOWN
 
     @property
     def places(self) -> Masses:
@@ -92,9 +104,47 @@ def predicted(belief: Belief, transition: Transition, share: float = 1.0) -> Bel
     anywhere = ((1 - jump) * (spread + gone) + jump) / n
     moved *= np.float32(1 - jump)
     moved += np.float32(anywhere)
-    known = 1 - belief.unknown
+    speeds = UNKNOWN if transition.moves or transition.jumps else belief.speeds
+    return Belief(moved, _out_of_sight(belief.unknown, share, gone), anywhere, speeds)
+
+
+def predicted_by_speed(
+    belief: Belief, graph: PlaceGraph, frames: int = 1, constant: int = 0, share: float = 1.0
+) -> Belief:
+    """The belief after a motion along the sequences at a speed that is not known, and before the frame.
+
+    Args:
+        frames, constant: as of :func:`core.belief.speeds.displacement_of`.
+        share: as of :func:`predicted`.
+    """
+    n = len(belief.given)
+    if not n:
+        return belief
+    least = 0.0
+    if n >= MANY:
+        least = FAINT * belief.floor
+        if np.count_nonzero(belief.given > least) > MOST_MOVED:
+            least = float(np.partition(belief.given, n - MOST_MOVED)[n - MOST_MOVED])
+    places, moved, spread = forward(belief.given, belief.speeds, graph, least, frames, constant, SLIGHT * belief.floor)
+    jump = share * JUMP
+    anywhere = ((1 - jump) * spread + jump) / n
+    moved *= np.float32(1 - jump)
+    elsewhere = belief.speeds.expected(belief.given)
+    moved += np.float32(anywhere) * elsewhere
+    given = np.full(n, anywhere, np.float32)
+    given[places] = sums = moved.sum(axis=1)
+    speeds = Speeds(places, moved / sums[:, np.newaxis], elsewhere)
+    if n >= MANY:
+        speeds = speeds.likeliest(given, TRACKED)
+    if len(graph.stations):
+        given = Transition((AcrossTraverses(graph),)).forward(given, 0.0)[0]
+    return Belief(given, _out_of_sight(belief.unknown, share), anywhere, speeds)
+
+
+def _out_of_sight(unknown: float, share: float, gone: float = 0.0) -> float:
+    """The probability that the robot does not see the map after a look, and after a share ``gone`` has left it."""
     left = 1 - (1 - share * LEAVING) * (1 - gone)
-    return Belief(moved, (1 - share * RETURNING) * belief.unknown + left * known, anywhere)
+    return (1 - share * RETURNING) * unknown + left * (1 - unknown)
 
 
 def fits(belief: Belief, seen: Evidence, graph: PlaceGraph) -> bool:
@@ -117,16 +167,27 @@ def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
     if inside < VANISHING or known + outside < VANISHING:  # the frame contradicts everything that was believed
         return uninformed(n)
     floor = belief.floor * float(np.exp(-scale)) / inside
-    return Belief(likely / np.float32(inside), outside / (known + outside), floor)
+    return Belief(likely / np.float32(inside), outside / (known + outside), floor, belief.speeds)
+
+
+def observed_by_speed(belief: Belief, seen: Evidence, graph: PlaceGraph, weights: Masses) -> Belief:
+    """The belief after a frame that counts by how fast the robot goes: at each speed with a weight, float32 [S]."""
+    overall = float(belief.speeds.overall(belief.given) @ weights)
+    places = graph.places_at(seen.rows)
+    there = places >= 0
+    likelihoods = np.exp(seen.gains[there, np.newaxis] * weights)
+    speeds, factors = belief.speeds.weighed(places[there], likelihoods)
+    with np.errstate(divide="ignore"):
+        told = Evidence(seen.rows[there], np.log(factors), seen.unknown * overall)
+    return observed(replace(belief, speeds=speeds), told, graph)
 
 
 def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses, float]:
     """Values times the likelihoods of a frame, divided by exp(scale) so that nothing overflows; and the scale."""
-    places = graph.places_at(seen.rows)
-    there = places >= 0
-    scale = max(0.0, seen.unknown, float(seen.gains[there].max(initial=0)))
+    places, gains = graph.evidence_at(seen)
+    scale = max(0.0, seen.unknown, float(gains.max(initial=0)))
     weighted = values * np.float32(np.exp(-scale))
-    weighted[places[there]] = values[places[there]] * np.exp(seen.gains[there] - np.float32(scale))
+    weighted[places] = values[places] * np.exp(gains - np.float32(scale))
     return weighted, scale
 
 
@@ -190,4 +251,5 @@ def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
     kept = places >= 0
     given[places[kept]] = belief.given[kept]
     lost = min(1.0, float(belief.given[~kept].sum(dtype=np.float64)))
-    return Belief(given / np.float32(given.sum(dtype=np.float64)), belief.unknown + (1 - belief.unknown) * lost)
+    given /= np.float32(given.sum(dtype=np.float64))
+    return Belief(given, belief.unknown + (1 - belief.unknown) * lost, speeds=belief.speeds.carried(old, new))

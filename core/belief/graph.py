@@ -1,7 +1,8 @@
 """The places of a map as a graph of ways from one to the next: along their sequences, and from pose to pose.
 
 A belief has one probability for each living place, in the order of this graph: by sequence, and within a sequence by
-ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.  Places
+ordinal, so that "k frames later" is "k entries later".  Frames that show one view, as where a robot stood while it
+mapped, are one place of the graph.  Places with poses are also joined to those near them.  Places
 of several traverses that were aligned with each other are at one station of a track: they are the same place.
 """
 
@@ -13,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from core.belief.evidence import Evidence
 from core.kernels.belief import same_place
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 
@@ -35,7 +37,7 @@ SPACINGS = 3.0
 class PlaceGraph:
     """n living places, and which of them are joined.
 
-    rows: int64 [n], the map's row of each place, in the graph's order.
+    rows: int64 [n], the map's row of each place, in the graph's order; of several frames of one view that of the first.
     index: int32 [rows of the map], the place at a row; -1 for a row that is dead or not allowed.
     first, last: int32 [n], the bounds (inclusive, exclusive) of the places of each place's sequence.
     posed: bool [n].
@@ -97,6 +99,13 @@ class PlaceGraph:
         found[inside] = self.index[rows[inside]]
         return found
 
+    def evidence_at(self, seen: Evidence) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """The places that a frame speaks for, int32 [k], each once, and how much, float32 [k]."""
+        places = self.places_at(seen.rows)
+        order = np.lexsort((-seen.gains, places))
+        order = order[np.diff(places[order], prepend=-1) > 0]  # of several frames of one place the best
+        return places[order], seen.gains[order]
+
     def same_place(self, place: int) -> NDArray[np.int64]:
         """The places that are the same place as one, itself included; int64 [m], ascending.
 
@@ -157,7 +166,9 @@ def place_graph(
     order = np.lexsort((where.ordinal, where.sequence))
     living, where = living[order], where.take(order)
     index = np.full(rows, -1, np.int32)
-    index[living] = np.arange(len(living), dtype=np.int32)
+    first_of_view = _first_of_views(where, neighborhood.radius)
+    index[living] = (np.cumsum(first_of_view) - 1).astype(np.int32)
+    living, where = living[first_of_view], where.take(first_of_view)
     bounds = np.flatnonzero(np.diff(where.sequence)) + 1
     ends = np.concatenate([[0], bounds, [len(living)]]).astype(np.int32)
     lengths = np.diff(ends)
@@ -190,6 +201,29 @@ def place_graph(
         whereabouts=where,
         stations=_stations(where),
     )
+
+
+def _first_of_views(where: Whereabouts, radius: float) -> NDArray[np.bool_]:
+    """Which of the places, in the order of the graph, are not of one view with the place before them; bool [n].
+
+    Consecutive frames at one position are, unless poses put them farther apart than the radius from the first of them.
+    """
+    together = np.zeros(len(where), np.bool_)
+    together[1:] = (
+        (where.sequence[1:] == where.sequence[:-1])
+        & (where.sequence[1:] != NO_SEQUENCE)
+        & (where.ordinal[1:] == where.ordinal[:-1])
+        & (where.kind[1:] == where.kind[:-1])
+        & (where.track[1:] == where.track[:-1])
+        & (where.station[1:] == where.station[:-1])
+    )
+    first = np.maximum.accumulate(np.where(together, 0, np.arange(len(where))))
+    beyond = 0  # the last place that is too far from the first of its view, and so begins another one
+    for place in np.flatnonzero(together & (where.kind != NO_POSE)).tolist():
+        apart = where.position[place] - where.position[max(int(first[place]), beyond)]
+        if np.linalg.norm(apart) > radius:
+            together[place], beyond = False, place
+    return ~together
 
 
 def _plane(where: Whereabouts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

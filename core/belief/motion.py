@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.belief.graph import PlaceGraph
+from core.belief.speeds import PRIOR, Kernel, mixture
 from core.kernels.belief import FITS, MISFIT, along_sequence, by_odometry, within_reach
 from core.places import EARTH_RADIUS
 
@@ -337,24 +338,34 @@ class Transition:
         return values if self.moves else values.copy()
 
 
-def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) -> Transition:
+def by_poses(graph: PlaceGraph, step: Step) -> bool:
+    """Whether places are gone to by their poses: there are some, and something is known about the motion."""
+    return bool(graph.posed.any()) and (step.odometry is not None or step.reach is not None)
+
+
+def along_sequences(graph: PlaceGraph, kernel: Kernel, moving: NDArray[np.bool_], times: int = 1) -> list[Move]:
+    """The moves of places that go along their sequences, and on to their counterparts in other traverses."""
+    moves: list[Move] = [AlongSequences(graph, kernel, moving)] * times
+    return [*moves, AcrossTraverses(graph)] if len(graph.stations) else moves
+
+
+def transition(graph: PlaceGraph, step: Step, stride: Stride | None, pending: Pending) -> Transition:
     """The transition of one step.
 
     Args:
         graph: of the map's places.
         step: what is known about the motion.
-        stride: the usual advance along a sequence.
+        stride: the usual advance along a sequence; None: any of ``speeds.SPEEDS``, as before the first frame.
         pending: collects motion that is too small to apply, until it is enough; changed.
     """
     moves: list[Move] = []
     if step.frames > FARTHEST_STEPS:
         return Transition((), jumps=True)
-    by_pose = graph.posed.any() and (step.odometry is not None or step.reach is not None)
+    by_pose = by_poses(graph, step)
     along = ~graph.posed if by_pose else np.ones(len(graph), np.bool_)
     if along.any():
-        moves += [AlongSequences(graph, stride.kernel(), along)] * step.frames
-        if len(graph.stations):
-            moves.append(AcrossTraverses(graph))
+        kernel = mixture(PRIOR) if stride is None else stride.kernel()
+        moves += along_sequences(graph, kernel, along, step.frames)
     if by_pose:
         further = _by_pose(graph, step, pending)
         if further is None:

@@ -9,13 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from core.belief.evidence import Evidence
 from core.belief.motion import Odometry
+from core.belief.odometry import OdometryPose
 from core.belief.run import RunState
+from core.belief.speeds import SPEEDS, UNKNOWN
 from core.belief.view import HEIGHT, WIDTH, View
 
-FORMAT = 2
-"""Format 1, of version 0.1, knows nothing of views; it is read as if there had been none."""
+FORMAT = 3
+"""Format 1, of version 0.1, knows nothing of views; it is read as if there had been none.  Neither it nor
+format 2 knows of speeds.  Both may have evidence of the last frames behind the probabilities, for a filter that is no
+more."""
+
+WHOLE = 255
+"""Shares of speeds are kept as so many parts of 1, which is nearer than they are known."""
 
 _PREFIX = struct.Struct("<II")  # checksum of all that follows it, length of the head
 
@@ -25,8 +31,9 @@ class DamagedRecord(ValueError):
 
 
 def to_bytes(state: RunState) -> bytes:
-    """Serialize a state, in a few kilobytes: 8 bytes for each row, 4 for each probability and gain."""
-    odometry = state.odometry
+    """Serialize a state, in a few kilobytes: 8 bytes for each row, 4 for each probability, 1 for
+    each share of a speed."""
+    odometry, pose = state.odometry, state.pose
     head = {
         "format": FORMAT,
         "unknown": state.unknown,
@@ -35,16 +42,16 @@ def to_bytes(state: RunState) -> bytes:
         "odometry": [odometry.forward, odometry.left, odometry.turn, odometry.variance, odometry.turn_variance],
         "reach": state.reach,
         "places": len(state.rows),
-        "seen": [[len(seen.rows), seen.unknown] for seen in state.seen],
+        "speeds": list(state.shares.shape),
         "view": 0 if state.view is None else len(state.view.levels),
         "blind": state.blind,
         "constant": state.constant,
         "pending_reach": state.pending_reach,
+        "pose": None if pose is None else [pose.x, pose.y, pose.heading, pose.covariance, pose.origin],
     }
     text = json.dumps(head, separators=(",", ":")).encode()
     arrays = [state.rows.astype("<i8"), state.masses.astype("<f4")]
-    for seen in state.seen:
-        arrays += [seen.rows.astype("<i8"), seen.gains.astype("<f4")]
+    arrays.append(np.rint(WHOLE * state.shares).astype("u1"))
     if state.view is not None:
         arrays.append(state.view.levels)
     rest = struct.pack("<I", len(text)) + text + b"".join(array.tobytes() for array in arrays)
@@ -62,7 +69,7 @@ def from_bytes(data: bytes) -> RunState:
         if zlib.crc32(data[4:]) != checksum:
             raise DamagedRecord("the checksum is wrong")
         head: dict[str, Any] = json.loads(data[_PREFIX.size : _PREFIX.size + length])
-        if head["format"] not in (1, FORMAT):
+        if head["format"] not in (1, 2, FORMAT):
             raise DamagedRecord("it is of another format")
         position = _PREFIX.size + length
 
@@ -73,7 +80,13 @@ def from_bytes(data: bytes) -> RunState:
             return found
 
         rows, masses = array("<i8", head["places"]), array("<f4", head["places"])
-        seen = tuple(Evidence(array("<i8", count), array("<f4", count), unknown) for count, unknown in head["seen"])
+        for count, _ in head.get("seen", ()):
+            position += 12 * count
+        count, speeds = head.get("speeds", (0, len(SPEEDS)))
+        shares = array("u1", count * speeds).reshape(count, speeds).astype(np.float32)
+        if speeds != len(SPEEDS):  # they are learnt again
+            shares = UNKNOWN.shares
+        shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1)
         levels = array("u1", head.get("view", 0))
         if len(levels) not in (0, WIDTH * HEIGHT):
             raise DamagedRecord("the view has another size")
@@ -85,11 +98,19 @@ def from_bytes(data: bytes) -> RunState:
             head["unrecognized"],
             Odometry(*head["odometry"]),
             head["reach"],
-            seen,
             View(levels) if len(levels) else None,
             head.get("blind", 0),
             head.get("constant", 0),
             head.get("pending_reach", 0.0),
+            _pose(head.get("pose")),
+            shares,
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error
+
+
+def _pose(fields: Any) -> OdometryPose | None:
+    if fields is None:
+        return None
+    x, y, heading, covariance, origin = fields
+    return OdometryPose(x, y, heading, None if covariance is None else tuple(covariance), origin)

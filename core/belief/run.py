@@ -6,14 +6,36 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from core.belief.estimate import Estimate, estimate
 from core.belief.evidence import NOTHING, Evidence
-from core.belief.filter import Belief, Smoother, fits, observed, predicted, reindexed, uninformed
+from core.belief.filter import (
+    Belief,
+    Smoother,
+    fits,
+    observed,
+    observed_by_speed,
+    predicted,
+    predicted_by_speed,
+    reindexed,
+    uninformed,
+)
 from core.belief.graph import PlaceGraph
-from core.belief.motion import TURN_NOTED, Odometry, Pending, Step, Stride, Transition, transition
-from core.belief.paths import PathSearch
+from core.belief.motion import (
+    FARTHEST_STEPS,
+    TURN_NOTED,
+    Odometry,
+    Pending,
+    Step,
+    Stride,
+    Transition,
+    along_sequences,
+    by_poses,
+    transition,
+)
+from core.belief.odometry import FASTEST, OdometryPose, motion_between
+from core.belief.speeds import PRIOR, SPEEDS, TRACKED, UNKNOWN, Speeds, mixture, news
 from core.belief.view import HEIGHT, WIDTH, View, novelty
 
 Sight = Literal["covered", "constant"]
@@ -21,6 +43,10 @@ Sight = Literal["covered", "constant"]
 
 LOST_AFTER = 5
 """After a first recognized frame, the robot is lost once this many frames in a row were not recognized."""
+
+FIRST = 2.5
+"""Weight of a run's first look.  Evidence counts less than half of what a frame says, because frames that follow one
+another lead to the same mistakes (``evidence``); the first follows none."""
 
 STANDING = 0.1
 """Weight of a further frame from the same spot: it shows the same things and leads to the same mistakes."""
@@ -37,17 +63,13 @@ KEPT = 512
 class RunOptions:
     """How the belief of a run is computed.
 
-    filter: ``bayes``, the hidden Markov model, or ``path``, the search for straight paths.
-    stride: the usual advance along the sequence, used if neither odometry nor a speed limit is known.
-    lag: after this many frames, the place of a frame is estimated again, given the frames since; 0: never.  Only for
-        ``bayes``.
-    path_frames: frames of a path.  Only for ``path``.
+    stride: the usual advance along the sequence, used if neither odometry nor a speed limit is known; None: it is not
+        known, and learnt.
+    lag: after this many frames, the place of a frame is estimated again, given the frames since; 0: never.
     """
 
-    filter: Literal["bayes", "path"] = "bayes"
-    stride: Stride = field(default_factory=Stride)
+    stride: Stride | None = None
     lag: int = 0
-    path_frames: int = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +77,14 @@ class RunState:
     """From what a run can be continued: all but the probabilities of the least likely places and the last frames.
 
     rows, masses: int64 [k] and float32 [k], the likeliest places and their probabilities if the robot sees the map.
+    shares: float32 [k, S], the probabilities of the speeds there; [0, S]: as before the first frame.
     unknown: the probability that the robot does not see the map.
     frames, unrecognized: as of the :class:`Run`.
     odometry, reach: motion that was reported but not yet applied.
-    seen: the evidence that the path search still uses.
     view: the last frame that counted; None before the first.
     blind, constant: as of the :class:`Run`.
     pending_reach: metres that the robot may have moved in the constant frames.
+    pose: as of the :class:`Run`.
     """
 
     rows: NDArray[np.int64]
@@ -71,11 +94,17 @@ class RunState:
     unrecognized: int | None
     odometry: Odometry
     reach: float
-    seen: tuple[Evidence, ...]
     view: View | None = None
     blind: int = 0
     constant: int = 0
     pending_reach: float = 0.0
+    pose: OdometryPose | None = None
+    shares: NDArray[np.float32] = field(default_factory=lambda: UNKNOWN.shares)
+
+
+def _apart(speed: ArrayLike) -> NDArray[np.float64]:
+    """The weight of frames that are so many of the map's frames apart."""
+    return np.clip(np.sqrt(speed), 1.0, FIRST)
 
 
 class Run:
@@ -86,6 +115,7 @@ class Run:
     sight: why the last frame did not count; None if it did.
     blind: how many frames since the last one that told where the robot is, or that it is not in the map.
     constant: how many frames since the last one that counted showed the same as it.
+    pose: where odometry said that the robot was at the last frame; None if that had no such pose.
     """
 
     def __init__(self, options: RunOptions, graph: PlaceGraph) -> None:
@@ -95,11 +125,11 @@ class Run:
         self.belief = uninformed(len(graph))
         self.sight: Sight | None = None
         self.blind = self.constant = 0
+        self.pose: OdometryPose | None = None
         self._view: View | None = None
         self._pending_reach = 0.0
         self._pending = Pending()
         self._smoother = Smoother(options.lag)
-        self._paths = PathSearch(options.path_frames)
 
     @property
     def lost(self) -> bool:
@@ -110,7 +140,8 @@ class Run:
     def bytes(self) -> int:
         """Upper bound of the run's memory in bytes, without the graph."""
         moments = 1 + (self.options.lag + 1 if self.options.lag else 0)
-        return 4 * len(self.graph) * moments + 2048 * self.options.path_frames + WIDTH * HEIGHT
+        speeds = 4 * (len(SPEEDS) + 1) * min(len(self.graph), TRACKED) if self.options.stride is None else 0
+        return (4 * len(self.graph) + speeds) * moments + WIDTH * HEIGHT
 
     def place_on(self, graph: PlaceGraph) -> None:
         """Continue on another graph, after the map's places have changed."""
@@ -119,7 +150,22 @@ class Run:
             self._smoother.clear()
             self.graph = graph
 
-    def advance(self, seen: Evidence, step: Step, view: View | None = None) -> None:
+    def moved_to(self, pose: OdometryPose, seconds: float | None, speed_limit: float | None) -> Odometry | None:
+        """The motion since the last frame, by where odometry says that the robot is now; nothing is changed.
+
+        Args:
+            pose: at the frame that comes next.
+            seconds: since the last frame; None if that is not known.
+            speed_limit: of the robot, metres per second.
+
+        Returns:
+            None if the motion is not known: the last frame had no pose, or odometry has begun anew since, as its origin
+            or a motion says that is faster than the robot can be.
+        """
+        fastest = FASTEST if speed_limit is None else 2 * speed_limit
+        return motion_between(self.pose, pose, None if seconds is None else fastest * seconds + self.graph.spacing)
+
+    def advance(self, seen: Evidence, step: Step, view: View | None = None, pose: OdometryPose | None = None) -> None:
         """Update the belief with one frame.
 
         A frame that shows hardly anything tells nothing.  One that shows the same as the last one that counted is no
@@ -130,6 +176,7 @@ class Run:
             seen: the evidence of the frame.
             step: the motion since the frame before; ignored for the first frame.
             view: what the frame shows; None: it is not known, and taken to be new.
+            pose: where odometry says that the robot is, from which the motion to the next frame is told.
         """
         change = 1.0 if view is None or self._view is None else novelty(view.change(self._view))
         fitting = fits(self.belief, seen, self.graph)
@@ -144,33 +191,60 @@ class Run:
             self.sight, self.blind, share = None, 0, change
             self._view = view or self._view
         stands = self.sight == "constant" and step.odometry is None
-        if self.options.filter == "path":
-            if not stands:
-                self._paths.append(seen.tempered(share), step.frames - 1)
-                self.belief = self._paths.belief(self.graph, self.options.stride)
-        else:
-            self._filter(seen, step, share, stands)
+        self._filter(seen, step, share, stands)
         self.constant = self.constant + 1 if stands else 0
+        self.pose = pose
         self.frames += 1
 
     def _filter(self, seen: Evidence, step: Step, share: float, stands: bool) -> None:
         """Move the belief and weigh it by what was seen."""
         share = min(share, self._freshness(step))
-        seen = seen.tempered(share)
+        seen = seen.tempered(share * self._independence(step))
+        moved, ahead = Transition(()), self.belief
         if not self.frames or stands:
-            moved = Transition(())
             self._pending_reach = min(self._pending_reach + (step.reach or 0.0), self.graph.spacing)
+            ahead = predicted(self.belief, moved, share) if self.frames else self.belief
+        elif self._by_speed(step) and step.frames <= FARTHEST_STEPS:
+            if self.options.lag:
+                kernel = mixture(self.belief.speeds.overall(self.belief.given), step.frames, self.constant)
+                everywhere = np.ones(len(self.graph), np.bool_)
+                moved = Transition(tuple(along_sequences(self.graph, kernel, everywhere)))
+            ahead = predicted_by_speed(self.belief, self.graph, step.frames, self.constant, share)
         else:
             moved = transition(self.graph, self._caught_up(step), self._stride(), self._pending)
             self._pending_reach = 0.0
-        ahead = predicted(self.belief, moved, share) if self.frames else self.belief
-        self.belief = observed(ahead, seen, self.graph)
+            ahead = predicted(self.belief, moved, share)
+        if self.frames and share and self._by_speed(step):
+            new = np.minimum(1, news(step.frames, self.constant) / np.float32(share))
+            self.belief = observed_by_speed(ahead, seen, self.graph, new)
+        else:
+            self.belief = observed(ahead, seen, self.graph)
         if self.options.lag:
             self._smoother.append(self.belief, moved, seen, share)
 
-    def _stride(self) -> Stride:
+    def _by_speed(self, step: Step) -> bool:
+        """Whether the robot goes along the sequences at a speed that is to be learnt."""
+        return self.options.stride is None and not by_poses(self.graph, step)
+
+    def _independence(self, step: Step) -> float:
+        """How much more a frame tells than one that follows another closely.
+
+        Frames that are some of the map's frames apart make fewer mistakes in common: the weight grows with the root of
+        the speed, up to that of a first look, which ``frames`` without any that told something come before.
+        """
+        if self.blind == self.frames:
+            return FIRST
+        if by_poses(self.graph, step):
+            return 1.0
+        if self.options.stride is not None:
+            return float(_apart(self.options.stride.advance))
+        return float(self.belief.speeds.overall(self.belief.given) @ _apart(np.abs(SPEEDS)))
+
+    def _stride(self) -> Stride | None:
         """The usual advance since the last frame in which the view changed: at most one place more than usual."""
         usual = self.options.stride
+        if usual is None:
+            return None
         return Stride(max(usual.advance, min(1.0, usual.advance * (1 + self.constant))), usual.backwards)
 
     def _caught_up(self, step: Step) -> Step:
@@ -226,7 +300,6 @@ class Run:
         """The state from which the run can be continued."""
         masses = self.belief.given
         best = np.argpartition(-masses, KEPT)[:KEPT] if len(masses) > KEPT else np.arange(len(masses))
-        seen = self._paths.seen if self.options.filter == "path" else ()
         return RunState(
             self.graph.rows[best],
             masses[best],
@@ -235,11 +308,12 @@ class Run:
             self.unrecognized,
             self._pending.odometry,
             self._pending.reach,
-            seen,
             self._view,
             self.blind,
             self.constant,
             self._pending_reach,
+            self.pose,
+            self.belief.speeds.at(best),
         )
 
     @classmethod
@@ -249,17 +323,16 @@ class Run:
         run.frames, run.unrecognized = state.frames, state.unrecognized
         run._pending = Pending(state.odometry, state.reach)
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
-        run._pending_reach = state.pending_reach
-        if options.filter == "path":
-            run._paths = PathSearch(options.path_frames, state.seen)
-            if state.seen:
-                run.belief = run._paths.belief(graph, options.stride)
-        elif state.frames and len(graph):
+        run._pending_reach, run.pose = state.pending_reach, state.pose
+        if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))
             given = np.full(len(graph), max(rest / len(graph), 1e-12), np.float32)
             places = graph.places_at(state.rows)
             given[places[places >= 0]] = np.maximum(state.masses[places >= 0], given[0])
             lost = float(state.masses[places < 0].sum(dtype=np.float64))
             unknown = state.unknown + (1 - state.unknown) * min(lost, 1.0)
-            run.belief = Belief(given / np.float32(given.sum(dtype=np.float64)), unknown)
+            kept = np.flatnonzero(places[: len(state.shares)] >= 0)
+            given /= np.float32(given.sum(dtype=np.float64))
+            speeds = Speeds(places[kept], state.shares[kept], PRIOR)
+            run.belief = Belief(given, unknown, speeds=replace(speeds, elsewhere=speeds.expected(given)))
         return run

@@ -1,4 +1,4 @@
-"""The compiled loops of beliefs over places: how a motion moves one, which places are one, what a path gathers.
+"""The compiled loops of beliefs over places: how a motion moves one, and which places are one.
 
 The motions (``along_sequence``, ``within_reach``, ``by_odometry``) take masses float32 [n] and multiply them by a
 transition matrix, which ``core.belief.motion`` writes out in plain NumPy.  Forwards, the mass of a place is divided
@@ -147,12 +147,58 @@ def by_odometry(  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
-    """Add each place's gain to the path through it, which ends ``shift`` places further along the sequence."""
-    for k in range(len(places)):
-        place = places[k]
-        if place >= 0 and first[place] <= place + shift < last[place]:
-            totals[place + shift] += gains[k]
+def along_by_speed(p, known, shares, prior, first, last, starts, offsets, weights, least, slight):  # type: ignore[no-untyped-def]
+    """Along the sequences by one kernel for each speed, up to the ends; ``core.belief.speeds.forward`` says what of it.
+
+    Args:
+        p: float32 [n].
+        known, shares: int32 [k] and float32 [k, S], the speeds at some places.
+        prior: float32 [S], the speeds at all others.
+        first, last: int32 [n], the bounds of each place's sequence.
+        starts, offsets, weights: int64 [S + 1], int64 [m], float32 [m], the kernels behind each other.
+        least: masses of places up to this are not moved.
+        slight: nor are those of one speed at a place up to this.
+
+    Returns:
+        The places that are reached, int32 [r], the masses there by speed, float32 [r, S], and the sum of those that
+        were not moved.
+    """
+    speeds = len(prior)
+    at = np.full(len(p), -1, np.int32)
+    for k in range(len(known)):
+        at[known[k]] = k
+    slots = np.full(len(p), -1, np.int32)
+    reached, negligible = 0, 0.0
+    for i in range(len(p)):
+        if p[i] <= least:
+            negligible += p[i]
+            continue
+        own = shares[at[i]] if at[i] >= 0 else prior
+        for s in range(speeds):
+            if p[i] * own[s] <= slight:
+                continue
+            low = min(max(i + offsets[starts[s]], first[i]), last[i] - 1)  # the offsets of a kernel ascend by one
+            high = min(max(i + offsets[starts[s + 1] - 1], first[i]), last[i] - 1)
+            for j in range(low, high + 1):
+                if slots[j] < 0:
+                    slots[j] = reached
+                    reached += 1
+    places, moved = np.empty(reached, np.int32), np.zeros((reached, speeds), np.float32)
+    for i in range(len(p)):
+        if slots[i] >= 0:
+            places[slots[i]] = i
+        if p[i] <= least:
+            continue
+        own = shares[at[i]] if at[i] >= 0 else prior
+        for s in range(speeds):
+            mass = p[i] * own[s]
+            if mass <= slight:
+                negligible += mass
+                continue
+            for k in range(starts[s], starts[s + 1]):
+                j = min(max(i + offsets[k], first[i]), last[i] - 1)
+                moved[slots[j], s] += mass * weights[k]
+    return places, moved, negligible
 
 
 @_compiled

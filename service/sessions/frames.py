@@ -128,8 +128,6 @@ def _found_run(sessions: Sessions, map_: Map, session: Session) -> Run:
 def _check_options(session: Session, options: FrameParameters) -> None:
     if session.options.speed_limit is not None and options.timestamp is None:
         raise InvalidRequest("timestamp: the session has a speed limit, so every frame needs a timestamp.")
-    if session.options.filter == "path" and options.forward is not None:
-        raise InvalidRequest("forward: the filter path does not use odometry.")
 
 
 def _repeated(session: Session, options: FrameParameters, request_id: str | None) -> SessionAnswer | None:
@@ -168,7 +166,7 @@ def _advance(
     """Update the belief, save the session, and answer."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    run.advance(_evidence(map_, answered), step, view)
+    run.advance(_evidence(map_, answered), step, view, options.odometry_pose())
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -217,10 +215,13 @@ def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, M
     frames = 1
     if options.frame is not None and session.number is not None:
         frames = options.frame - session.number
-    reach, odometry = None, options.odometry()
-    limit = session.options.speed_limit
-    if limit is not None and options.timestamp is not None and session.moment is not None:
-        reach = limit * (options.timestamp.timestamp() - session.moment)
+    odometry, pose, limit = options.odometry(), options.odometry_pose(), session.options.speed_limit
+    seconds = None
+    if options.timestamp is not None and session.moment is not None:
+        seconds = options.timestamp.timestamp() - session.moment
+    if pose is not None:
+        odometry = run.moved_to(pose, seconds, limit)
+    reach = None if limit is None or seconds is None else limit * seconds
     motion: Motion = "sequence"
     if run.graph.posed.any():
         motion = "odometry" if odometry is not None else "speed-limit" if reach is not None else motion

@@ -20,6 +20,7 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.openapi import frame_body
 from service.http.routing import (
+    WHOLE_DELETION,
     DeadlineDep,
     EngineDep,
     FromState,
@@ -95,9 +96,9 @@ async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep, 
         return await in_thread(session_report, sessions, map_, session)
 
 
-@router.delete("/{session}", status_code=204, responses=GONE)
+@router.delete("/{session}", status_code=204, dependencies=[WHOLE_DELETION], responses=GONE)
 async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> None:
-    """End a session."""
+    """Delete a session: its run is over."""
     map_ = await engine.map(map_id)
     session = await in_thread(sessions.find, map_, session_id)
     await in_thread(sessions.delete, session)

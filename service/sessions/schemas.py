@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from core.belief import Odometry, RunOptions, Sight, Stride
+from core.belief import Odometry, OdometryPose, RunOptions, Sight, Stride
 from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
@@ -17,13 +17,11 @@ from service.queries.schemas import QueryAnswer
 SESSION_EXAMPLE: dict[str, Any] = {
     "id": "s-4f2a9c01d37be586",
     "map": "lab",
-    "filter": "bayes",
-    "advance": 1.0,
+    "advance": None,
     "backwards": False,
     "speed_limit": 1.5,
     "sequences": None,
     "lag": 0,
-    "path_frames": 10,
     "camera": None,
     "expires_after": 900.0,
     "created_at": "2026-11-20T10:00:00Z",
@@ -35,31 +33,34 @@ SESSION_EXAMPLE: dict[str, Any] = {
 }
 
 
+LARGEST_COVARIANCE = 1e12
+"""The most that an entry of a covariance of odometry may be, in metres and radians."""
+
+RETIRED = ("filter", "path_frames")
+"""Options of sessions before there was one filter."""
+
 Motion = Literal["first", "sequence", "speed-limit", "odometry"]
 
 
 class NewSession(BaseModel):
     """The options of a session."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, json_schema_extra={"examples": [{"filter": "bayes", "speed_limit": 1.5}]}
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [{"speed_limit": 1.5}]})
 
-    filter: Literal["bayes", "path"] = Field(
-        default="bayes",
-        description="bayes: a hidden Markov model over the places. path: the best straight path through the last "
-        "frames, as in SeqSLAM; it uses neither odometry nor a speed limit.",
-    )
-    advance: float = Field(
+    advance: float | None = Field(
         strict=True,
-        default=1.0,
+        default=None,
         ge=0,
         le=100,
         description="By how many frames of the map's traverse the robot usually moves on from one frame to the next; "
-        "used where neither odometry nor a speed limit is given.",
+        "used where neither odometry nor a speed limit is given. By default it is not known: the session learns how "
+        "fast the robot goes, up to ten frames, and whether it stands or goes in reverse.",
     )
     backwards: bool = Field(
-        strict=True, default=False, description="The robot may move against the traverse as well as along it."
+        strict=True,
+        default=False,
+        description="With advance: the robot may move against the traverse as well as along it; without, it may "
+        "anyway.",
     )
     speed_limit: float | None = Field(
         strict=True,
@@ -79,7 +80,6 @@ class NewSession(BaseModel):
         le=20,
         description="Also estimate where the robot was so many frames ago, given all frames since.",
     )
-    path_frames: int = Field(strict=True, default=10, ge=2, le=50, description="Frames of a path; for the filter path.")
     camera: CameraName = None
     verify: Verification = "auto"
     expires_after: float | None = Field(
@@ -91,15 +91,17 @@ class NewSession(BaseModel):
         "the maximum.",
     )
 
-    @model_validator(mode="after")
-    def _options_go_together(self) -> NewSession:
-        if self.filter == "path" and (self.speed_limit is not None or self.lag):
-            raise ValueError("the filter path takes neither a speed limit nor a lag")
-        return self
+    @model_validator(mode="before")
+    @classmethod
+    def _one_filter(cls, options: object) -> object:
+        for name in RETIRED:
+            if isinstance(options, dict) and name in options:
+                raise ValueError(f"there is no option {name} any more: every session follows its robot by one filter")
+        return options
 
     def run_options(self) -> RunOptions:
         """The options of :class:`core.belief.Run`."""
-        return RunOptions(self.filter, Stride(self.advance, self.backwards), self.lag, self.path_frames)
+        return RunOptions(None if self.advance is None else Stride(self.advance, self.backwards), self.lag)
 
 
 class FrameParameters(Parameters):
@@ -120,7 +122,8 @@ class FrameParameters(Parameters):
         ge=-1e5,
         le=1e5,
         allow_inf_nan=False,
-        description="Odometry: metres forward since the frame before, in the direction that the robot faced then.",
+        description="Odometry: metres forward since the last frame that the service took in, in the direction that the "
+        "robot faced then.",
     )
     left: float | None = Field(
         default=None, ge=-1e5, le=1e5, allow_inf_nan=False, description="Odometry: metres to the left; with forward."
@@ -130,7 +133,8 @@ class FrameParameters(Parameters):
         ge=-36000,
         le=36000,
         allow_inf_nan=False,
-        description="Odometry: degrees turned counter-clockwise since the frame before; with forward.",
+        description="Odometry: degrees turned counter-clockwise since the last frame that the service took in; with "
+        "forward.",
     )
     deviation: float | None = Field(
         default=None, ge=0, le=1e4, allow_inf_nan=False, description="Standard deviation of forward and left, metres."
@@ -138,15 +142,61 @@ class FrameParameters(Parameters):
     turn_deviation: float | None = Field(
         default=None, ge=0, le=360, allow_inf_nan=False, description="Standard deviation of turn, degrees."
     )
+    odometry_x: float | None = Field(
+        default=None,
+        ge=-1e8,
+        le=1e8,
+        allow_inf_nan=False,
+        description="Where odometry says that the robot is, in metres in odometry's own frame; instead of forward. "
+        "The service takes the motion since the last frame that it took in from it, so that none is lost or counted "
+        "twice.",
+    )
+    odometry_y: float | None = Field(
+        default=None, ge=-1e8, le=1e8, allow_inf_nan=False, description="Metres in odometry's frame; with odometry_x."
+    )
+    odometry_heading: float | None = Field(
+        default=None,
+        ge=-1e6,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Degrees counter-clockwise from +x of odometry's frame to where the camera looks; with odometry_x.",
+    )
+    odometry_covariance: str | None = Field(
+        default=None,
+        max_length=512,
+        description="The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated "
+        "by commas, in metres and radians as in ROS; what it grows by is that of the motion.",
+    )
+    odometry_origin: str | None = Field(
+        default=None,
+        max_length=128,
+        description="A name for where odometry began. If the frame before had another one, the motion between the two "
+        "is not known.",
+    )
     k: Matches = 5
     encoder: EncoderAssertion = None
 
     @model_validator(mode="after")
     def _odometry_is_whole(self) -> FrameParameters:
-        beside = [name for name in ("left", "turn", "deviation", "turn_deviation") if getattr(self, name) is not None]
-        if self.forward is None and beside:
-            raise ValueError(f"{beside[0]} needs forward beside it")
+        for first, needed, others in (
+            ("forward", (), ("left", "turn", "deviation", "turn_deviation")),
+            ("odometry_x", ("odometry_y", "odometry_heading"), ("odometry_covariance", "odometry_origin")),
+        ):
+            given = [name for name in (*needed, *others) if getattr(self, name) is not None]
+            if getattr(self, first) is None and given:
+                raise ValueError(f"{given[0]} needs {first} beside it")
+            if getattr(self, first) is not None and (absent := [name for name in needed if name not in given]):
+                raise ValueError(f"{first} needs {absent[0]} beside it")
+        if self.forward is not None and self.odometry_x is not None:
+            raise ValueError("forward and odometry_x tell the motion in two ways; give one of them")
         return self
+
+    @field_validator("odometry_covariance")
+    @classmethod
+    def _covariance_is_one(cls, text: str | None) -> str | None:
+        if text is not None and _covariance(text) is None:
+            raise ValueError("the value is not nine numbers of a symmetric matrix without negative variances")
+        return text
 
     def odometry(self) -> Odometry | None:
         """The odometry of the frame; None if it has none."""
@@ -154,6 +204,27 @@ class FrameParameters(Parameters):
             return None
         turn, spread = math.radians(self.turn or 0.0), math.radians(self.turn_deviation or 0.0)
         return Odometry(self.forward, self.left or 0.0, turn, (self.deviation or 0.0) ** 2, spread**2)
+
+    def odometry_pose(self) -> OdometryPose | None:
+        """Where odometry says that the robot is; None if the frame does not tell."""
+        x, y, heading, text = self.odometry_x, self.odometry_y, self.odometry_heading, self.odometry_covariance
+        if x is None or y is None or heading is None:
+            return None
+        covariance = None if text is None else _covariance(text)
+        return OdometryPose(x, y, math.radians(heading), covariance, self.odometry_origin)
+
+
+def _covariance(text: str) -> tuple[float, ...] | None:
+    """The nine numbers of a covariance, row by row; None if they are none."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    if len(numbers) != 9 or not all(abs(number) <= LARGEST_COVARIANCE for number in numbers):
+        return None
+    mirrored = ((1, 3), (2, 6), (5, 7))
+    alike = all(math.isclose(numbers[one], numbers[other], rel_tol=1e-6, abs_tol=1e-9) for one, other in mirrored)
+    return numbers if alike and min(numbers[0], numbers[4], numbers[8]) >= 0 else None
 
 
 class BelievedPlace(BaseModel):

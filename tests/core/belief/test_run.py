@@ -29,7 +29,7 @@ from core.belief.view import HEIGHT, WIDTH
 from core.places import Neighborhood
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
-BAYES, PATH = RunOptions(), RunOptions(filter="path")
+DEFAULT = RunOptions()
 NOWHERE = 1.0
 
 
@@ -45,10 +45,9 @@ def seen_at(row: int, places: int, random: np.random.Generator) -> Evidence:
     return Evidence(np.append(others, row).astype(np.int64), gains, NOWHERE)
 
 
-@pytest.mark.parametrize("options", [BAYES, PATH])
-def test_a_robot_is_found_and_found_again_when_carried_off(options: RunOptions) -> None:
+def test_a_robot_is_found_and_found_again_when_carried_off() -> None:
     random, graph = np.random.default_rng(3), graph_of(walk(400), Neighborhood(5, 3))
-    run, found = Run(options, graph), []
+    run, found = Run(DEFAULT, graph), []
     for row in [*range(50, 80), *range(300, 330)]:
         run.advance(seen_at(row, 400, random), Step())
         told = run.estimate(1, alive(graph))
@@ -57,10 +56,9 @@ def test_a_robot_is_found_and_found_again_when_carried_off(options: RunOptions) 
     assert found[30:].index(True) <= 20 and all(found[50:]), "and after it was carried off"
 
 
-@pytest.mark.parametrize("options", [BAYES, PATH])
-def test_what_is_not_in_the_map_is_unknown_after_a_few_frames(options: RunOptions) -> None:
+def test_what_is_not_in_the_map_is_unknown_after_a_few_frames() -> None:
     random, graph = np.random.default_rng(4), graph_of(walk(300), Neighborhood(5, 3))
-    run = Run(options, graph)
+    run = Run(DEFAULT, graph)
     for row in range(100, 125):
         run.advance(seen_at(row, 300, random), Step())
         verdict = run.estimate(1, alive(graph)).verdict
@@ -76,7 +74,7 @@ def test_what_is_not_in_the_map_is_unknown_after_a_few_frames(options: RunOption
 
 def test_a_blocked_view_does_not_lose_the_place() -> None:
     random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
-    run = Run(BAYES, graph)
+    run = Run(DEFAULT, graph)
     for row in range(100, 130):
         run.advance(seen_at(row, 300, random), Step())
     for _ in range(8):  # a bus stands before the camera
@@ -92,7 +90,7 @@ def test_odometry_tells_two_corridors_apart_that_look_the_same() -> None:
     graph = graph_of(posed(straight, bent))
     told = {}
     for way, turning in (("straight", 0.0), ("bent", math.pi / 2)):
-        blind, knowing = Run(BAYES, graph), Run(BAYES, graph)
+        blind, knowing = Run(DEFAULT, graph), Run(DEFAULT, graph)
         for number in range(2, 18):
             frame = shows(number, 20 + number, gain=1.5, unknown=NOWHERE)
             blind.advance(frame, Step())
@@ -118,7 +116,7 @@ def test_a_second_look_from_the_same_spot_is_no_second_witness() -> None:
 
 def test_places_that_die_between_two_frames_are_not_told() -> None:
     graph = graph_of(walk(30))
-    run = Run(BAYES, graph)
+    run = Run(DEFAULT, graph)
     for number in range(5):
         run.advance(shows(10 + number), Step())
     assert run.look(1, alive(graph)).verdict == "recognized"
@@ -132,10 +130,9 @@ def test_places_that_die_between_two_frames_are_not_told() -> None:
     assert run.look(1, living[:0]).candidates == ()
 
 
-@pytest.mark.parametrize("options", [BAYES, PATH])
 @pytest.mark.parametrize("start", [0, 5])
-def test_a_run_can_be_looked_at_when_places_have_come_or_gone(options: RunOptions, start: int) -> None:
-    run = Run(options, graph_of(walk(30)))
+def test_a_run_can_be_looked_at_when_places_have_come_or_gone(start: int) -> None:
+    run = Run(DEFAULT, graph_of(walk(30)))
     for number in range(5):
         run.advance(shows(10 + number), Step())
     rows = np.arange(start, 40)  # ten new ones at the end, and the first ones gone
@@ -146,16 +143,15 @@ def test_a_run_can_be_looked_at_when_places_have_come_or_gone(options: RunOption
     assert run.look(1, alive(changed)).candidates[0].row == 15
 
 
-@pytest.mark.parametrize("options", [BAYES, PATH])
-def test_a_run_is_taken_up_where_it_was(options: RunOptions) -> None:
+def test_a_run_is_taken_up_where_it_was() -> None:
     random, graph = np.random.default_rng(6), graph_of(walk(2000), Neighborhood(5, 3))
-    run = Run(options, graph)
+    run = Run(DEFAULT, graph)
     for row in range(700, 720):
         run.advance(seen_at(row, 2000, random), Step())
         run.estimate(1, alive(graph))
     data = to_bytes(run.state())
     assert len(data) < 16_000
-    again = Run.restored(options, graph, from_bytes(data))
+    again = Run.restored(DEFAULT, graph, from_bytes(data))
     assert (again.frames, again.unrecognized) == (run.frames, run.unrecognized)
     for one in (run, again):
         assert one.look(1, alive(graph)).verdict == "recognized"
@@ -168,7 +164,7 @@ def test_a_run_is_taken_up_where_it_was(options: RunOptions) -> None:
 
 
 def test_a_record_that_was_changed_is_refused() -> None:
-    data = to_bytes(Run(BAYES, graph_of(walk(10))).state())
+    data = to_bytes(Run(DEFAULT, graph_of(walk(10))).state())
     for bad in (b"", data[:7], data[:-1], data[:9] + b"?" + data[10:]):
         with pytest.raises(DamagedRecord):
             from_bytes(bad)
@@ -198,7 +194,7 @@ BLACK = View(np.zeros(WIDTH * HEIGHT, np.uint8))
 @pytest.mark.parametrize("outside", [False, True])
 def test_a_robot_that_was_carried_off_is_missed_within_three_frames(outside: bool) -> None:
     random, graph = np.random.default_rng(7), graph_of(walk(400), Neighborhood(5, 3))
-    run = Run(BAYES, graph)
+    run = Run(DEFAULT, graph)
     for row in range(50, 80):
         run.advance(seen_at(row, 400, random), Step(), view(row))
     assert run.look(1, alive(graph)).verdict == "recognized"
@@ -212,7 +208,7 @@ def test_a_robot_that_was_carried_off_is_missed_within_three_frames(outside: boo
 @pytest.mark.parametrize("odometry", [None, Odometry(0.0)])
 def test_a_robot_that_stands_becomes_no_surer(odometry: Odometry | None) -> None:
     graph = graph_of(posed([(float(i), 0.0) for i in range(60)]))
-    once, standing = Run(BAYES, graph), Run(BAYES, graph)
+    once, standing = Run(DEFAULT, graph), Run(DEFAULT, graph)
     for run in (once, standing):
         for row in range(10, 14):
             run.advance(shows(row, row + 30, gain=2), Step(), view(row))
@@ -226,10 +222,10 @@ def test_a_robot_that_stands_becomes_no_surer(odometry: Odometry | None) -> None
     for run in (once, standing):
         run.advance(shows(14, gain=2), Step(), view(14))
     assert standing.sight is None
-    np.testing.assert_allclose(standing.belief.given, once.belief.given, atol=1e-3)
+    # A robot that is slow may have advanced a little meanwhile.
+    np.testing.assert_allclose(standing.belief.given, once.belief.given, atol=1e-2 if odometry is None else 1e-3)
 
 
-@pytest.mark.parametrize("options", [BAYES, PATH])
 @pytest.mark.parametrize(
     ("seen", "shown", "sight"),
     [
@@ -238,9 +234,9 @@ def test_a_robot_that_stands_becomes_no_surer(odometry: Odometry | None) -> None
         (Evidence(np.array([3]), np.array([0.2], np.float32), NOWHERE), view(129), "constant"),
     ],
 )
-def test_a_covered_camera_is_unknown_and_says_so(options: RunOptions, seen: Evidence, shown: View, sight: str) -> None:
+def test_a_covered_camera_is_unknown_and_says_so(seen: Evidence, shown: View, sight: str) -> None:
     random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
-    run = Run(options, graph)
+    run = Run(DEFAULT, graph)
     for row in range(100, 130):
         run.advance(seen_at(row, 300, random), Step(), view(row))
     verdicts = []
@@ -267,7 +263,7 @@ def test_a_slow_robot_advances_while_its_view_seems_the_same() -> None:
 
 
 def test_records_of_the_first_format_are_read() -> None:
-    run = Run(BAYES, graph_of(walk(10)))
+    run = Run(DEFAULT, graph_of(walk(10)))
     run.advance(shows(3), Step(), view(3))
     state = run.state()
     assert from_bytes(to_bytes(state)).view is not None
@@ -279,4 +275,4 @@ def test_records_of_the_first_format_are_read() -> None:
     rest = len(text).to_bytes(4, "little") + text + data[8 + length : -WIDTH * HEIGHT]
     old = from_bytes(zlib.crc32(rest).to_bytes(4, "little") + rest)
     assert (old.view, old.blind, old.constant) == (None, 0, 0)
-    assert Run.restored(BAYES, run.graph, old).look(1, alive(run.graph)).candidates[0].row == 3
+    assert Run.restored(DEFAULT, run.graph, old).look(1, alive(run.graph)).candidates[0].row == 3

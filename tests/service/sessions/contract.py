@@ -17,7 +17,7 @@ STEPS = st.lists(
 
 
 def _session(session_id: str, number: int, state: bytes) -> StoredSession:
-    options = '{"filter": "bayes", "expires_after": 900.0}'
+    options = '{"expires_after": 900.0}'
     return StoredSession(
         session_id, "lab", "2026", options, 1.0, 2.0, number, number / 7, f"request {number}", number % 3, None, state,
         f'{{"frame": {number}}}',

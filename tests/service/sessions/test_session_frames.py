@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from core.errors import StorageFailure
 from core.maps import Map, MapSettings
-from core.places import PlaceFields
+from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
@@ -43,27 +44,26 @@ def deadline() -> RequestDeadline:
     return RequestDeadline(time.monotonic() + 60, asyncio.Event().wait)  # type: ignore[arg-type]
 
 
-async def walked(engine: Engine) -> Map:
-    """A map of four places."""
+async def walked(engine: Engine, count: int = 4, metres: float | None = None) -> Map:
+    """A map of so many places, which are so far apart along +x if they have poses."""
     identity = engine.resolve(None)
     encoder = await engine.queue.load(identity)
     made = engine.maps.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    await enrol(engine, made, [FrameToEnrol(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
+    poses = [None if metres is None else Pose(x=metres * n, y=0) for n in range(count)]
+    fields = [PlaceFields(pose=pose, sequence="a") for pose in poses]
+    await enrol(engine, made, [FrameToEnrol(f"p{n}", one, jpeg(n)) for n, one in enumerate(fields)], deadline())
     return made
 
 
-async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> SessionAnswer:
-    options = FrameParameters(frame=number)
+async def send(runtime: Runtime, map_: Map, session: Session, number: int, **motion: Any) -> SessionAnswer:
+    options = FrameParameters(frame=number, **motion)
     parts = runtime.engine, runtime.sessions, runtime.statistics
     return await process_frame(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
-@pytest.mark.parametrize("kind", ["bayes", "path"])
-async def test_a_frame_whose_answer_fails_does_not_count(
-    runtime: Runtime, monkeypatch: pytest.MonkeyPatch, kind: Any
-) -> None:
+async def test_a_frame_whose_answer_fails_does_not_count(runtime: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
     map_ = await walked(runtime.engine)
-    session, other = (runtime.sessions.create(map_, NewSession(filter=kind)) for _ in range(2))
+    session, other = (runtime.sessions.create(map_, NewSession()) for _ in range(2))
     for number in range(2):
         await send(runtime, map_, session, number)
         await send(runtime, map_, other, number)
@@ -96,3 +96,41 @@ async def test_a_session_deleted_during_a_frame_stays_deleted(runtime: Runtime) 
     runtime.sessions.delete(session)
     assert not runtime.sessions.save(session), "as the frame does that was under way"
     assert runtime.sessions._store.read(session.id) is None
+
+
+OK, REQUEST, ANSWER, AGAIN = "ok", "request lost", "answer lost", "answer lost, sent again"
+
+
+def fates(patterns: int, frames: int) -> list[list[str]]:
+    """What happens to each frame of a run: the worst, and some by chance."""
+    by_chance = random.Random(4)
+    drawn = [by_chance.choices((OK, REQUEST, ANSWER, AGAIN), k=frames) for _ in range(patterns)]
+    return [[ANSWER] * frames, [AGAIN] * frames, [REQUEST] * (frames - 1) + [OK], *drawn]
+
+
+async def test_odometry_counts_once_whatever_is_lost(runtime: Runtime) -> None:
+    count, metres = 7, 2.0
+    map_ = await walked(runtime.engine, count, metres)
+    for pattern in fates(2, count - 1):
+        by_pose, expected = (runtime.sessions.create(map_, NewSession(verify="never")) for _ in range(2))
+        last: int | None = None
+        for number, fate in enumerate([OK, *pattern]):
+            if fate == REQUEST:
+                continue
+            # The odometry's frame is turned by a quarter and begins elsewhere.
+            pose = {"odometry_x": 3.0, "odometry_y": metres * number - 8, "odometry_heading": 90.0}
+            told = await send(runtime, map_, by_pose, number, **pose)
+            if fate == AGAIN:
+                again = await send(runtime, map_, by_pose, number, **pose)
+                assert again.repeated and again.candidates == told.candidates
+            if number == 3:
+                by_pose.run = None  # as after a restart of the service: the belief is read from the disk
+            motion: dict[str, float] = {} if last is None else {"forward": metres * (number - last)}
+            true = await send(runtime, map_, expected, number, **motion)
+            last = number
+            assert told.motion == true.motion == ("first" if number == 0 else "odometry")
+            assert told.unknown == pytest.approx(true.unknown, abs=1e-3), (pattern, number)
+            assert told.candidates[0].place == true.candidates[0].place
+            assert told.candidates[0].probability == pytest.approx(true.candidates[0].probability, abs=1e-3)
+        for session in (by_pose, expected):
+            runtime.sessions.delete(session)

@@ -51,7 +51,7 @@ def send(server: Server, map_id: str, session: str, data: bytes, **parameters: A
     return answer
 
 
-@pytest.mark.parametrize("options", [{}, {"filter": "path", "path_frames": 4}, {"lag": 2}])
+@pytest.mark.parametrize("options", [{}, {"advance": 1.0}, {"lag": 2}])
 def test_a_run_along_the_traverse(server: Server, traverse: str, options: dict[str, object]) -> None:
     session = begin(server, traverse, **options)
     for number in range(NUMBER):
@@ -150,6 +150,9 @@ def test_a_bad_frame_does_not_count(server: Server, traverse: str) -> None:
     assert send(server, traverse, session, again(2), frame=2)["frames"] == 2
 
 
+AT: dict[str, Any] = {"odometry_x": 1, "odometry_y": 2, "odometry_heading": 90}
+
+
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -159,6 +162,19 @@ def test_a_bad_frame_does_not_count(server: Server, traverse: str) -> None:
         {"forward": "nan"},
         {"turn": 90},
         {"left": 1},
+        {"odometry_x": 1, "odometry_y": 1},
+        {"odometry_y": 1},
+        {"odometry_heading": 90},
+        {"odometry_origin": "a"},
+        {"odometry_covariance": "0,0,0,0,0,0,0,0,0"},
+        {**AT, "odometry_x": "inf"},
+        {**AT, "odometry_heading": 1e7},
+        {**AT, "odometry_origin": "a" * 129},
+        {**AT, "odometry_covariance": "1,0,0,0,1,0,0,0"},
+        {**AT, "odometry_covariance": "1,0,0,0,1,0,0,0,nan"},
+        {**AT, "odometry_covariance": "1,0,0,0,1,0,0,0,-1"},
+        {**AT, "odometry_covariance": "1,2,0,0,1,0,0,0,1"},
+        {**AT, "forward": 1},
         {"k": 0},
         {"speed": 3},
     ],
@@ -171,22 +187,25 @@ def test_bad_parameters_of_a_frame(server: Server, traverse: str, parameters: di
 @pytest.mark.parametrize(
     "options",
     [
-        {"filter": "particles"},
         {"speed_limit": 0},
         {"speed_limit": "fast"},
         {"advance": -1},
         {"lag": 21},
-        {"path_frames": 1},
         {"expires_after": 0},
         {"sequences": []},
-        {"filter": "path", "lag": 3},
-        {"filter": "path", "speed_limit": 2},
         {"particles": 10},
         [],
     ],
 )
 def test_bad_options_of_a_session(server: Server, traverse: str, options: object) -> None:
     assert_problem(server.client.post(f"/v1/maps/{traverse}/sessions", json=options), 422, "invalid-request")
+
+
+@pytest.mark.parametrize("option", [{"filter": "path"}, {"filter": "bayes"}, {"path_frames": 10}])
+def test_the_choice_of_a_filter_is_refused_in_words(server: Server, traverse: str, option: dict[str, object]) -> None:
+    refused = server.client.post(f"/v1/maps/{traverse}/sessions", json=option)
+    assert_problem(refused, 422, "invalid-request")
+    assert f"there is no option {next(iter(option))} any more" in refused.text
 
 
 def test_a_session_needs_existing_sequences_and_cameras(server: Server, traverse: str) -> None:
@@ -217,8 +236,28 @@ def test_odometry(server: Server, traverse: str) -> None:
     send(server, traverse, session, again(1))
     answer = send(server, traverse, session, again(2), forward=2.0, turn=0, deviation=0.1)
     assert answer["motion"] == "odometry"
-    path = begin(server, traverse, filter="path")
-    assert_problem(post(server, traverse, path, again(1), forward=1), 422, "invalid-request")
+
+
+def test_odometry_by_pose(server: Server, traverse: str) -> None:
+    session, other = begin(server, traverse, speed_limit=3.0), begin(server, traverse, speed_limit=3.0)
+
+    def told(number: int, x: float, **more: Any) -> dict[str, Any]:
+        stamp = f"2026-11-20T10:00:{number:02d}Z"
+        pose = {"odometry_x": x, "odometry_y": 7, "odometry_heading": 180, **more}
+        return send(server, traverse, session, again(number), frame=number, timestamp=stamp, **pose)
+
+    answers = [told(1, 50.0), told(2, 48.0), told(3, 46.0, odometry_covariance="0.1,0,0,0,0.1,0,0,0,0.01")]
+    for number, motion in ((1, {}), (2, {"forward": 2.0}), (3, {"forward": 2.0})):
+        stamp = f"2026-11-20T10:00:{number:02d}Z"
+        expected = send(server, traverse, other, again(number), frame=number, timestamp=stamp, **motion)
+        found = answers[number - 1]
+        assert (found["motion"], found["candidates"]) == (expected["motion"], expected["candidates"])
+    assert answers[-1]["motion"] == "odometry"
+    assert told(4, 0.0)["motion"] == "speed-limit", "odometry that jumps has begun anew"
+    assert told(5, -2.0)["motion"] == "odometry"
+    assert told(6, -4.0, odometry_origin="again")["motion"] == "speed-limit"
+    assert told(6, 77.0, odometry_origin="again")["repeated"], "the same frame, whatever it says"
+    assert told(7, -6.0, odometry_origin="again")["motion"] == "odometry"
 
 
 def test_a_form_gives_the_same_answer(server: Server, traverse: str) -> None:
@@ -354,6 +393,9 @@ def test_sessions_expire_and_are_bounded(small: Server) -> None:
     assert (answer["frames"], answer["single"]["reason"]) == (1, "no-regions")
 
 
+RESTARTED: dict[str, dict[str, object]] = {"speed unknown": {}, "advance fixed": {"advance": 1.0}}
+
+
 @pytest.mark.parametrize("end", ["kill", pytest.param("stop", marks=pytest.mark.thorough)])
 def test_a_session_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
     install_coarse_encoder(tmp_path / "models")
@@ -362,7 +404,7 @@ def test_a_session_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
     first.create_map("lab")
     for number in range(NUMBER):
         first.enrol("lab", f"p{number}", jpeg(number), sequence="monday")
-    sessions = {name: begin(first, "lab", filter=name) for name in ("bayes", "path")}
+    sessions = {name: begin(first, "lab", **options) for name, options in RESTARTED.items()}
     before = {
         name: [send(first, "lab", session, again(number), frame=number) for number in range(4)][-1]
         for name, session in sessions.items()

@@ -46,6 +46,20 @@ def test_a_run_over_one_connection(server: Server, traverse: str) -> None:
     assert send(server, traverse, session, again(7))["frames"] == 8, "the session outlives the connection"
 
 
+def test_odometry_by_pose(server: Server, traverse: str) -> None:
+    session, other = begin(server, traverse), begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        for number, last in ((0, None), (1, 0), (4, 1), (5, 4)):
+            pose = {"odometry_x": 2.0 * number, "odometry_y": 0.0, "odometry_heading": 0.0, "odometry_origin": "a"}
+            motion = {} if last is None else {"forward": 2.0 * (number - last)}
+            answer = ask(connection, again(number), frame=number, **pose)
+            expected = send(server, traverse, other, again(number), frame=number, **motion)
+            assert (answer["motion"], answer["candidates"]) == (expected["motion"], expected["candidates"])
+            assert ask(connection, again(number), frame=number, **pose)["repeated"]
+        assert answer["motion"] == "odometry"
+        assert ask(connection, again(6), frame=6, forward=2.0, **pose)["problem"]["status"] == 422
+
+
 def test_frames_sent_ahead_are_answered_in_their_order(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
