@@ -31,6 +31,7 @@ from core.networks.xfeat import packaged_xfeat
 from core.recognition.verification import Verify
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
+from service.engine.rehearsal import rehearse
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.engine.stores import OpenStore
@@ -147,8 +148,10 @@ class Engine:
         began = time.perf_counter()
         try:
             identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
-            await self.queue.load(identity)
+            encoder = await self.queue.load(identity)
             await in_thread(packaged_xfeat)  # which finds keypoints
+            if self.settings.rehearsal:
+                await in_thread(rehearse, encoder)
         except PlacerecError as error:
             self.encoder_state = str(error)
             log.error("the default encoder cannot be used: %s", error)

@@ -1,0 +1,120 @@
+"""A rehearsal: everything that robots and operators wait for is done once, on small maps that are thrown away.
+
+What a process does for the first time is slow: Numba compiles its loops or loads what it has compiled, and networks,
+indexes and SQLite make their working memory.  Without a rehearsal a robot waits for that at its first frame of each
+kind.
+
+``python -m service.engine.rehearsal`` fills Numba's cache, so that no start of a service has to compile.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from core.belief import Odometry, Run, RunOptions, Step, evidence, place_graph, view_of
+from core.errors import StorageFailure, StorageFull
+from core.frames.preprocessing import Pixels
+from core.judgement.alignment import LEAST_FRAMES, of_matrix, shared_stretches
+from core.maps import Map
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder, canary_frame
+from core.method.regions import box_sums
+from core.places import PlaceFields, Pose
+from core.recognition import Answer, enrol, recognize
+from core.recognition.stages import neighborhood_of
+from core.storage import Atlas
+from core.storage.files.row_formats import COMPRESSED, inner_products, pack_descriptors
+
+FRAMES = 2
+"""Of each of the two traverses."""
+
+STEPS = (Step(), Step(reach=2.0), Step(odometry=Odometry(2.0)))
+"""What sessions know of a motion: nothing, a speed limit, odometry."""
+
+log = logging.getLogger("placerec.rehearsal")
+
+
+def rehearse(encoder: Encoder) -> None:
+    """Enrol, recognize, follow a run and align two traverses, as requests do.
+
+    Where the temporary folder cannot be written, which requests do without, the log says so and no more is done.
+
+    Raises:
+        InvalidModel: the network of keypoints cannot be loaded.
+    """
+    try:
+        _rehearse(encoder)
+    except (StorageFull, StorageFailure, OSError) as error:
+        log.warning("the first request of each kind takes longer, for nothing could be rehearsed: %s", error)
+
+
+def _rehearse(encoder: Encoder) -> None:
+    with tempfile.TemporaryDirectory(prefix="placerec-rehearsal-") as folder:
+        atlas = Atlas(Path(folder))
+        try:
+            shape = encoder.local_shape
+            _rehearse_in(atlas.create("rehearsal", encoder.identity, encoder.dimension, local_shape=shape), encoder)
+        finally:
+            atlas.close()
+    shared_stretches(of_matrix(np.eye(LEAST_FRAMES, dtype=np.float32)), LEAST_FRAMES, LEAST_FRAMES)
+    # Loops that only compressed maps and encoders without a projection use.
+    descriptors = np.ones((1, encoder.dimension), np.float32)
+    inner_products(descriptors, pack_descriptors(descriptors, COMPRESSED), COMPRESSED)
+    box_sums(np.ones((1, 1, 8), np.float32), np.array([[0, 0, 1, 1]], np.int32))
+
+
+def _rehearse_in(map_: Map, encoder: Encoder) -> None:
+    frames, moment = list(_frames()), datetime(2026, 1, 1, tzinfo=UTC)
+    for number, frame in enumerate(frames):
+        traverse, place = divmod(number, FRAMES)
+        pose = Pose(x=2.0 * place, y=0.5 * traverse, heading=0.0)
+        taken = moment + timedelta(seconds=number)
+        fields = PlaceFields(pose=pose, timestamp=taken, sequence=f"traverse-{traverse}")
+        enrol(map_, f"place-{number}", _file(frame), encoder, fields)
+    seen = frames[:FRAMES]
+    _follow(map_, seen, [recognize(map_, _file(frame), encoder, verify="always") for frame in seen])
+
+
+def _follow(map_: Map, frames: Sequence[Pixels], answers: Sequence[Answer]) -> None:
+    """A run over the answers with each kind of motion."""
+    snapshot, neighborhood = map_.snapshot(), neighborhood_of(map_)
+    graph = place_graph(snapshot.whereabouts, np.flatnonzero(snapshot.alive), snapshot.rows, neighborhood)
+    for step in STEPS:
+        run = Run(RunOptions(lag=1), graph)
+        for frame, answer in zip(frames, answers, strict=True):
+            ranked = answer.candidates
+            found = evidence(
+                ranked.rows, ranked.scores, ranked.whereabouts, answer.calibration, neighborhood, ranked.examined
+            )
+            run.advance(found, step, view_of(frame))
+            run.estimate(1, snapshot.alive)
+            run.earlier(1, snapshot.alive)
+
+
+def _frames() -> Iterator[Pixels]:
+    """The canary frame seen from a little further aside each time, for each of two traverses."""
+    whole = canary_frame()
+    for number in range(2 * FRAMES):
+        yield np.ascontiguousarray(np.roll(whole, 24 * number, axis=1))
+
+
+def _file(frame: Pixels) -> bytes:
+    return cv2.imencode(".jpg", frame)[1].tobytes()
+
+
+def main() -> None:
+    """Check the packaged default encoder on this machine, and rehearse with it."""
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    encoder.check_golden()
+    rehearse(encoder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""A service that has rehearsed compiles nothing more, whatever it is asked for first."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from benchmarks.day.first_requests import Request, enrol, kinds
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from service.engine.rehearsal import rehearse
+from tests.service.server import Server
+
+CACHE = "[cache] "
+"""How lines begin by which Numba tells that it loads a compiled loop, or has compiled one."""
+
+
+def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
+    server = Server(tmp_path, {"rehearsal": True}, forked=False)
+    try:
+        server.wait()
+        assert loops(server), "Numba does not tell what it loads"
+        asked_first = {"enrolment of a map": prepared(enrol, server.client), **kinds(server.client)}
+        later = {}
+        for name, prepare in asked_first.items():
+            before = len(loops(server))
+            prepare()(0)
+            if new := loops(server)[before:]:
+                later[name] = new
+        assert later == {}
+    finally:
+        server.kill()
+
+
+def prepared(work: Callable[[httpx.Client], None], client: httpx.Client) -> Callable[[], Request]:
+    """Something that needs no preparation, as a kind of request."""
+    return lambda: lambda _: work(client)
+
+
+def loops(server: Server) -> list[str]:
+    """The lines of a server's output about compiled loops."""
+    return [line for line in server.log_file.read_text().splitlines() if line.startswith(CACHE)]
+
+
+def test_a_service_does_without_where_nothing_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "no such folder"))
+    rehearse(EncoderCatalogue().get(DEFAULT_ENCODER))
+    assert "nothing could be rehearsed" in caplog.text
