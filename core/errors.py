@@ -112,7 +112,7 @@ class UnknownPlace(PlacerecError):
     """The map has no place with this id."""
 
 
-class TooManyToForget(PlacerecError):
+class TooManyToDelete(PlacerecError):
     """More places fulfil the conditions than may be forgotten at once; none was."""
 
 

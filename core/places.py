@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from core import names
 from core.errors import InvalidIdentifier
 
 MAP_ID = r"[a-z0-9][a-z0-9._-]{0,63}"
-PLACE_ID = r"[A-Za-z0-9][A-Za-z0-9._~-]{0,127}"
+PLACE_ID = names.word(128)
 RESERVED_MAP_IDS = frozenset({"import"})
 EARTH_RADIUS = 6_371_008.8  # metres, mean
 
@@ -25,6 +26,9 @@ NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
 
 NO_SEQUENCE = -1
 """The code of the places that belong to no sequence."""
+
+SAME_VIEW = 3
+"""Consecutive frames of one view are the same place up to this many times the radius, where poses are coarse."""
 
 NO_TIME = -(1 << 63)
 """The timestamp of a place without one."""
@@ -52,6 +56,15 @@ def check_place_id(text: str) -> str:
     if not re.fullmatch(PLACE_ID, text):
         raise InvalidIdentifier(f"{text[:140]!r} cannot name a place: it must match {PLACE_ID}.")
     return text
+
+
+def check_sequence(text: str) -> str:
+    """Return ``text`` if it can be the name of a sequence.
+
+    Raises:
+        InvalidIdentifier: it cannot.
+    """
+    return names.check_name(text, "a sequence")
 
 
 class Pose(BaseModel):
@@ -129,9 +142,9 @@ def microseconds(moment: datetime) -> int:
     return (moment - _EPOCH) // timedelta(microseconds=1)
 
 
-Sequence = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f/]+$")]
+Sequence = Annotated[str, Field(min_length=1, max_length=names.LONGEST, pattern=f"^{names.TEXT}$")]
 
-Camera = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._~-]{0,63}$")]
+Camera = Annotated[str, Field(pattern=f"^{names.word(64)}$")]
 
 
 class PlaceFields(BaseModel):
@@ -147,14 +160,19 @@ class PlaceFields(BaseModel):
 
 
 class Place(PlaceFields):
-    """One enrolled reference frame."""
+    """One enrolled reference frame; its sequence may have a name from before the rule for names, and keeps it."""
 
     id: str
+    sequence: str | None = None
     pose_of: str | None = Field(default=None, description="The place whose pose it got from an alignment.")
     regions: int = Field(ge=0, description="Regions of interest found in the frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
     created_at: Timestamp
     updated_at: Timestamp
+
+    def fields(self) -> PlaceFields:
+        """What a caller once said about the frame."""
+        return PlaceFields.model_construct(**{name: getattr(self, name) for name in PlaceFields.model_fields})
 
 
 @dataclass(frozen=True)
@@ -176,7 +194,8 @@ class Whereabouts:
     kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
     position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
     sequence: int32 [n], a code for the sequence's name; NO_SEQUENCE for places without one.
-    ordinal: int64 [n], order of enrolment within the sequence.
+    ordinal: int64 [n], order of enrolment within the sequence, in which consecutive frames that show the same view have
+        the same position (``core.maps.views``).
     heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
     track, station: int32 [n] and int64 [n], the sequence and the ordinal at which another traverse shows the same, as
@@ -232,8 +251,10 @@ class Whereabouts:
     def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
         """Which of the places are the same place as ``row``, itself included; bool [n].
 
-        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart, or
+        Two poses of one kind are compared by distance; other places must be of one sequence and few positions apart, or
         at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own.
+        Frames at one position of a sequence show one view and are the same place also if coarse poses are a little
+        farther apart.
         """
         near = np.zeros(len(self), np.bool_)
         for sequence, ordinal in ((self.sequence, self.ordinal), (self.track, self.station)):
@@ -243,19 +264,42 @@ class Whereabouts:
         if kind != NO_POSE:
             x, y, z = (self.position - self.position[row]).T
             distance = np.sqrt(x * x + y * y + z * z)
-            near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
+            reach = np.full(len(self), neighborhood.radius)
+            if self.sequence[row] != NO_SEQUENCE:
+                reach[(self.sequence == self.sequence[row]) & (self.ordinal == self.ordinal[row])] *= SAME_VIEW
+            near = np.where(self.kind == kind, distance <= reach, near)
         near[row] = True
         return near
 
-    def others(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
+    def others(self, row: int, neighborhood: Neighborhood, across: bool = True) -> NDArray[np.bool_]:
         """Which of the places are other places than ``row``, of those at one station only the first; bool [n].
 
-        So a place that several aligned traverses show counts once.
+        So a place that several aligned traverses show counts once, and one at which a robot stood.
+
+        Args:
+            across: whether frames of several traverses can be at one station; else frames of one view are.
         """
         others = ~self.near(row, neighborhood)
-        if not self.aligned:
-            return others
-        at = np.flatnonzero(others & (self.track != NO_SEQUENCE))
-        _, first = np.unique(np.stack([self.track[at], self.station[at]]), axis=1, return_index=True)
-        others[np.delete(at, first)] = False
+        at = np.flatnonzero(others)
+        track, station = (self.track, self.station) if across else (self.sequence, self.ordinal)
+        others[at[_repeated(track[at], station[at])]] = False
         return others
+
+    def repeats(self, order: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the places ``order``, int64 [n], show a view that an earlier one of them shows; bool [n]."""
+        return _repeated(self.sequence[order], self.ordinal[order])
+
+
+def _repeated(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of n positions in sequences are those of an earlier one; bool [n].  Without a sequence none is."""
+    keys = (sequence.astype(np.int64) << _SEQUENCE) + ordinal
+    repeated = np.zeros(len(keys), np.bool_)
+    ordered = np.sort(keys)
+    if (ordered[1:] == ordered[:-1]).any():
+        repeated[:] = True
+        repeated[np.unique(keys, return_index=True)[1]] = False
+        repeated &= sequence != NO_SEQUENCE
+    return repeated
+
+
+_SEQUENCE = 40  # bits of a position

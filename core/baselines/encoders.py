@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.system import About, Array, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Description, Index, InnerProducts, stack, system_identity
 from core.frames.preprocessing import Pixels
 from core.recognition.stages import score_matrix
 
@@ -71,7 +71,8 @@ class EncoderSystem:
 
     def __init__(self, encoder: Encoder, about: About) -> None:
         self.encoder, self.about = encoder, about
-        self.identity = encoder.identity
+        own = about.name == encoder.name
+        self.identity = encoder.identity if own else system_identity(about, encoder=encoder.identity)
 
     def describe(self, pixels: Pixels) -> Description:
         encoding = self.encoder.encode(pixels)

@@ -6,7 +6,7 @@ To add a system, add a row to ``BASELINES``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from core.baselines import (
@@ -24,9 +24,11 @@ from core.baselines.attention import attentive_attention, context_flexible_atten
 from core.baselines.encoders import EncoderSystem, about_encoder
 from core.baselines.stages import (
     FIRST_STAGE,
+    TWO_STAGES,
     VERIFIED,
     VerifiedSystem,
     about_first_stage,
+    about_two_stages,
     about_verified,
     first_stage,
 )
@@ -34,6 +36,7 @@ from core.baselines.system import About, Resources, System
 from core.errors import InvalidModel, MissingWeights, UnknownEncoder
 from core.method.catalogue import EncoderCatalogue, EncoderSummary
 from core.networks.files import open_network
+from core.recognition.verification import Verify
 
 
 @dataclass(frozen=True)
@@ -76,16 +79,19 @@ BASELINES: tuple[Baseline, ...] = (
 def systems(models: EncoderCatalogue) -> list[About]:
     """All systems that ``build`` knows, without reading weights: installed encoders, the default first, then others.
 
-    An encoder of two stages stands there with one and with three, too.
+    An encoder of two stages stands there as the service asks it, with one stage, with two, and always verified.
     """
     summaries = sorted(models.describe(), key=lambda summary: not summary.default)
     names = {summary.name for summary in summaries}
     own = []
     for summary in summaries:
         about = about_encoder(summary)
-        own.append(about)
-        if has_second_stage(summary):
-            own += [other for other in (about_first_stage(about), about_verified(about)) if other.name not in names]
+        if not has_second_stage(summary):
+            own.append(about)
+            continue
+        always = about_verified(replace(about, name=about.name + VERIFIED))
+        others = about_first_stage(about), about_two_stages(about), always
+        own += [about_verified(about, "auto"), *(other for other in others if other.name not in names)]
     return own + [baseline.about for baseline in BASELINES]
 
 
@@ -94,14 +100,16 @@ def has_second_stage(summary: EncoderSummary) -> bool:
     return summary.definition is not None and summary.definition.agreement is not None
 
 
-def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -> System:
+def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None, verify: Verify = "auto") -> System:
     """Make a system ready to describe frames, or to be trained first if it is ``Trainable``.
 
     Args:
-        name: of a system, or the name or identity of an installed encoder.  With ``.first-stage`` behind the name of
-            an encoder of two stages, it has only the first; with ``.verified``, a third.
+        name: of a system, or the name or identity of an installed encoder.  An encoder of two stages has a third, as
+            the service asks it; with ``.first-stage`` or ``.two-stages`` behind the name it has fewer, and with
+            ``.verified`` the third always verifies.
         weights: the file that the system needs; for a system that runs on the packaged network,
             another network file to run on.
+        verify: when the third stage of an encoder that is asked as the service asks it verifies.
 
     Raises:
         MissingWeights: it needs a file and none was given, or there is no such file.
@@ -110,7 +118,7 @@ def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -
     """
     baseline = next((baseline for baseline in BASELINES if baseline.about.name == name), None)
     if baseline is None:
-        return _encoder(name, models, weights)
+        return _encoder(name, models, weights, verify)
     if weights is not None and not weights.is_file():
         raise MissingWeights(f"{name}: there is no file {weights}.")
     if weights is None and baseline.about.weights is not None:
@@ -118,10 +126,10 @@ def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -
     return baseline.build(baseline.about, Resources(models, weights))
 
 
-def _encoder(name: str, models: EncoderCatalogue, weights: Path | None) -> System:
+def _encoder(name: str, models: EncoderCatalogue, weights: Path | None, verify: Verify) -> System:
     summaries = {summary.name: summary for summary in models.describe()}
     asked, stages = name, ""
-    for ending in (FIRST_STAGE, VERIFIED):
+    for ending in (FIRST_STAGE, TWO_STAGES, VERIFIED):
         whole = summaries.get(name.removesuffix(ending))
         if name not in summaries and whole is not None and has_second_stage(whole):
             asked, stages = whole.name, ending
@@ -135,4 +143,10 @@ def _encoder(name: str, models: EncoderCatalogue, weights: Path | None) -> Syste
     if stages == FIRST_STAGE:
         network = open_network(models.network_file(summary.network), encoder.definition.layers)
         return EncoderSystem(first_stage(encoder, network), about_first_stage(about))
-    return VerifiedSystem(EncoderSystem(encoder, about)) if stages else EncoderSystem(encoder, about)
+    if stages:
+        about = replace(about, name=about.name + stages)
+    if stages == VERIFIED:
+        return VerifiedSystem(encoder, about_verified(about), "always")
+    if stages == TWO_STAGES or verify == "never" or not has_second_stage(summary):
+        return EncoderSystem(encoder, about)
+    return VerifiedSystem(encoder, about_verified(about, verify), verify)

@@ -1,36 +1,37 @@
-"""An encoder with fewer or more stages than its own, so that one sees what each stage adds.
+"""An encoder of two stages as the service asks it, and with fewer stages, so that one sees what each adds.
 
-``ENCODER.first-stage`` is the encoder without the second stage, in which cells of frames are compared.
-``ENCODER.verified`` adds a third, geometric verification (``core.geometry``): of the best places of both stages, those
-that share more of the query's keypoints move up.
+``ENCODER`` has three stages, as every map of the service: of the best places of two stages, those that share more of
+the query's keypoints move up (``core.geometry``), by default where two stages leave doubt.  ``ENCODER.verified`` always
+verifies them, ``ENCODER.two-stages`` never, and ``ENCODER.first-stage`` does not compare cells of frames, either.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.encoders import LOCAL_AGREEMENT, EncoderSystem
-from core.baselines.system import About, Array, Description, Index, system_identity
+from core.baselines.encoders import LOCAL_AGREEMENT, EncoderSystem, local_of
+from core.baselines.system import About, Array, Description, Index, InnerProducts, stack
 from core.frames.preprocessing import Pixels
 from core.geometry import detection, keypoints, verification
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints, keypoints_of
 from core.geometry.verification import verify
 from core.judgement.geometry import WEIGHT
-from core.judgement.verdict import Calibration
+from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder
 from core.method.features import FeatureExtractor
 from core.method.vocabulary import Vocabulary
 from core.networks.backbone import Backbone
 from core.networks.xfeat import load_xfeat
-from core.recognition.verification import CANDIDATES
+from core.recognition.stages import Candidates, Positions, likeness_of_first, traverse_candidates, traverse_neighborhood
+from core.recognition.verification import CANDIDATES, Verifier, Verify, verify_candidates
 
-FIRST_STAGE, VERIFIED = ".first-stage", ".verified"
+FIRST_STAGE, TWO_STAGES, VERIFIED = ".first-stage", ".two-stages", ".verified"
 
 NOTHING = Calibration(source="encoder-default", threshold=0, margin=0, background_mean=0, background_deviation=1)
 """The calibration of an encoder with its second stage says nothing of its first alone."""
@@ -55,9 +56,15 @@ def first_stage(encoder: Encoder, network: Backbone) -> Encoder:
     return Encoder(encoder.name + FIRST_STAGE, extractor, definition, vocabulary, NOTHING, whitening=encoder.whitening)
 
 
-def about_verified(about: About) -> About:
-    """A two-stage encoder and geometric verification."""
+def about_two_stages(about: About) -> About:
+    """A two-stage encoder by itself."""
+    return replace(about, name=about.name + TWO_STAGES)
+
+
+def about_verified(about: About, verify: Verify = "always") -> About:
+    """A two-stage encoder and geometric verification, ``auto`` or ``always``; the latter has a name of its own."""
     constants = {
+        "verify": verify,
         "keypoints": keypoints.MOST,
         "longest_side": detection.LONGEST_SIDE,
         "least_cosine": verification.LEAST_COSINE,
@@ -66,47 +73,81 @@ def about_verified(about: About) -> About:
     }
     return replace(
         about,
-        name=about.name + VERIFIED,
-        title=f"{about.title} and verification",
+        title=f"{about.title} and verification" + (" where these leave doubt" if verify == "auto" else ""),
         paper=f"{about.paper}; keypoints by Potje, Cadar, Araujo, Martins, Nascimento: XFeat: Accelerated Features for "
         "Lightweight Image Matching, CVPR 2024",
         configuration={**about.configuration, **{f"verification.{name}": value for name, value in constants.items()}},
     )
 
 
-class VerifiedSystem:
-    """An encoder whose best places are verified; a frame has the encoder's arrays and its keypoints' record, uint8."""
+class VerifiedSystem(EncoderSystem):
+    """An encoder whose best places are verified; a frame has the encoder's arrays and its keypoints' record, uint8.
 
-    sequential = False
+    Args:
+        about: under the encoder's own name it has the encoder's identity, which maps are bound to.
+        verify: when they are.
+    """
 
-    def __init__(self, system: EncoderSystem) -> None:
-        self._system, self._network = system, load_xfeat()
-        self.about = about_verified(system.about)
-        self.identity = system_identity(self.about, encoder=system.identity)
+    def __init__(self, encoder: Encoder, about: About, verify: Verify) -> None:
+        super().__init__(encoder, about)
+        self._verify, self._network = verify, load_xfeat()
 
     def describe(self, pixels: Pixels) -> Description:
-        described, began = self._system.describe(pixels), time.perf_counter()
+        described, began = super().describe(pixels), time.perf_counter()
         record = np.frombuffer(find_keypoints(self._network, pixels).record(), np.uint8)
         spent = 1e3 * (time.perf_counter() - began)
         return Description({**described.arrays, "keypoints": record}, {**described.milliseconds, "keypoints": spent})
 
     def index(self, references: Sequence[Description]) -> Index:
-        return ThreeStages(self._system.index(references), [keypoints_in(reference) for reference in references])
+        return ThreeStages(self.encoder, self._verify, references)
 
 
 @dataclass(frozen=True)
 class ThreeStages:
-    """An index whose best places are verified; ``places`` are the keypoints of the R references."""
+    """The references as the places of one map, which is asked as the service asks it.
 
-    stages: Index
-    places: list[Keypoints]
+    The score of a place is the value by which the service orders it (``core.judgement.geometry``): of two stages and,
+    where it was verified, with ``WEIGHT`` times the share of its keypoints that are inliers.
+    """
+
+    encoder: Encoder
+    verify: Verify
+    references: Sequence[Description]
+    vectors: Array = field(init=False)
+    local: NDArray[np.int8] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vectors", stack(self.references))  # float32 [R, D]
+        object.__setattr__(self, "local", local_of(self.references))  # int8 [R, C, L]
 
     def score(self, queries: Sequence[Description]) -> Array:
-        scores = self.stages.score(queries)
-        for row, query in zip(scores, queries, strict=True):
-            best = np.argsort(-row, kind="stable")[:CANDIDATES]
-            row[best] += verified_gains(keypoints_in(query), [self.places[place] for place in best])
+        products = InnerProducts(self.vectors).score(queries)
+        scores = np.empty_like(products)
+        ranked = traverse_candidates(self.encoder, products, local_of(queries), self.local)
+        for row, query, candidates in zip(scores, queries, ranked, strict=True):
+            verifier = Verifier(self.verify, lambda query=query: keypoints_in(query))  # type: ignore[misc]
+            calibration = self.encoder.calibration
+            found, _, _ = verify_candidates(candidates, self._judged, verifier, calibration, self._keypoints_at)
+            row[found.rows] = found.values
         return scores
+
+    def _judged(self, candidates: Candidates) -> Judgement:
+        def likeness(positions: Positions) -> Array:
+            rows = candidates.rows[np.concatenate([[0], positions])]
+            return likeness_of_first(self.encoder, self.vectors[rows], self.local[rows])
+
+        return judge(
+            candidates.ordered,
+            candidates.whereabouts,
+            self.encoder.calibration,
+            traverse_neighborhood(),
+            candidates.examined,
+            likeness,
+            candidates.geometry,
+        )
+
+    def _keypoints_at(self, rows: list[int]) -> list[Keypoints | None]:
+        return [keypoints_in(self.references[row]) for row in rows]
 
 
 def verified_gains(query: Keypoints, places: Sequence[Keypoints]) -> NDArray[np.float32]:

@@ -106,6 +106,7 @@ class Subject:
         return cache_key(
             kind=kind,
             system=self._untrained_identity,
+            configuration=dict(self.system.about.configuration),
             training=training,
             references=files_digest(self.pair.kept_references),
             queries=files_digest(self.pair.queries),

@@ -281,7 +281,7 @@ def judge(
 class _Ranking:
     """A ranking, and which of its places are other than the best match.
 
-    others: int64 [m], positions of the other places.
+    others: int64 [m], positions of the other places, of frames of one view only the first.
     compared: int64 [k], those of them whose scores are compared with the best, one for each station.
     apart: bool [n], the places that cannot overlap with the best match.
     geometry: what verification found of the n places; None if none was verified.
@@ -307,7 +307,7 @@ class _Ranking:
         geometry: Geometry | None,
     ) -> _Ranking:
         """The arguments are those of :func:`judge`."""
-        others = np.flatnonzero(~whereabouts.near(0, neighborhood))
+        others = np.flatnonzero(whereabouts.others(0, neighborhood, across=False))
         closely = others[others < examined] if isinstance(examined, int) else others[examined[others]]
         compared = closely if np.any(examined) else others
         compared = compared[whereabouts.others(0, neighborhood)[compared]]

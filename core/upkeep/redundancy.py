@@ -16,6 +16,9 @@ MOST_NEIGHBOURS = 32
 
 _STEPS = MOST_NEIGHBOURS // 2
 
+FEWEST_STANDING = 10
+"""So many frames of one view are a stop: fewer are those of a slow robot or a fast camera."""
+
 
 def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
     """Pairs of frames of the same place (``Whereabouts.near``), each once, the lower first: int64 [m, 2]."""
@@ -33,12 +36,31 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
         second = found.reshape(-1)
         there = apart.reshape(-1) <= neighborhood.radius
         pairs.append(np.stack([members[first[there]], members[second[there]]], axis=1))
-    pairs += _along(where, where.sequence, where.ordinal, neighborhood.frames, min(neighborhood.frames, _STEPS))
+    # Where a robot stood still, many frames are at one position.
+    crowded = bool(where.repeats(np.arange(len(where))).any())
+    steps = _STEPS if crowded else min(neighborhood.frames, _STEPS)
+    pairs += _along(where, where.sequence, where.ordinal, neighborhood.frames, steps)
     if where.aligned:
         # Several traverses may have a frame at each station.
         pairs += _along(where, where.track, where.station, neighborhood.frames, _STEPS)
     ordered = np.sort(np.concatenate(pairs), axis=1)
     return np.unique(ordered[ordered[:, 0] != ordered[:, 1]], axis=0)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Frames of a traverse that show one view; ``places`` are their positions, int64 [n], in the order of the map."""
+
+    places: NDArray[np.int64]
+
+
+def stops(where: Whereabouts) -> list[Stop]:
+    """Where a robot stood while it mapped: the views with ``FEWEST_STANDING`` frames or more, those of most first."""
+    found = np.flatnonzero(where.sequence != NO_SEQUENCE)
+    order = found[np.lexsort((where.ordinal[found], where.sequence[found]))]
+    begins = np.flatnonzero((np.diff(where.sequence[order]) != 0) | (np.diff(where.ordinal[order]) != 0)) + 1
+    views = [np.sort(view) for view in np.split(order, begins) if len(view) >= FEWEST_STANDING]
+    return sorted(map(Stop, views), key=lambda stop: (-len(stop.places), int(stop.places[0])))
 
 
 def _along(

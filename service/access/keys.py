@@ -26,6 +26,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
+from core.names import word
 from core.places import check_map_id
 from service.access.roles import LEVELS, Role
 from service.errors.faults import (
@@ -44,7 +45,7 @@ MODE = 0o600
 BUSY_SECONDS = 5.0
 
 ID = re.compile(r"[0-9a-f]{12}")
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+NAME = re.compile(word(64, more="@"))
 RESERVED = frozenset({"anonymous", "owner"})
 SECRET_BYTES = 32
 
@@ -217,7 +218,7 @@ class KeyRecords(ABC):
         with self.changing() as changes:
             keys = changes.read()
             if any(other.name == name and in_force(other, now) for other in keys):
-                raise KeyExists(f"There is already a key {name!r}. Revoke it first, or choose another name.")
+                raise KeyExists(f"There is already a key {name!r}. Delete it first, or choose another name.")
             if len(keys) >= MOST_KEYS:
                 raise TooManyKeys(f"{MOST_KEYS} keys were created, which is the most that one data directory holds.")
             if keep_admin:
@@ -259,11 +260,11 @@ class KeyRecords(ABC):
                 check_map_id(map_id)
             if not before.includes(after):
                 raise KeyWidened(
-                    f"The holder of the key {before.name!r} could do more than before. Create another key, and revoke "
+                    f"The holder of the key {before.name!r} could do more than before. Create another key, and delete "
                     "this one."
                 )
             if after.expires_at is not None and after.expires_at <= now:
-                raise InvalidRequest("The expiry of the key is in the past. Revoke it instead.")
+                raise InvalidRequest("The expiry of the key is in the past. Delete it instead.")
             if keep_admin and is_admin(before):
                 _check_admin([after if key is before else key for key in keys], now)
             changing.put(after)

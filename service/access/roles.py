@@ -115,7 +115,7 @@ OPERATIONS: dict[str, Rule] = {
     "create_key": Rule("admin", "all", changes=True),
     "read_key": Rule("admin", "all"),
     "narrow_key": Rule("admin", "all", changes=True),
-    "revoke_key": Rule("admin", "all", changes=True),
+    "delete_key": Rule("admin", "all", changes=True),
     "read_audit": Rule("admin", "all"),
     # Maps
     "list_maps": Rule("query", "shown"),
@@ -129,8 +129,8 @@ OPERATIONS: dict[str, Rule] = {
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
-    "forget_place": Rule("enrol", "path", changes=True),
-    "forget_places": Rule("enrol", "path", changes=True),
+    "delete_place": Rule("enrol", "path", changes=True),
+    "delete_places": Rule("enrol", "path", changes=True),
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path"),
@@ -140,7 +140,7 @@ OPERATIONS: dict[str, Rule] = {
     "list_cameras": Rule("query", "path"),
     "read_camera": Rule("query", "path"),
     "put_camera": Rule("enrol", "path", changes=True),
-    "forget_camera": Rule("enrol", "path", changes=True),
+    "delete_camera": Rule("enrol", "path", changes=True),
     # Queries
     "query": Rule("query", "path"),
     "query_batch": Rule("query", "path"),

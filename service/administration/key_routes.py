@@ -1,4 +1,4 @@
-"""Routes of keys: create, list, read, narrow and revoke them; and who asks.
+"""Routes of keys: create, list, read, narrow and delete them; and who asks.
 
 A change is on disk when it is answered, and counts for every later request.  The command line changes the same file
 (``placerec keys``), so a service that nobody may manage any more can be opened again on its own machine.
@@ -33,6 +33,7 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.openapi import json_patch
 from service.http.routing import (
+    WHOLE_DELETION,
     EngineDep,
     FromState,
     Page,
@@ -161,11 +162,11 @@ def narrow_key(
     return KeyView.of(key, principal.key_id)
 
 
-@router.delete("/{key}", responses=problem_documentation(UnknownKey, LastAdminKey))
-def revoke_key(
+@router.delete("/{key}", dependencies=[WHOLE_DELETION], responses=problem_documentation(UnknownKey, LastAdminKey))
+def delete_key(
     key_id: KeyId, request: Request, gate: GateDep, store: StoreDep, principal: PrincipalDep, lock_out: LockOut = False
 ) -> KeyView:
-    """Revoke a key: no later request is let in with it. Repeating this changes nothing."""
+    """Delete a key: it is revoked, so that no later request is let in with it. Repeating this changes nothing."""
     request.state.noted = _noted({"key": key_id})
     store.find(key_id)  # the store would also take a name
     key = store.revoke(key_id, keep_admin=not lock_out)

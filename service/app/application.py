@@ -174,6 +174,20 @@ async def _method_not_allowed(request: Request, _error: Exception) -> Response:
     return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
 
 
+class WholeSegments:
+    """ASGI middleware that has nothing at a path with a slash inside a segment (``%2F``).
+
+    Servers decode a path before it is taken apart, and so do some proxies: such a name would choose another operation.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        has_slash = scope["type"] != "lifespan" and b"%2f" in scope.get("raw_path", b"").lower()
+        await (_not_found if has_slash else self.app)(scope, receive, send)
+
+
 async def _not_found(scope: Scope, receive: Receive, send: Send) -> None:
     """Answer 404 if a path has no route; the framework would answer a WebSocket with an empty 403."""
     error = HTTPException(404)
@@ -257,6 +271,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     app.add_exception_handler(405, _method_not_allowed)
     app.router.routes.extend(_routes())
     app.router.default = _not_found
+    app.router.middleware_stack = WholeSegments(app.router.middleware_stack)  # where a 404 is answered as a problem
     app.state.gate, app.state.key_store = gate, store
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)

@@ -100,7 +100,7 @@ def _measure_service(
     from core.evaluation.samples import jpeg, sample_frame
     from service.commands.load import measure
 
-    path = "/v1/encode" if map_id is None else path_of("maps", map_id, "query")
+    path = path_of("encode") if map_id is None else path_of("maps", map_id, "query")
     version = ask(Target(url, None), "GET", "/version").json()
     frames = [read_bytes(image)] if image else [jpeg(sample_frame(index)) for index in range(FRAMES)]
     seen: dict[str, Any] = {}

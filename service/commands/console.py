@@ -34,17 +34,26 @@ messages = Console(stderr=True)
 """Standard error: progress, remarks, errors."""
 
 
+RENAMED = {"forget": "delete", "revoke": "delete"}
+"""Commands by the names that they had once."""
+
+
 class Failure(Exception):
     """A command failed for a foreseen reason, which its text tells the user."""
 
 
 class Commands(TyperGroup):
-    """A group of commands that ends foreseen errors with a message and exit status 1, without a traceback."""
+    """A group of commands that ends foreseen errors with a message and exit status 1, without a traceback.
+
+    A command is also refused, with exit status 2, by a name that it had once; the message has its present one.
+    """
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         found = super().get_command(ctx, cmd_name)
         if found is not None:
             add_key(found)
+        elif (new := RENAMED.get(cmd_name)) is not None and super().get_command(ctx, new) is not None:
+            ctx.fail(f"`{ctx.command_path} {cmd_name}` is `{ctx.command_path} {new}` now: use {new}.")
         return found
 
     def invoke(self, ctx: Any) -> Any:

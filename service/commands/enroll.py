@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from pydantic import BaseModel, ValidationError
 from rich.markup import escape
 
-from core.places import Sequence as SequenceName
+from core.errors import InvalidIdentifier
+from core.places import check_sequence
 from service.commands.connection.batches import Frame, Outcome, enrol_frames
 from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress
 from service.commands.jobs import show_outcome, submit
 from service.commands.recordings import (
+    PANEL,
     EveryChange,
     EveryDegrees,
     EveryMetres,
@@ -30,6 +31,7 @@ from service.commands.recordings import (
     Topic,
     TrajectoryFile,
     TrajectoryTimes,
+    without_standing,
 )
 
 
@@ -90,6 +92,14 @@ def enroll(
     every_degrees: EveryDegrees = None,
     every_seconds: EverySeconds = None,
     every_change: EveryChange = None,
+    keep_standing: Annotated[
+        bool,
+        typer.Option(
+            "--keep-standing",
+            help="Of a bag or a video: also enrol the frames in which nothing changes, as where the robot stood.",
+            rich_help_panel=PANEL,
+        ),
+    ] = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -98,8 +108,8 @@ def enroll(
     A directory of images is taken in natural order. Poses come from places.csv in it
     (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
     images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
-    stamps, of which their ids are made; those of a video are numbered. What is neither JPEG nor PNG nor WebP is sent
-    as PNG.
+    stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
+    shows, as where the robot stood, are left out. What is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
     """
     options = RecordingOptions(
@@ -119,7 +129,9 @@ def enroll(
         name = _checked_sequence(opened.name if sequence is None else sequence)
 
         def choose(used: str | None) -> list[Frame]:
-            return [Frame(taken, name, camera) for taken in options.choose(opened, used)]
+            chosen = options.choose(opened, used)
+            chosen = chosen if keep_standing else without_standing(opened, chosen)
+            return [Frame(taken, name, camera) for taken in chosen]
 
         report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, name, frames, time.monotonic() - began)
@@ -129,10 +141,6 @@ def enroll(
         raise typer.Exit(1)
 
 
-class _Sequence(BaseModel):
-    name: SequenceName
-
-
 def _checked_sequence(name: str) -> str:
     """Return ``name`` if a traverse may have it.
 
@@ -140,9 +148,9 @@ def _checked_sequence(name: str) -> str:
         Failure: a traverse may not have this name.
     """
     try:
-        return _Sequence(name=name).name
-    except ValidationError as error:
-        raise Failure(f"A sequence cannot have the name {name!r}; give another one with --sequence.") from error
+        return check_sequence(name)
+    except InvalidIdentifier as error:
+        raise Failure(f"{error} Give another one with --sequence.") from error
 
 
 def _show_aligned(job: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""``placerec keys``: create, list and revoke the keys of a data directory, which a service may be using."""
+"""``placerec keys``: create, list and delete the keys of a data directory, which a service may be using."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.commands.console import Commands, Failure, remark, show, show_json,
 if TYPE_CHECKING:
     from service.access.keys import Key, KeyRecords, KeyState
 
-keys = typer.Typer(cls=Commands, help="Create, list and revoke the keys of a data directory.", no_args_is_help=True)
+keys = typer.Typer(cls=Commands, help="Create, list and delete the keys of a data directory.", no_args_is_help=True)
 
 UNITS = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 SPAN = re.compile(r"([0-9]{1,6})([mhdw])")
@@ -71,15 +71,15 @@ def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
         remark("No key was ever created, so the service needs none.")
 
 
-@keys.command("revoke")
-def revoke(
+@keys.command("delete")
+def delete(
     wanted: Annotated[str, typer.Argument(metavar="ID|NAME", help="Id or name of the key.", show_default=False)],
     data_dir: DataDir = None,
 ) -> None:
-    """Revoke a key, so that nobody is let in with it; a running service knows within a second."""
+    """Delete a key: it is revoked, so that nobody is let in with it; a running service knows within a second."""
     store = _store(data_dir)
-    revoked = store.revoke(wanted)
-    remark(f"The key {revoked.name} ({revoked.id}) is revoked.")
+    deleted = store.revoke(wanted)
+    remark(f"The key {deleted.name} ({deleted.id}) is deleted.")
     if not any(_state_of(other) == "in force" for other in store.all()):
         remark("No key is in force now: the service refuses every request that needs one.")
 

@@ -13,7 +13,11 @@ from service.commands.console import Commands, Failure, remark
 if TYPE_CHECKING:
     from service.ray_serve.cluster import Cluster
 
-ray = typer.Typer(cls=Commands, help="Deploy the encoders in a Ray cluster, and look at them.", no_args_is_help=True)
+ray = typer.Typer(
+    cls=Commands,
+    help="Start nodes of a Ray cluster, deploy the encoders in it, and look at them.",
+    no_args_is_help=True,
+)
 
 Address = Annotated[
     str | None, typer.Option(help="Of the cluster, host:port; default: PLACEREC_RAY_ADDRESS.", show_default=False)
@@ -21,6 +25,20 @@ Address = Annotated[
 
 LOOK_SECONDS = 0.5
 """Seconds between two looks at a rollout."""
+
+
+@ray.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def start(context: typer.Context) -> None:
+    """Start a node of Ray on this machine, with the options of Ray's own command, such as --head and --block.
+
+    Unlike ray start it has no dashboard, reports to nobody, and does not let encoders wait for everything else that the
+    machine does.
+    """
+    from service.ray_serve import check_installed
+    from service.ray_serve.cluster import start_node
+
+    check_installed()
+    start_node(context.args)
 
 
 @ray.command("deploy")

@@ -150,6 +150,35 @@ class RecordingOptions:
         return chosen
 
 
+def without_standing(recording: Recording, frames: list[Frame]) -> list[Frame]:
+    """The frames of a bag or a video without those in which nothing has changed; says how many these are.
+
+    The frames of a folder all stay, for somebody chose them.
+    """
+    if not recording.continuous:
+        return frames
+    from core.belief.view import STILL, View, view_of
+    from core.errors import InvalidImage, InvalidRecording
+    from core.frames.images import decode
+    from core.recordings.keyframes import moving
+
+    def look(frame: Frame) -> View | None:
+        try:
+            return view_of(decode(frame.load()))
+        except (InvalidImage, InvalidRecording, OSError):
+            return None  # what is wrong with it is said where it is sent
+
+    with progress() as bar:
+        task = bar.add_task("Looking for stops", total=len(frames))
+        kept = list(moving(bar.track(frames, task_id=task), look, lambda one, other: one.change(other) < STILL))
+    if left_out := len(frames) - len(kept):
+        remark(
+            f"{left_out} of {len(frames)} frames show the same as the frame before them, as where the robot stood, and "
+            "are left out; --keep-standing enrols them."
+        )
+    return kept
+
+
 def describer(encoder: str | None) -> Describe:
     """What describes frames by an encoder that is installed here; frames that cannot be used have no descriptor."""
     import numpy as np

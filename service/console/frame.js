@@ -1,5 +1,5 @@
 // The frame around every view: where one can go, who one is, whether the service is there, and what is being said.
-import { caller, checkConnection, epoch, everyMap, get, identify, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { caller, checkConnection, epoch, everyMap, get, identify, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
 import { html, signal, useEffect, useState } from "./shared/view.js";
@@ -59,6 +59,7 @@ function skip(event) {
 // The view that the address names
 
 function viewOf({ parts }) {
+  if (!parts.every(isName)) return { name: "", entry: null, map: null, rest: [] };
   const [first = "maps", map, second = "plan", ...rest] = parts;
   if (first === "maps" && map !== undefined) return { name: second, entry: OF_MAPS[second], map, rest };
   return { name: first, entry: OF_SERVICE[first], map: null, rest: parts.slice(1) };

@@ -96,7 +96,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownMap: Kind(404, "unknown-map", "The map does not exist"),
     errors.MapExists: Kind(409, "map-exists", "A map of this id already exists"),
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
-    errors.TooManyToForget: Kind(422, "too-many-to-forget", "Too many places would be forgotten at once"),
+    errors.TooManyToDelete: Kind(422, "too-many-to-delete", "Too many places would be deleted at once"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
     errors.UnknownFrame: Kind(404, "unknown-frame", "The frame is not kept for review"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),

@@ -155,7 +155,7 @@ _MADE_JOB = {"job": "$response.body#/id"}
 _JOB = {"job": "$request.path.job"}
 
 LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
-    "create_key": {"201": dict.fromkeys(("read_key", "narrow_key", "revoke_key"), _MADE_KEY)},
+    "create_key": {"201": dict.fromkeys(("read_key", "narrow_key", "delete_key"), _MADE_KEY)},
     "create_map": {
         "201": dict.fromkeys(
             (
@@ -178,12 +178,12 @@ LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
     },
     "delete_map": {"204": dict.fromkeys(("read_map", "list_places"), _MAP)},
     "enrol_place": {
-        "201": dict.fromkeys(("read_place", "edit_place", "see_thumbnail", "forget_place"), _PLACE)
+        "201": dict.fromkeys(("read_place", "edit_place", "see_thumbnail", "delete_place"), _PLACE)
         | dict.fromkeys(("query", "list_places", "list_sequences"), _MAP)
     },
-    "forget_place": {"204": {"read_place": _PLACE}},
-    "put_camera": {"201": dict.fromkeys(("read_camera", "forget_camera"), _CAMERA)},
-    "forget_camera": {"204": {"read_camera": _CAMERA}},
+    "delete_place": {"204": {"read_place": _PLACE}},
+    "put_camera": {"201": dict.fromkeys(("read_camera", "delete_camera"), _CAMERA)},
+    "delete_camera": {"204": {"read_camera": _CAMERA}},
     "create_session": {"201": dict.fromkeys(("send_frame", "read_session", "delete_session"), _SESSION)},
     "delete_session": {"204": {"read_session": _SAME_SESSION}},
     "reencode_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},

@@ -21,7 +21,7 @@ from starlette.responses import Response
 
 from core.errors import InvalidIdentifier
 from core.maps import Map
-from core.places import check_map_id, check_place_id
+from core.places import check_map_id, check_place_id, check_sequence
 from service.access.roles import Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
@@ -41,6 +41,23 @@ class FromState:
 
     async def __call__(self, request: Request) -> Any:
         return getattr(request.app.state, self.name)
+
+
+async def _whole_deletion(request: Request) -> None:
+    """Refuse a deletion that says more than its path: whoever says more means to delete less.
+
+    Raises:
+        InvalidRequest: the query string has a parameter that the operation does not know, or there is a body.
+    """
+    known = {one.alias for one in request.scope["route"].dependant.query_params}
+    if unknown := [name for name in request.query_params if name not in known]:
+        raise InvalidRequest(f"query.{unknown[0][:80]}: A deletion takes no such parameter; nothing was deleted.")
+    if await request.body():
+        raise InvalidRequest("A deletion takes no body; nothing was deleted.")
+
+
+WHOLE_DELETION = Depends(_whole_deletion)
+"""What every DELETE depends on."""
 
 
 async def _principal(request: Request) -> Principal:
@@ -144,7 +161,11 @@ MapId = Annotated[str, Path(alias="map", description="Id of the map.", examples=
 PlaceId = Annotated[
     str, Path(alias="place", description="Id of the place.", examples=["p7"]), AfterValidator(check_place_id)
 ]
-SequenceName = Annotated[str, Path(alias="sequence", description="Name of the traverse.", examples=["monday"])]
+SequenceName = Annotated[
+    str,
+    Path(alias="sequence", description="Name of the traverse.", examples=["monday"]),
+    AfterValidator(check_sequence),
+]
 IfMatch = Annotated[
     str | None,
     Header(alias="If-Match", description="The ETag of the map as it was read; 412 if the map has changed since."),

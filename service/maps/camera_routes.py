@@ -11,7 +11,7 @@ from core import errors
 from core.places import Camera
 from service.errors.faults import UnsupportedMediaType
 from service.errors.problems import problem_documentation
-from service.http.routing import EngineDep, MapId, StrictRoute, json_body, single_values
+from service.http.routing import WHOLE_DELETION, EngineDep, MapId, StrictRoute, json_body, single_values
 from service.maps.map_events import tell_map
 from service.maps.schemas import CameraDefinition, CameraList, CameraView
 
@@ -63,9 +63,14 @@ def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraVie
     return CameraView(**engine.maps.get(map_id).cameras.find(name).__dict__)
 
 
-@router.delete("/{camera}", status_code=204, responses=problem_documentation(errors.UnknownCamera, errors.StorageFull))
-def forget_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
-    """Forget a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
+@router.delete(
+    "/{camera}",
+    status_code=204,
+    dependencies=[WHOLE_DELETION],
+    responses=problem_documentation(errors.UnknownCamera, errors.StorageFull),
+)
+def delete_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
+    """Delete a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
     map_ = engine.maps.get(map_id)
     map_.cameras.forget(name)
     tell_map(engine, map_, "cameras")

@@ -19,7 +19,17 @@ from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, Too
 from service.errors.problems import problem_documentation
 from service.http.headers import entity_tag, expected_revision
 from service.http.openapi import json_patch
-from service.http.routing import EngineDep, IfMatch, MapId, Page, PrincipalDep, StrictRoute, json_body, single_values
+from service.http.routing import (
+    WHOLE_DELETION,
+    EngineDep,
+    IfMatch,
+    MapId,
+    Page,
+    PrincipalDep,
+    StrictRoute,
+    json_body,
+    single_values,
+)
 from service.http.schemas import PageParameters
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
@@ -232,7 +242,12 @@ def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | No
     return Calibration(**values)
 
 
-@router.delete("/{map}", status_code=204, responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch))
+@router.delete(
+    "/{map}",
+    status_code=204,
+    dependencies=[WHOLE_DELETION],
+    responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch),
+)
 def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
     """Delete a map with everything that it contains. A damaged map can be deleted, too."""
     if if_match is not None:

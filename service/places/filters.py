@@ -1,4 +1,4 @@
-"""Which places a listing shows, and which places are forgotten together."""
+"""Which places a listing shows, and which places are deleted together."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fastapi import Query
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.maps.place_filter import PlaceFilter, Scalar
-from core.places import Camera, Sequence, Timestamp
+from core.places import Camera, Timestamp
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
 from service.http.schemas import PageParameters
@@ -17,8 +17,8 @@ from service.http.schemas import PageParameters
 MOST_NAMES = 100
 """The most sequences, and the most keys of metadata, that one request may name."""
 
-MOST_FORGOTTEN = 10_000
-"""Places that one request may forget."""
+MOST_DELETED = 10_000
+"""Places that one request may delete."""
 
 
 def parsed_json(text: str, what: str) -> Any:
@@ -91,7 +91,7 @@ class PlaceConditions(BaseModel):
         extra="forbid", json_schema_extra={"examples": [{"sequence": "monday", "where": {"floor": 2}}]}
     )
 
-    sequence: Sequence | None = Field(default=None, description="It belongs to this traverse.")
+    sequence: str | None = Field(default=None, max_length=128, description="It belongs to this traverse.")
     camera: Camera | None = Field(default=None, description="This camera took its frame.")
     after: Timestamp | None = Field(default=None, description="It has this timestamp or a later one.")
     before: Timestamp | None = Field(default=None, description="It has this timestamp or an earlier one.")
@@ -100,28 +100,28 @@ class PlaceConditions(BaseModel):
     )
 
 
-FORGETTING_EXAMPLES: tuple[Any, ...] = (
+DELETION_EXAMPLES: tuple[Any, ...] = (
     {"ids": ["p7", "p8"], "dry_run": False},
     {"filter": {"sequence": "monday", "before": "2026-11-20T10:00:00Z"}},
 )
 
 
-class Forgetting(BaseModel):
-    """Which places to forget: those of some ids, or those that fulfil some conditions."""
+class Deletion(BaseModel):
+    """Which places to delete: those of some ids, or those that fulfil some conditions."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [*FORGETTING_EXAMPLES]})
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [*DELETION_EXAMPLES]})
 
     ids: list[Annotated[str, Field(max_length=128)]] | None = Field(
         default=None,
         min_length=1,
-        max_length=MOST_FORGOTTEN,
+        max_length=MOST_DELETED,
         description="Ids of places; those that are gone are told.",
     )
     filter: PlaceConditions | None = Field(default=None, description="Conditions, at least one.")
-    dry_run: bool = Field(strict=True, default=True, description="Only say which places would be forgotten.")
+    dry_run: bool = Field(strict=True, default=True, description="Only say which places would be deleted.")
 
     @model_validator(mode="after")
-    def _says_which(self) -> Forgetting:
+    def _says_which(self) -> Deletion:
         if (self.ids is None) == (self.filter is None):
             raise ValueError("give either ids or a filter")
         return self
@@ -140,12 +140,12 @@ class Forgetting(BaseModel):
         metadata = {} if given.where is None else checked_metadata(given.where)
         made = PlaceFilter(None, given.sequence, given.camera, given.after, given.before, metadata)
         if not made:
-            raise InvalidRequest("filter: give at least one condition; to forget all places, delete the map.")
+            raise InvalidRequest("filter: give at least one condition; to delete all places, delete the map.")
         return made
 
 
-class ForgottenPlaces(BaseModel):
-    """Places that were forgotten or, in a dry run, would be."""
+class DeletedPlaces(BaseModel):
+    """Places that were deleted or, in a dry run, would be."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"dry_run": True, "places": 2, "ids": ["p7", "p8"], "missing": []}]}

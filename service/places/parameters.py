@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from core.names import word
 from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
 from service.http.bodies import json_size
@@ -81,7 +82,7 @@ class EnrolParameters(PlaceDescription):
         return self.fields(metadata, settings)
 
 
-BatchName = Annotated[str | None, Field(pattern=r"^[A-Za-z0-9._~-]{1,64}$", examples=["monday-17"])]
+BatchName = Annotated[str | None, Field(pattern=f"^{word(64)}$", examples=["monday-17"])]
 
 
 class BatchParameters(Parameters):

@@ -27,6 +27,7 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.openapi import form_body, frame_body, json_patch
 from service.http.routing import (
+    WHOLE_DELETION,
     DeadlineDep,
     EngineDep,
     FromState,
@@ -50,14 +51,14 @@ from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
 from service.places.enrolment import FrameToEnrol, enrol
-from service.places.filters import MOST_FORGOTTEN, Forgetting, ForgottenPlaces, PlacePageQuery
+from service.places.filters import MOST_DELETED, DeletedPlaces, Deletion, PlacePageQuery
 from service.places.parameters import BatchParameters, EnrolParameters, check_metadata
 from service.places.place_events import tell_change, tell_deletion, tell_enrolment
 from service.places.schemas import (
     BatchResult,
     BatchResults,
+    DeletedSequence,
     EnrolledPlace,
-    ForgottenSequence,
     PlaceChanges,
     PlacePage,
     PlaceView,
@@ -250,27 +251,27 @@ def list_places(map_id: MapId, page: PlacePageQuery, engine: EngineDep) -> Place
 
 
 @router.post(
-    ":forget",
+    ":delete",
     dependencies=[Depends(json_body)],
     responses=problem_documentation(
-        UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.TooManyToForget, errors.StorageFull
+        UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.TooManyToDelete, errors.StorageFull
     ),
 )
-def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: EngineDep) -> ForgottenPlaces:
+def delete_places(map_id: MapId, order: Deletion, request: Request, engine: EngineDep) -> DeletedPlaces:
     """Delete many places in one commit, by their ids or by conditions; by default, only say which these would be.
 
     To delete exactly the places that a dry run named, send their ids. At most 10 000 places are deleted at once.
     """
     map_, wanted = engine.maps.get(map_id), order.wanted()
     choose = map_.ids_of if order.dry_run else map_.forget_all
-    found = choose(wanted, MOST_FORGOTTEN)
+    found = choose(wanted, MOST_DELETED)
     changed = {} if found and not order.dry_run else {"change": None}
     if not order.dry_run:
         tell_change(engine, map_, "deleted", len(found))
     request.state.noted = {"map": map_id, "places": len(found), **changed}
     there = set(found)
     missing = [place_id for place_id in wanted.ids or () if place_id not in there]
-    return ForgottenPlaces(dry_run=order.dry_run, places=len(found), ids=found, missing=missing)
+    return DeletedPlaces(dry_run=order.dry_run, places=len(found), ids=found, missing=missing)
 
 
 @router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))
@@ -296,8 +297,13 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
     return PlaceView.of(place)
 
 
-@router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
-def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
+@router.delete(
+    "/{place}",
+    status_code=204,
+    dependencies=[WHOLE_DELETION],
+    responses=problem_documentation(errors.UnknownPlace, errors.StorageFull),
+)
+def delete_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     """Delete a place: no later query finds it."""
     map_ = engine.maps.get(map_id)
     map_.forget(place_id)
@@ -325,11 +331,11 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
     return SequencePage(items=summaries, next_cursor=next_cursor)
 
 
-@traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
-def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
+@traverses.delete("/{sequence}", dependencies=[WHOLE_DELETION], responses=problem_documentation(errors.UnknownSequence))
+def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> DeletedSequence:
     """Delete all places of a traverse at once."""
     map_ = engine.maps.get(map_id)
     count = map_.forget_sequence(sequence)
     tell_change(engine, map_, "deleted", count, sequence)
     request.state.noted = {"places": count}
-    return ForgottenSequence(name=sequence, places=count)
+    return DeletedSequence(name=sequence, places=count)

@@ -131,7 +131,7 @@ class SequencePage(BaseModel):
     next_cursor: Cursor
 
 
-class ForgottenSequence(BaseModel):
+class DeletedSequence(BaseModel):
     """A deleted traverse."""
 
     name: str

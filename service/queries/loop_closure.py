@@ -9,6 +9,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from core import errors
+from core.belief import view_of
 from core.maps import Map
 from core.maps.selection import Selection
 from core.places import Place, check_place_id
@@ -51,7 +52,7 @@ class Closure:
     """The result of a loop closure.
 
     answer: the answer of the map before the frame was enrolled.
-    enrolled: the frame's own place; None if the frame shows, or may show, another place.
+    enrolled: the frame's own place; None if the frame shows, or may show, another place, or hardly anything.
     created: whether the place was created by this request.
     """
 
@@ -70,6 +71,8 @@ def close_loop(
     verify: Verify,
 ) -> Closure:
     """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
+
+    A uniform view, such as that of a covered camera, is not enrolled: every other one would be found to show its place.
 
     The map is locked meanwhile: if two frames of one new place arrive together, the second finds the first.  A
     repeated request gets the same answer as the first one, because its own place is left out of the search.
@@ -96,7 +99,7 @@ def close_loop(
         (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection, [verifier])
         if known is not None:
             return Closure(answer, map_.place(frame.id), created=False)
-        if answer.judgement.verdict != "unknown":
+        if answer.judgement.verdict != "unknown" or view_of(encoded.pixels, frame.mask).uniform:
             return Closure(answer, None, created=False)
         ((place, change),) = map_.enrol([enrolment])
         tell_enrolment(engine, map_, [(place, change)])
@@ -138,7 +141,7 @@ async def query_or_enrol(
     If two robots send the same new place at the same time, one enrols it and the other finds it. A request can be
     repeated until it succeeds: the same frame with the same id is located among the other places, and not enrolled
     again. `exclude_frames` and `exclude_seconds` keep a robot from finding its own last frames. A frame without
-    regions is not enrolled.
+    regions is not enrolled, nor is one that shows hardly anything, as behind a covered lens.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     selection = options.selection()

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.judgement.background import GUARD_FACTOR
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
@@ -20,6 +21,7 @@ from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
 from core.upkeep.drift import Trend, score_trend, unknown_trend
 from core.upkeep.hubness import Alias
+from core.upkeep.redundancy import stops
 from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
 from service.queries.statistics import Statistics
 from service.upkeep.schemas import (
@@ -30,6 +32,7 @@ from service.upkeep.schemas import (
     HubView,
     MapHealth,
     SilentPlaces,
+    StopView,
     StretchView,
     TrendView,
     WeekView,
@@ -96,6 +99,12 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         for gap in walk.gaps
     ]
     gaps.sort(key=lambda gap: -gap.severity)
+    standing = [
+        StopView(
+            sequence=own.places[stop.places[0]].sequence or "", place=names[stop.places[0]], frames=len(stop.places)
+        )
+        for stop in stops(own.where)
+    ]
     return MapHealth(
         map=map_.record.id,
         places=len(own),
@@ -105,6 +114,8 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         aliasing=_aliasing_view(own, aliasing, statistics, limit),
         gaps=gaps[:limit],
         gap_count=len(gaps),
+        stops=standing[:limit],
+        stop_count=len(standing),
         retraverse=_retraverse(own, walks, aliasing, statistics, set(silent))[:limit],
     )
 
@@ -164,7 +175,7 @@ def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
         some = order[done : done + TOGETHER]
         for position, others, scores in own.search(some):
             same = own.near(position, others)
-            best, found = hubness.nearest_others(scores, same, k)
+            best, found = hubness.nearest_others(scores, own.near(position, others, GUARD_FACTOR), k)
             lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is -1 and picks the appended NONE
             mine = float(scores[same].max()) if same.any() else None
             has_own = same.any() or own.near(position, everything[everything != position]).any()

@@ -20,7 +20,7 @@ from core.maps import Enrolment, History, Map, Snapshot
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
-from core.places import PlaceFields, check_place_id
+from core.places import check_place_id
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
 from service.engine.engine import Engine
@@ -284,15 +284,14 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
     items = []
     for (place, name), descriptor, cells, of_frame in zip(ready, descriptors, local, keypoints, strict=True):
         stored = found[place.id][0]
-        fields = {field: getattr(stored, field) for field in PlaceFields.model_fields}
-        if stored.sequence is not None:
-            fields["sequence"] = names["sequences"].get(stored.sequence, stored.sequence)
-        if stored.camera is not None:
-            fields["camera"] = names["cameras"].get(stored.camera, stored.camera)
+        called = {
+            "sequence": names["sequences"].get(stored.sequence, stored.sequence),
+            "camera": names["cameras"].get(stored.camera, stored.camera),
+        }
         picture = pictures[place.id]
         item = Enrolment(
             id=name,
-            fields=PlaceFields(**fields),
+            fields=stored.fields().model_copy(update=called),
             descriptor=descriptor,
             regions=stored.regions,
             digest=place.digest,
@@ -301,7 +300,7 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             image=picture if stored.picture == "image" else None,
             keypoints=of_frame,
         )
-        ordinal = ends.get(fields["sequence"] or "", 0) + place.ordinal
+        ordinal = ends.get(called["sequence"] or "", 0) + place.ordinal
         items.append((item, History(stored.picture, ordinal, stored.created_at, stored.updated_at)))
     map_.transfer.adopt(items)
 

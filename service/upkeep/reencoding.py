@@ -18,7 +18,6 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
 from core.maps import Enrolment, History, Map
 from core.maps.records import Outline
-from core.places import PlaceFields
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
 from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_after_requests
@@ -190,8 +189,9 @@ class _Reencoding:
         keypoints: Keypoints | None,
     ) -> tuple[Enrolment, History]:
         stored = fields[place.id][0]
-        kept = PlaceFields(**{name: getattr(stored, name) for name in PlaceFields.model_fields})
-        item = Enrolment(place.id, kept, descriptor, regions, place.digest, local, image=image, keypoints=keypoints)
+        item = Enrolment(
+            place.id, stored.fields(), descriptor, regions, place.digest, local, image=image, keypoints=keypoints
+        )
         return item, History("image", place.ordinal, stored.created_at, stored.updated_at)
 
     def _mask(self, camera: str | None) -> Mask | None:

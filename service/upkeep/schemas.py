@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.names import word
 from core.places import Sequence, Timestamp
 from core.upkeep.coverage import Measure
 from core.upkeep.revisits import Reason
@@ -100,7 +101,7 @@ class Merging(BaseModel):
     )
     prefix: str | None = Field(
         default=None,
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9._~-]{0,63}$",
+        pattern=f"^{word(64)}$",
         description="Put before names on conflict; if left out, the other map's id and a hyphen.",
     )
     sample: int = Field(
@@ -213,6 +214,14 @@ class GapView(BaseModel):
     )
 
 
+class StopView(BaseModel):
+    """Frames of one view, as where the robot stood while it mapped; pruning removes most of them."""
+
+    sequence: str
+    place: str = Field(description="The first of them.")
+    frames: int = Field(description="How many frames of the sequence show this view.")
+
+
 class StretchView(BaseModel):
     """A stretch of a sequence that should be recorded again."""
 
@@ -260,6 +269,8 @@ HEALTH_EXAMPLE: dict[str, Any] = {
         }
     ],
     "gap_count": 1,
+    "stops": [{"sequence": "monday", "place": "p57", "frames": 127}],
+    "stop_count": 1,
     "retraverse": [{"sequence": "monday", "first": "p39", "last": "p42", "reasons": ["distance-gap"], "weight": 3.0}],
 }
 
@@ -277,6 +288,8 @@ class MapHealth(BaseModel):
     aliasing: AliasingView
     gaps: list[GapView] = Field(description="The most severe gaps come first.")
     gap_count: int
+    stops: list[StopView] = Field(description="Views of ten frames or more; those of most frames come first.")
+    stop_count: int
     retraverse: list[StretchView] = Field(description="Stretches that should be recorded again, the most urgent first.")
 
 

@@ -78,3 +78,32 @@ def test_of_other_places_at_one_station_only_the_first_counts() -> None:
     assert np.flatnonzero(where.others(1, Neighborhood(1, 1))).tolist() == [0, 3, 6, 7]
     alone = Whereabouts(*columns)
     np.testing.assert_array_equal(alone.others(1, Neighborhood(1, 1)), ~alone.near(1, Neighborhood(1, 1)))
+
+
+def stood() -> Whereabouts:
+    """A walk of six views, in the third and the fifth of which the robot stood."""
+    return Whereabouts.along_sequence([0, 1, 2, 2, 2, 3, 4, 4, 4, 4, 5])
+
+
+def test_frames_of_one_view_are_one_place_and_count_once_elsewhere() -> None:
+    where = stood()
+    assert np.flatnonzero(where.near(3, NEARBY)).tolist() == [1, 2, 3, 4, 5]
+    assert np.flatnonzero(where.others(3, NEARBY)).tolist() == [0, 6, 10]
+    assert np.flatnonzero(where.repeats(np.arange(len(where)))).tolist() == [3, 4, 7, 8, 9]
+    assert where.repeats(np.array([9, 7, 3, 2])).tolist() == [False, True, False, True]
+
+
+def test_places_without_a_sequence_are_no_frames_of_one_view() -> None:
+    where = stood()
+    where.sequence[:] = where.track[:] = NO_SEQUENCE
+    assert not where.repeats(np.arange(len(where))).any()
+    assert where.others(3, NEARBY).sum() == len(where) - 1
+
+
+@pytest.mark.parametrize(("metres", "same"), [(4.0, True), (14.0, True), (16.0, False)])
+def test_coarse_poses_of_one_view_may_be_a_little_farther_apart(metres: float, same: bool) -> None:
+    where = stood()
+    where.kind[:] = METRIC
+    where.position[4, 0] = metres
+    assert where.near(3, NEARBY)[4] == same
+    assert where.near(5, NEARBY)[4] == (metres <= 5)

@@ -28,6 +28,9 @@ ANY: Any = _Any()
 
 Fields = dict[str, Any]
 
+MOST_HIDDEN = 8
+"""A view may be hidden for so many positions of its sequence."""
+
 
 class Refused(Exception):
     """The operation must fail with the error of this name, and change nothing."""
@@ -110,7 +113,10 @@ def merged(target: Any, patch: Any) -> Any:
 
 @dataclass
 class MapModel:
-    """One map.  ``ends`` are the ordinals that come next in each sequence."""
+    """One map.  ``ends`` are the ordinals that come next in each sequence.
+
+    Frames of one picture show one view, those of different pictures do not.
+    """
 
     settings: dict[str, Any]
     precision: str = "half"
@@ -126,9 +132,19 @@ class MapModel:
     # Writes; each returns the answer that it must get
 
     def enrol(
-        self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None, keypoints: Any | None = None
+        self,
+        place_id: str,
+        shown: Shown,
+        fields: Fields,
+        keep: str | None = None,
+        keypoints: Any | None = None,
+        ordinal: int | None = None,
     ) -> str:
-        """Enrol a frame, with these keypoints or none; created, replaced, updated or unchanged."""
+        """Enrol a frame, with these keypoints or none; created, replaced, updated or unchanged.
+
+        Args:
+            ordinal: of a new place; None: that of its view.
+        """
         keypoints = keypoints if self.settings.get("verification", True) else None
         known = self.places.get(place_id)
         if known is not None and known.shown.digest == shown.digest:
@@ -136,11 +152,19 @@ class MapModel:
             return self.set_fields(place_id, fields)
         kept = self.settings["keep"] if keep is None else keep
         if known is None:
-            made = PlaceModel(shown, dict(fields), kept, self._next(fields.get("sequence")))
+            sequence = fields.get("sequence")
+            self.ends.setdefault(sequence, 0)
+            at = self._next(sequence, shown.digest) if ordinal is None else ordinal
+            made = PlaceModel(shown, dict(fields), kept, at)
             self.places[place_id] = made
         else:
             known.shown, known.kept = shown, kept
+            before = known.sequence
             self._place_in(known, fields)
+            beside = [place for place in self._along(known.sequence) if place.ordinal == known.ordinal]
+            beside = [place for place in beside if place is not known]
+            if known.sequence == before and beside and beside[0].shown.digest != shown.digest:
+                known.ordinal = self._next(known.sequence)
             known.track = known.pose_of = None
             made = known
         made.keypoints = keypoints
@@ -164,7 +188,7 @@ class MapModel:
         """Take over a place of another map with its history."""
         before = self.places.get(place_id)
         same = before is not None and before.shown.digest == of.shown.digest
-        self.enrol(place_id, of.shown, of.fields, of.kept, of.keypoints)
+        self.enrol(place_id, of.shown, of.fields, of.kept, of.keypoints, ordinal)
         place = self.places[place_id]
         place.created, place.updated = of.created, of.updated
         if not same:
@@ -220,7 +244,23 @@ class MapModel:
             raise Refused("UnknownPlace")
         return self.places[place_id]
 
-    def _next(self, sequence: str | None) -> int:
+    def _along(self, sequence: str | None) -> list[PlaceModel]:
+        """The places of a sequence in the order of their enrolment."""
+        return [place for place in self.places.values() if sequence is not None and place.sequence == sequence]
+
+    def _next(self, sequence: str | None, digest: str | None = None) -> int:
+        """The ordinal of the next frame of a sequence; that of the frame's view if it is given and there already."""
+        along = self._along(sequence) if digest is not None else []
+        if along:
+            last, end = along[-1].ordinal, self.ends[sequence]
+            hidden = min(self.settings["same_place_frames"], MOST_HIDDEN)
+            at = {last, *range(end - 1 - hidden, end)}
+            first = {place.ordinal: place.shown.digest for place in reversed(along) if place.ordinal in at}
+            if (along[-1].shown.digest, first[last]) == (digest, digest):
+                return last
+            for ordinal in sorted(first, reverse=True):
+                if first[ordinal] == digest:
+                    return ordinal
         ordinal = self.ends.setdefault(sequence, 0)
         self.ends[sequence] = ordinal + 1
         return ordinal
@@ -228,9 +268,11 @@ class MapModel:
     def _place_in(self, place: PlaceModel, fields: Fields) -> None:
         if canonical(place.fields)["pose"] != canonical(fields)["pose"]:
             place.pose_of = None
-        before, place.fields = place.sequence, dict(fields)
-        if place.sequence != before:
-            place.ordinal = self._next(place.sequence)
+        before, sequence = place.sequence, fields.get("sequence")
+        if sequence != before:
+            place.ordinal = self._next(sequence, place.shown.digest)
+        place.fields = dict(fields)
+        if sequence != before:
             self._drop_if_empty(before)
 
     def _drop_if_empty(self, sequence: str | None) -> None:

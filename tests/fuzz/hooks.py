@@ -67,12 +67,12 @@ class Fixtures:
 _fixtures: dict[str, Fixtures] = {}
 _DELETES = (
     "delete_map",
-    "forget_place",
+    "delete_place",
     "delete_sequence",
-    "forget_camera",
+    "delete_camera",
     "delete_session",
     "prune_map",
-    "revoke_key",
+    "delete_key",
 )
 
 

@@ -39,6 +39,7 @@ class Server:
         key: that the client sends.
         forked: start it off a process that has imported everything; not if it has a wrapper, or has to be where this
             process is, as in a network of its own.
+        port: that it listens on; a free one if left out.
     """
 
     def __init__(
@@ -48,12 +49,14 @@ class Server:
         wrapper: Sequence[str] = (),
         key: str | None = None,
         forked: bool = True,
+        port: int | None = None,
     ) -> None:
-        self.folder, self.port, self.key = folder, free_port(), key
+        self.folder, self.port, self.key = folder, port or free_port(), key
         self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
-        own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, **(settings or {})}
+        own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, "rehearsal": False}
+        own |= settings or {}
         environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
         self.process: ForkedServer | subprocess.Popen[bytes]
         if wrapper or not forked:
@@ -70,9 +73,9 @@ class Server:
         status = self.process.poll()
         assert status is None, f"the server ended with {status}:\n{self.log_file.read_text()[-4000:]}"
 
-    def wait(self, path: str = "/readyz") -> Server:
-        """Return when ``path`` answers 200."""
-        until = time.monotonic() + START_SECONDS
+    def wait(self, path: str = "/readyz", seconds: float = START_SECONDS) -> Server:
+        """Return when ``path`` answers 200, which is to be within so many seconds."""
+        until = time.monotonic() + seconds
         while time.monotonic() < until:
             self.check_running()
             try:

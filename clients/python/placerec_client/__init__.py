@@ -30,17 +30,21 @@ if TYPE_CHECKING:
     from placerec_client._sync.sessions import Session
     from placerec_client.batches import Enrolled, Located, NewPlace
     from placerec_client.errors import (
+        ClientClosed,
         ConnectionFailed,
         DeadlineExceeded,
         InvalidFrame,
+        InvalidName,
         JobCancelled,
         PlacerecError,
         Problem,
+        Renamed,
         TransferFailed,
         UnexpectedAnswer,
     )
     from placerec_client.events import MapEvent
     from placerec_client.frames import Frame, Picture
+    from placerec_client.odometry import Odometry
     from placerec_client.retry import Retry
 
 __version__ = VERSION
@@ -51,20 +55,24 @@ __all__ = [
     "AsyncMap",
     "AsyncSession",
     "Client",
+    "ClientClosed",
     "ConnectionFailed",
     "DeadlineExceeded",
     "Enrolled",
     "Frame",
     "InvalidFrame",
+    "InvalidName",
     "Job",
     "JobCancelled",
     "Located",
     "Map",
     "MapEvent",
     "NewPlace",
+    "Odometry",
     "Picture",
     "PlacerecError",
     "Problem",
+    "Renamed",
     "Retry",
     "Session",
     "TransferFailed",
@@ -86,11 +94,12 @@ _MODULES = {
     "_sync.sessions": ("Session",),
     "batches": ("Enrolled", "Located", "NewPlace"),
     "errors": (
-        *("ConnectionFailed", "DeadlineExceeded", "InvalidFrame", "JobCancelled", "PlacerecError", "Problem"),
-        *("TransferFailed", "UnexpectedAnswer"),
+        *("ClientClosed", "ConnectionFailed", "DeadlineExceeded", "InvalidFrame", "InvalidName", "JobCancelled"),
+        *("PlacerecError", "Problem", "Renamed", "TransferFailed", "UnexpectedAnswer"),
     ),
     "events": ("MapEvent",),
     "frames": ("Frame", "Picture"),
+    "odometry": ("Odometry",),
     "retry": ("Retry",),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}

@@ -17,6 +17,13 @@ class ConnectionFailed(PlacerecError):
     """No answer came: the service cannot be reached, or the connection was lost, or it took longer than ``timeout``."""
 
 
+class ClientClosed(PlacerecError):
+    """The client was closed: it sends nothing any more; another one has to be made."""
+
+    def __init__(self) -> None:
+        super().__init__("The client was closed; make another one to go on.")
+
+
 class DeadlineExceeded(PlacerecError):
     """No answer came before the deadline of the call."""
 
@@ -27,6 +34,21 @@ class UnexpectedAnswer(PlacerecError):
     def __init__(self, sentence: str, status: int = 200) -> None:
         super().__init__(sentence)
         self.status = status
+
+
+class InvalidName(PlacerecError, ValueError):
+    """Nothing can have this name: it is empty, ``.`` or ``..``, or has a slash. Nothing was sent."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name[:140]!a} is no name: it is empty, '.' or '..', or has a slash.")
+        self.name = name
+
+
+class Renamed(PlacerecError, AttributeError):
+    """A method has another name now, which the text says."""
+
+    def __init__(self, kind: str, old: str, new: str) -> None:
+        super().__init__(f"{kind}.{old} is {kind}.{new} now: use {new}.")
 
 
 class InvalidFrame(PlacerecError):

@@ -624,6 +624,22 @@ class CreatedKey(Model):
     key: str
 
 
+class DeletedPlaces(Model):
+    """Places that were deleted or, in a dry run, would be."""
+
+    dry_run: bool
+    places: int
+    ids: list[str]
+    missing: list[str]
+
+
+class DeletedSequence(Model):
+    """A deleted traverse."""
+
+    name: str
+    places: int
+
+
 class Descriptor(Model):
     """A frame's descriptor."""
 
@@ -735,22 +751,6 @@ class ExportedLabel(Model):
     enrolled: bool
     labelled_at: datetime
     labelled_by: str | None = None
-
-
-class ForgottenPlaces(Model):
-    """Places that were forgotten or, in a dry run, would be."""
-
-    dry_run: bool
-    places: int
-    ids: list[str]
-    missing: list[str]
-
-
-class ForgottenSequence(Model):
-    """A deleted traverse."""
-
-    name: str
-    places: int
 
 
 class FrameReport(Model):
@@ -955,6 +955,14 @@ class SilentPlaces(Model):
     places: list[str]
 
 
+class StopView(Model):
+    """Frames of one view, as where the robot stood while it mapped; pruning removes most of them."""
+
+    sequence: str
+    place: str
+    frames: int
+
+
 class StretchView(Model):
     """A stretch of a sequence that should be recorded again."""
 
@@ -976,6 +984,8 @@ class MapHealth(Model):
     aliasing: AliasingView
     gaps: list[GapView]
     gap_count: int
+    stops: list[StopView]
+    stop_count: int
     retraverse: list[StretchView]
 
 
@@ -1331,13 +1341,11 @@ class SessionAnswer(Model):
 class SessionView(Model):
     """A session as it is listed."""
 
-    filter: Known[Literal["bayes", "path"]] = "bayes"
-    advance: float = 1.0
+    advance: float | None = None
     backwards: bool = False
     speed_limit: float | None = None
     sequences: list[str] | None = None
     lag: int = 0
-    path_frames: int = 10
     camera: str | None = None
     verify: Known[Literal["auto", "always", "never"]] = "auto"
     expires_after: float | None = None
@@ -1361,13 +1369,11 @@ class SessionPage(Model):
 class SessionReport(Model):
     """A session and its present belief."""
 
-    filter: Known[Literal["bayes", "path"]] = "bayes"
-    advance: float = 1.0
+    advance: float | None = None
     backwards: bool = False
     speed_limit: float | None = None
     sequences: list[str] | None = None
     lag: int = 0
-    path_frames: int = 10
     camera: str | None = None
     verify: Known[Literal["auto", "always", "never"]] = "auto"
     expires_after: float | None = None

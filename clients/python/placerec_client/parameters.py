@@ -505,19 +505,40 @@ class SendFrame(TypedDict, total=False):
     """When the frame was taken; never before the last one."""
 
     forward: float | None
-    """Odometry: metres forward since the frame before, in the direction that the robot faced then."""
+    """Odometry: metres forward since the last frame that the service took in, in the direction that the robot faced
+    then.
+    """
 
     left: float | None
     """Odometry: metres to the left; with forward."""
 
     turn: float | None
-    """Odometry: degrees turned counter-clockwise since the frame before; with forward."""
+    """Odometry: degrees turned counter-clockwise since the last frame that the service took in; with forward."""
 
     deviation: float | None
     """Standard deviation of forward and left, metres."""
 
     turn_deviation: float | None
     """Standard deviation of turn, degrees."""
+
+    odometry_x: float | None
+    """Where odometry says that the robot is, in metres in odometry's own frame; instead of forward. The service
+    takes the motion since the last frame that it took in from it, so that none is lost or counted twice.
+    """
+
+    odometry_y: float | None
+    """Metres in odometry's frame; with odometry_x."""
+
+    odometry_heading: float | None
+    """Degrees counter-clockwise from +x of odometry's frame to where the camera looks; with odometry_x."""
+
+    odometry_covariance: str | Sequence[float] | None
+    """The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated by commas,
+    in metres and radians as in ROS; what it grows by is that of the motion.
+    """
+
+    odometry_origin: str | None
+    """A name for where odometry began. If the frame before had another one, the motion between the two is not known."""
 
     k: int
     """How many matches to list."""
@@ -669,7 +690,7 @@ class NarrowKey(TypedDict, total=False):
     """
 
 
-class RevokeKey(TypedDict, total=False):
+class DeleteKey(TypedDict, total=False):
     """Parameters of ``/v1/keys/{key}``."""
 
     lock_out: bool
@@ -771,18 +792,14 @@ class PlaceChanges(TypedDict, total=False):
 class NewSession(TypedDict, total=False):
     """The options of a session."""
 
-    filter: Literal["bayes", "path"]
-    """bayes: a hidden Markov model over the places. path: the best straight path through the last frames, as in
-    SeqSLAM; it uses neither odometry nor a speed limit.
-    """
-
-    advance: float
+    advance: float | None
     """By how many frames of the map's traverse the robot usually moves on from one frame to the next; used where
-    neither odometry nor a speed limit is given.
+    neither odometry nor a speed limit is given. By default it is not known: the session learns how fast the robot
+    goes, up to ten frames, and whether it stands or goes in reverse.
     """
 
     backwards: bool
-    """The robot may move against the traverse as well as along it."""
+    """With advance: the robot may move against the traverse as well as along it; without, it may anyway."""
 
     speed_limit: float | None
     """Metres per second. Every frame then needs a timestamp, and the places need poses."""
@@ -792,9 +809,6 @@ class NewSession(TypedDict, total=False):
 
     lag: int
     """Also estimate where the robot was so many frames ago, given all frames since."""
-
-    path_frames: int
-    """Frames of a path; for the filter path."""
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
@@ -934,8 +948,8 @@ class KeyChanges(TypedDict, total=False):
     """Not later than now; null: never."""
 
 
-class Forgetting(TypedDict, total=False):
-    """Which places to forget: those of some ids, or those that fulfil some conditions."""
+class Deletion(TypedDict, total=False):
+    """Which places to delete: those of some ids, or those that fulfil some conditions."""
 
     ids: Sequence[str] | None
     """Ids of places; those that are gone are told."""
@@ -944,7 +958,7 @@ class Forgetting(TypedDict, total=False):
     """Conditions, at least one."""
 
     dry_run: bool
-    """Only say which places would be forgotten."""
+    """Only say which places would be deleted."""
 
 
 class LabelOrder(TypedDict, total=False):

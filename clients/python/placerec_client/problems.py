@@ -297,8 +297,8 @@ class TooManyPairs(Problem):
     """422 ``too-many-pairs``: The traverses have too many frames to be compared."""
 
 
-class TooManyToForget(Problem):
-    """422 ``too-many-to-forget``: Too many places would be forgotten at once."""
+class TooManyToDelete(Problem):
+    """422 ``too-many-to-delete``: Too many places would be deleted at once."""
 
 
 class TruncatedImage(Problem):
@@ -522,7 +522,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "plan-too-large": PlanTooLarge,
     "too-few-frames": TooFewFrames,
     "too-many-pairs": TooManyPairs,
-    "too-many-to-forget": TooManyToForget,
+    "too-many-to-delete": TooManyToDelete,
     "truncated-image": TruncatedImage,
     "unfit-intrinsics": UnfitIntrinsics,
     "unknown-encoder": UnknownEncoder,

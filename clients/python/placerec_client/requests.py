@@ -10,15 +10,23 @@ from datetime import date
 from typing import Any
 from urllib.parse import quote, urlencode
 
-
-def path_of(*parts: str) -> str:
-    """The path ``/v1/…`` with these parts, which are quoted."""
-    return "/v1/" + "/".join(map(quoted, parts))
+from placerec_client.errors import InvalidName
 
 
-def quoted(part: str) -> str:
-    """One part of a path."""
-    return quote(part, safe="")
+def path_of(*segments: str | int, below: str = "/v1") -> str:
+    """The path of these segments, which are quoted, below another path; every path with a name in it is made here.
+
+    Whatever has to do with a URL on its way (httpx, a proxy, a browser) takes out a segment ``.``, and ``..`` together
+    with the one before it: the path would be that of something else. No name has a slash, which many unquote.
+
+    Raises:
+        InvalidName: a segment is one of these, or empty.
+    """
+    texts = [str(one) if isinstance(one, int) else one for one in segments]
+    for text in texts:
+        if text in ("", ".", "..") or "/" in text:
+            raise InvalidName(text)
+    return "/".join([below, *(quote(text, safe="") for text in texts)])
 
 
 def query_string(parameters: Mapping[str, Any]) -> str:

@@ -6,6 +6,10 @@ import random
 import time
 from dataclasses import dataclass
 
+SHORTEST_PAUSE = 0.05
+"""Seconds between two attempts at least, unless the rule begins with less; no attempt begins later than that before the
+end of the time."""
+
 
 @dataclass(frozen=True)
 class Retry:
@@ -13,7 +17,7 @@ class Retry:
 
     A request is repeated only where another answer may come: after 429, 502, 503, 504 and a lost connection, always
     under the same ``X-Request-Id``, after pauses that double, with some randomness, and never sooner than the service's
-    ``Retry-After`` says.
+    ``Retry-After`` says. A pause takes at most half of the time that is left, so that attempts go on to the end of it.
 
     Args:
         patience: seconds after the first attempt in which further ones may begin; 0 sends once. A call with a deadline
@@ -39,12 +43,13 @@ class Clock:
         retry: for how long the call is repeated if it has no deadline.
     """
 
-    __slots__ = ("_patience", "_until", "attempts", "deadline", "lost")
+    __slots__ = ("_last", "_retry", "_until", "attempts", "deadline", "lost")
 
     def __init__(self, deadline: float | None, retry: Retry) -> None:
         now = time.monotonic()
         self._until = None if deadline is None else now + deadline
-        self._patience = now + retry.patience if self._until is None or not retry.patience else self._until
+        self._last = now + retry.patience if self._until is None or not retry.patience else self._until
+        self._retry = retry
         self.deadline = deadline
         self.attempts = 0
         self.lost = False  # whether the service may have done what was asked for without being heard
@@ -53,6 +58,15 @@ class Clock:
         """Seconds until the deadline; None without one."""
         return None if self._until is None else self._until - time.monotonic()
 
-    def allows(self, pause: float) -> bool:
-        """Whether another attempt may begin after this pause."""
-        return time.monotonic() + pause < self._patience
+    def pause(self, asked: float | None = None) -> float | None:
+        """Seconds to wait before the next attempt; None if there is no time for one.
+
+        Args:
+            asked: seconds that the service asks to wait, which are never shortened.
+        """
+        left = self._last - time.monotonic()
+        pause = min(self._retry.pause(self.attempts), left / 2)
+        if pause < min(self._retry.first_pause / 2, SHORTEST_PAUSE):
+            return None
+        pause = max(pause, asked or 0.0)
+        return pause if pause < left else None

@@ -23,6 +23,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("map", description="Id of the map to localize in."),
         DeclareLaunchArgument("url", default_value="http://127.0.0.1:8000", description="Address of the service."),
         DeclareLaunchArgument("parameters", default_value=str(PARAMETERS), description="File with parameters."),
+        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node, such as robot1."),
         DeclareLaunchArgument("image", default_value="/camera/image_raw/compressed", description="Topic of images."),
         DeclareLaunchArgument("camera_info", default_value="/camera/camera_info", description="Topic of CameraInfo."),
         DeclareLaunchArgument("odom", default_value="/odom", description="Topic of odometry."),
@@ -33,7 +34,7 @@ def generate_launch_description() -> LaunchDescription:
         package="placerec_ros",
         executable="placerec_node",
         name="placerec",
-        namespace="",
+        namespace=given("namespace"),
         output="screen",
         parameters=[
             given("parameters"),

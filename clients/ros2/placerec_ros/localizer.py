@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from placerec_client import Client, DeadlineExceeded, PlacerecError, Problem
 from placerec_ros.frame_queue import Frame, FrameQueue
 from placerec_ros.health import ERROR, OK, Health
-from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Increment, Odometer, increment
+from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
 from placerec_ros.parameters import Settings
 from placerec_ros.pictures import UnfitPicture, picture_of
 from placerec_ros.planar import Planar, map_to_odom
@@ -97,7 +97,7 @@ class Localizer:
         self._run_generation = 0
         self._sent: Frame | None = None
         self._correction: Planar | None = None
-        self._mapping = self._unanswered = False
+        self._mapping = False
         self._paused_until = self._heard = self._pictured = 0.0
         self._pause = FIRST_PAUSE
         began = datetime.now(UTC)
@@ -117,6 +117,10 @@ class Localizer:
         """Take in the camera's intrinsics; None if the message tells none."""
         self._intrinsics = intrinsics
         self._camera_due = 0.0
+
+    def change(self, settings: Settings) -> None:
+        """Take in settings whose live parameters have changed."""
+        self._settings = settings
 
     def activate(self) -> None:
         """Begin a run with the next frame."""
@@ -264,14 +268,10 @@ class Localizer:
             self._health.counts["frames before the first CameraInfo"] += 1
             return
         run = self._running()
+        # Odometry's own pose: a frame without an answer may have reached the session, and its motion must count once.
+        odometry = self.odometer.told(frame.stamp, math.radians(self._settings.camera_yaw)) if frame.stamp else None
         began = time.monotonic()
-        try:
-            answer = run.send(picture, frame.number, frame.stamp, self._moved(frame))
-        except PlacerecError as error:
-            if not isinstance(reason_of(error), Problem):  # a frame that was refused is not counted
-                self._unanswered = True
-            raise
-        self._unanswered = False
+        answer = run.send(picture, frame.number, frame.stamp, odometry)
         took = time.monotonic() - began
         self._heard_from_service()
         for kind in ("map", "load", "session"):
@@ -304,18 +304,6 @@ class Localizer:
             self._run_generation = self._generation
             self._run = Run(self._open(), self._settings, self._health, known)
         return self._run
-
-    def _moved(self, frame: Frame) -> Increment | None:
-        """The motion since the last frame of the session; None if it is not known which one that is.
-
-        A frame without an answer may have reached the session all the same: its motion must not be counted twice.
-        """
-        if self._unanswered or self._sent is None or not frame.stamp or not self._sent.stamp:
-            return None
-        before, after = self.odometer.at(self._sent.stamp), self.odometer.at(frame.stamp)
-        if before is None or after is None:
-            return None
-        return increment(before, after, math.radians(self._settings.camera_yaw))
 
     def _judged(self, frame: Frame, answer: Mapping[str, Any], run: Run, took: float) -> Answered:
         found = estimate(answer, run.radius)
@@ -368,7 +356,6 @@ class Localizer:
     def _end_run(self) -> None:
         """End the session, if the service lets us; it ends by itself otherwise."""
         run, self._run, self._sent, self._correction = self._run, None, None, None
-        self._unanswered = False
         if run is not None:
             with suppress(PlacerecError):
                 run.end()

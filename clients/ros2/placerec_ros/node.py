@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
+from dataclasses import replace
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -35,7 +36,7 @@ from placerec_ros.health import ERROR, WARN, Health
 from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
 from placerec_ros.localizer import Answered, Done, Localizer
 from placerec_ros.odometry import stamp_of
-from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, settings
+from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
 
 IMAGE_TYPES = {
     "compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage),
@@ -81,7 +82,28 @@ class PlacerecNode(LifecycleNode):
         self._ask_for("create_map", lambda localizer: localizer.create_map())
         self._ask_for("enrol_here", lambda localizer: localizer.enrol_here())
         self._ask_for("relocalize", lambda localizer: localizer.relocalize())
+        self.add_on_set_parameters_callback(self._may_set)
+        self.add_post_set_parameters_callback(self._were_set)
         self.create_timer(TICK_SECONDS, self._tick)
+
+    # ---- parameters
+
+    def _may_set(self, asked: list[Any]) -> SetParametersResult:
+        """Refuse what would have no effect until the node is configured anew."""
+        for one in asked:
+            present = self.get_parameter(one.name).value if self.has_parameter(one.name) else None
+            reason = refusal(one.name, one.value, present, self._settings is not None)
+            if reason is not None:
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _were_set(self, changed: list[Any]) -> None:
+        """Let the localizer have the parameters that may change at any time."""
+        live = {one.name for one in PARAMETERS if one.live}
+        values = {one.name: one.value for one in changed if one.name in live}
+        if values and self._settings is not None and self._localizer is not None:
+            self._settings = replace(self._settings, **values)
+            self._localizer.change(self._settings)
 
     # ---- transitions
 

@@ -1,13 +1,15 @@
-"""Odometry: where the robot was at the moment of a frame, and how it moved between two frames."""
+"""Odometry: where the robot was at the moment of a frame."""
 
 from __future__ import annotations
 
 import math
 import threading
 from bisect import bisect_left, insort
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from placerec_client import Odometry
 from placerec_ros.planar import Planar, wrapped, yaw_of
 
 KEPT_SECONDS = 10.0
@@ -18,17 +20,32 @@ LATEST = 0.1
 CLOCK_JUMP = 1.0
 """Seconds by which a stamp may be older than the last one before the clock counts as set back."""
 MOST_KEPT = 10_000
+FASTEST = 100.0
+"""Metres a second. Odometry that moves faster has begun anew, as when its node was restarted."""
+AWAY, AT_START = 1.0, 0.05
+"""Odometry has begun anew, too, if it is suddenly at its start, to so many metres and radians, from so far away."""
+FLAT = (0, 1, 5, 6, 7, 11, 30, 31, 35)
+"""Where a covariance of ROS, 6 x 6, has those of x, y and the turn about z."""
+LARGEST_COVARIANCE = 1e12
+"""The service takes no larger entries."""
 
 NANOSECONDS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class Increment:
-    """The motion between two frames, in the robot's coordinates at the first: metres and degrees."""
+Covariance = tuple[float, ...]
 
-    forward: float
-    left: float
-    turn: float
+
+@dataclass(frozen=True)
+class Reading:
+    """What a message of odometry tells.
+
+    stamp: nanoseconds.
+    covariance: of x, y and yaw, nine numbers row by row; None if the message has none that can be used.
+    """
+
+    stamp: int
+    pose: Planar
+    covariance: Covariance | None
 
 
 def stamp_of(message: Any) -> int:
@@ -40,8 +57,9 @@ class Odometer:
     """The last seconds of odometry; one thread may feed it while others ask."""
 
     def __init__(self) -> None:
-        self._poses: list[tuple[int, Planar]] = []
+        self._poses: list[Reading] = []
         self._lock = threading.Lock()
+        self._beginnings = 0  # of the odometry, since this object was made
         self.frame = ""
         """The frame of the odometry's poses, such as ``odom``; empty before the first message."""
         self.child = ""
@@ -58,18 +76,21 @@ class Odometer:
         if not all(math.isfinite(one) for one in (position.x, position.y, position.z)):
             raise ValueError("the position is not finite")
         planar = Planar(position.x, position.y, yaw_of(turned.x, turned.y, turned.z, turned.w), position.z)
+        reading = Reading(stamp, planar, _covariance(message.pose.covariance))
         with self._lock:
             frame = message.header.frame_id
-            if frame != self.frame or (self._poses and stamp < self._poses[-1][0] - CLOCK_JUMP * NANOSECONDS):
-                self._poses.clear()  # another odometry, or the clock was set back as by a bag that begins again
+            last = self._poses[-1] if self._poses else None
+            if frame != self.frame or (last is not None and _begins_anew(last, reading)):
+                self._poses.clear()
+                self._beginnings += 1
             self.frame, self.child = frame, message.child_frame_id
-            if not self._poses or stamp > self._poses[-1][0]:
-                self._poses.append((stamp, planar))
+            if not self._poses or stamp > self._poses[-1].stamp:
+                self._poses.append(reading)
             else:
-                insort(self._poses, (stamp, planar), key=lambda one: one[0])
-            oldest = self._poses[-1][0] - int(KEPT_SECONDS * NANOSECONDS)
-            if self._poses[0][0] < oldest - NANOSECONDS or len(self._poses) > MOST_KEPT:
-                first = max(bisect_left(self._poses, oldest, key=lambda one: one[0]), len(self._poses) - MOST_KEPT)
+                insort(self._poses, reading, key=_stamp)
+            oldest = self._poses[-1].stamp - int(KEPT_SECONDS * NANOSECONDS)
+            if self._poses[0].stamp < oldest - NANOSECONDS or len(self._poses) > MOST_KEPT:
+                first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_KEPT)
                 del self._poses[:first]
 
     def clear(self) -> None:
@@ -80,37 +101,71 @@ class Odometer:
 
     def at(self, stamp: int) -> Planar | None:
         """The pose at a moment, in nanoseconds; None if no odometry is near it."""
-        widest = int(LARGEST_GAP * NANOSECONDS)
         with self._lock:
-            place = bisect_left(self._poses, stamp, key=lambda one: one[0])
-            if place == len(self._poses):
-                near = self._poses and stamp - self._poses[-1][0] <= LATEST * NANOSECONDS
-                return self._poses[-1][1] if near else None
-            after = self._poses[place]
-            if after[0] == stamp:
-                return after[1]
-            if place == 0:
-                return None
-            before = self._poses[place - 1]
-        if after[0] - before[0] > widest:
+            reading = self._read(stamp)
+        return None if reading is None else reading.pose
+
+    def told(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
+        """What the service is told with a frame of a moment, in nanoseconds; None if no odometry is near it.
+
+        Args:
+            camera_yaw: radians by which the camera looks to the left of the robot's front; the heading is that of the
+                camera, as headings of a map are.
+        """
+        with self._lock:
+            reading, origin = self._read(stamp), f"{self._beginnings} {self.frame}"[:128]
+        if reading is None:
             return None
-        share = (stamp - before[0]) / (after[0] - before[0])
-        first, second = before[1], after[1]
-        return Planar(
+        pose = reading.pose
+        return Odometry(pose.x, pose.y, math.degrees(pose.yaw + camera_yaw), reading.covariance, origin)
+
+    def _read(self, stamp: int) -> Reading | None:
+        """The reading of a moment, between two messages if there is none of it; the caller holds the lock."""
+        place = bisect_left(self._poses, stamp, key=_stamp)
+        if place == len(self._poses):
+            near = self._poses and stamp - self._poses[-1].stamp <= LATEST * NANOSECONDS
+            return self._poses[-1] if near else None
+        after = self._poses[place]
+        if after.stamp == stamp:
+            return after
+        if place == 0:
+            return None
+        before = self._poses[place - 1]
+        if after.stamp - before.stamp > int(LARGEST_GAP * NANOSECONDS):
+            return None
+        share = (stamp - before.stamp) / (after.stamp - before.stamp)
+        first, second, covariance = before.pose, after.pose, None
+        if before.covariance is not None and after.covariance is not None:
+            pairs = zip(before.covariance, after.covariance, strict=True)
+            covariance = tuple(one + share * (other - one) for one, other in pairs)
+        pose = Planar(
             first.x + share * (second.x - first.x),
             first.y + share * (second.y - first.y),
             wrapped(first.yaw + share * wrapped(second.yaw - first.yaw)),
             first.z + share * (second.z - first.z),
         )
+        return Reading(stamp, pose, covariance)
 
 
-def increment(before: Planar, after: Planar, camera_yaw: float = 0.0) -> Increment:
-    """The motion between two poses of the robot.
+def _stamp(reading: Reading) -> int:
+    return reading.stamp
 
-    Args:
-        camera_yaw: radians by which the camera looks to the left of the robot's front; the motion is that of the
-            camera, as headings of a map are.
-    """
-    looking = Planar(0.0, 0.0, camera_yaw)
-    moved = before.then(looking).inverse().then(after.then(looking))
-    return Increment(moved.x, moved.y, math.degrees(moved.yaw))
+
+def _begins_anew(last: Reading, reading: Reading) -> bool:
+    """Whether odometry began anew after a message: its clock was set back, as by a bag, or its pose has jumped."""
+    seconds = (reading.stamp - last.stamp) / NANOSECONDS
+    if seconds <= 0:
+        return seconds < -CLOCK_JUMP
+    moved = math.hypot(reading.pose.x - last.pose.x, reading.pose.y - last.pose.y)
+    at_start = math.hypot(reading.pose.x, reading.pose.y) < AT_START and abs(reading.pose.yaw) < AT_START
+    return moved > AWAY and (at_start or moved > AWAY + FASTEST * seconds)
+
+
+def _covariance(numbers: Sequence[float]) -> Covariance | None:
+    """The covariance of x, y and yaw of one of ROS, 6 x 6; None if it cannot be one."""
+    flat = [float(numbers[place]) for place in FLAT]
+    if not all(abs(number) <= LARGEST_COVARIANCE for number in flat) or min(flat[0], flat[4], flat[8]) < 0:
+        return None
+    for one, other in ((1, 3), (2, 6), (5, 7)):  # drivers leave out a half, or round
+        flat[one] = flat[other] = 0.5 * (flat[one] + flat[other])
+    return tuple(flat)

@@ -24,7 +24,10 @@ class InvalidParameters(Exception):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter; ``least`` and ``most`` are those of numbers, ``choices`` those of words."""
+    """One parameter; ``least`` and ``most`` are those of numbers, ``choices`` those of words.
+
+    A ``live`` one can be changed at any time.  Others are read when the node starts or is configured.
+    """
 
     name: str
     default: str | bool | int | float
@@ -32,6 +35,7 @@ class Parameter:
     least: float | None = None
     most: float | None = None
     choices: tuple[str, ...] = ()
+    live: bool = False
 
 
 PARAMETERS = (
@@ -78,13 +82,13 @@ PARAMETERS = (
     ),
     Parameter(
         "advance",
-        1.0,
+        0.0,
         "Places of the map's traverse that usually go by from image to image, where neither odometry nor a "
-        "speed limit tells it.",
+        "speed limit tells it; 0: the session learns it.",
         0.0,
         100.0,
     ),
-    Parameter("backwards", False, "The robot may go against the map's traverse."),
+    Parameter("backwards", False, "With advance, the robot may go against the map's traverse; without, it may anyway."),
     Parameter("speed_limit", 0.0, "Metres a second that the robot does not exceed; 0: none.", 0.0, 1000.0),
     Parameter("verify", "auto", "When the geometry of candidates is verified.", choices=("auto", "always", "never")),
     Parameter(
@@ -93,6 +97,7 @@ PARAMETERS = (
         "Seconds between two annotated pictures, while someone subscribes to them.",
         0.1,
         3600.0,
+        live=True,
     ),
     Parameter("autostart", False, "Configure and activate the node when it starts, without a manager of lifecycles."),
     Parameter(
@@ -131,6 +136,23 @@ class Settings:
 
     def __repr__(self) -> str:
         return f"<settings of {self.map!r} at {self.url!r}>"  # never the key
+
+
+def refusal(name: str, value: object, present: object, configured: bool) -> str | None:
+    """Why a parameter of the running node cannot be set now, a sentence; None if it can, or stays as it is.
+
+    Args:
+        value, present: that it is to have, and that it has.
+        configured: whether the node is, active or not.
+    """
+    parameter = next((one for one in PARAMETERS if one.name == name), None)
+    if parameter is None or parameter.live or (value == present and type(value) is type(present)):
+        return None
+    if name == "autostart":
+        return "The parameter autostart is read when the node starts."
+    if configured:
+        return f"The parameter {name} is read when the node is configured: deactivate and clean up the node first."
+    return None
 
 
 def settings(values: Mapping[str, Any], environment: Mapping[str, str] = os.environ) -> Settings:

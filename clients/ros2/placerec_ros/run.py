@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal, cast
 
-from placerec_client import Client, Problem
+from placerec_client import Client, Odometry, Problem
 from placerec_client.retry import Retry
 from placerec_ros.health import Health
 from placerec_ros.intrinsics import camera_name
-from placerec_ros.odometry import Increment
 from placerec_ros.parameters import Settings
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -45,7 +44,7 @@ class Run:
         self.intrinsics = intrinsics
         self.camera = self._camera(intrinsics)
         self._session = self._map.sessions.begin(
-            advance=settings.advance,
+            advance=settings.advance or None,
             backwards=settings.backwards,
             speed_limit=settings.speed_limit or None,
             camera=self.camera,
@@ -87,18 +86,15 @@ class Run:
         self._health.over("camera")
         return name
 
-    def send(self, frame: Any, number: int, stamp: int, moved: Increment | None) -> dict[str, Any]:
+    def send(self, frame: Any, number: int, stamp: int, odometry: Odometry | None) -> dict[str, Any]:
         """Send a frame; the service's ``SessionAnswer`` as JSON."""
-        motion: dict[str, Any] = {}
-        if moved is not None:
-            motion = {"forward": moved.forward, "left": moved.left, "turn": moved.turn}
         answer = self._session.send(
             frame,
+            odometry=odometry,
             frame=number,
             timestamp=moment_of(stamp),
             encoder=self._settings.encoder or None,
             deadline=self._settings.deadline,
-            **motion,
         )
         if answer.single.revision is not None and answer.single.revision != self.revision:
             self._read_map()  # its settings were edited
@@ -127,8 +123,8 @@ class Run:
         return int(self._map.read().places)
 
     def end(self) -> None:
-        """End the session."""
-        self._session.end()
+        """Delete the session."""
+        self._session.delete()
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -88,7 +88,7 @@ async def enrol_frames(
     lab = service.patient(PATIENCE).maps[map_id]
     places = (NewPlace(frame.id, partial(_load, frame), frame.parameters) for frame in frames)
     with failures():
-        async with aclosing(lab.enrol(places, known=known, encoder=encoder)) as outcomes:
+        async with aclosing(lab.enrol_each(places, known=known, encoder=encoder)) as outcomes:
             async for outcome in outcomes:
                 tell(_outcome(by_id[outcome.place.id], outcome))
 

@@ -17,9 +17,9 @@ import httpx
 import typer
 
 from core.errors import DataDirectoryLocked
-from placerec_client import AsyncClient, PlacerecError, Problem, Retry, UnexpectedAnswer
+from placerec_client import AsyncClient, PlacerecError, Problem, Retry, UnexpectedAnswer, requests
 from placerec_client.frames import media_type
-from placerec_client.requests import Part, form, path_of
+from placerec_client.requests import Part, form
 from service.commands.connection.credentials import VARIABLE, given_key, is_unencrypted
 from service.commands.console import Failure, remark
 
@@ -153,6 +153,16 @@ def failures() -> Iterator[None]:
         raise Failure(str(error)) from error
 
 
+def path_of(*segments: str) -> str:
+    """The path ``/v1/…`` of these segments, which the client quotes.
+
+    Raises:
+        Failure: a segment is nothing that can be named.
+    """
+    with failures():
+        return requests.path_of(*segments)
+
+
 def read_bytes(path: Path) -> bytes:
     """The bytes of a file.
 
@@ -174,10 +184,10 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
     """
     if target.url is not None:
         key = given_key()
-        if key is not None and is_unencrypted(target.url):
-            remark(f"Warning: the key is sent to {target.url} without encryption. Use https.")
         with failures():
             made = AsyncClient(target.url, key=key, timeout=ANSWER_SECONDS, retry=Retry(0))
+        if key is not None and is_unencrypted(made.connection.url):
+            remark(f"Warning: the key is sent to {made.connection.url} without encryption. Use https.")
         async with made as client:
             yield Service(client)
         return
@@ -186,7 +196,7 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
 
     # Nobody else can reach it, so its address does not matter; its warnings would only repeat its answers.
     settings = read_settings(target.data_dir).model_copy(update={"host": "127.0.0.1", "log_level": "error"})
-    application = create_app(settings, as_owner=True)
+    application = create_app(settings.model_copy(update={"rehearsal": False}), as_owner=True)
     async with AsyncExitStack() as stack:
         try:
             await stack.enter_async_context(application.router.lifespan_context(application))

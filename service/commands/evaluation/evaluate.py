@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -162,6 +162,14 @@ def evaluate(
             rich_help_panel=SYSTEMS,
         ),
     ] = None,
+    verify: Annotated[
+        Literal["auto", "always", "never"],
+        typer.Option(
+            help="When the geometry of the best matches is verified, as of a query to the service: where the scores "
+            "leave doubt, always, or never. It holds for encoders of two stages whose name says nothing of stages.",
+            rich_help_panel=SYSTEMS,
+        ),
+    ] = "auto",
     every: Annotated[
         bool,
         typer.Option(
@@ -273,6 +281,10 @@ def evaluate(
 ) -> None:
     """Evaluate place recognition on two traverses of the same places.
 
+    The default is what the service answers: the default encoder with three stages,
+    the last where the first two leave doubt (--verify). NAME.first-stage and
+    NAME.two-stages judge fewer.
+
     Images of a directory (not of its subfolders) are taken in natural order; one
     that cannot be decoded stops the run. A query without a kept true reference is
     a true negative. Results are cached: a second run measures only what is new and
@@ -318,7 +330,7 @@ def evaluate(
         pair = options.open(stack, encoder[0] if encoder else None)
         elsewhere = [] if others is None else read_others(others, pair)
         lessons = choose_training(training, pair, seed)
-        systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
+        systems = build_systems(encoder or [], every, files, open_catalogue(models_dir), verify)
         kept = EvaluationCache(None if no_cache else cache or default_folder())
         with progress() as bar:
             extras = Extras(scalability, severity, seed, map_sizes=report is not None)

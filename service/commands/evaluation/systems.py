@@ -16,6 +16,7 @@ from service.commands.model import default_encoder, name_of
 if TYPE_CHECKING:
     from core.baselines.system import About, System
     from core.method.catalogue import EncoderCatalogue
+    from core.recognition.verification import Verify
 
 
 def parse_weights(given: list[str]) -> dict[str, Path]:
@@ -33,12 +34,15 @@ def parse_weights(given: list[str]) -> dict[str, Path]:
     return files
 
 
-def build_systems(names: list[str], every: bool, weights: dict[str, Path], models: EncoderCatalogue) -> list[System]:
+def build_systems(
+    names: list[str], every: bool, weights: dict[str, Path], models: EncoderCatalogue, verify: Verify = "auto"
+) -> list[System]:
     """The systems that the options name, each once, in that order.
 
     Args:
         names: of systems or encoders; if empty, the default encoder.
         every: add all systems that run without a file, or whose file is given.
+        verify: when encoders that are asked as the service asks them verify.
 
     Raises:
         MissingWeights, UnknownEncoder, InvalidModel: one cannot be made.
@@ -60,7 +64,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
         raise typer.BadParameter(f"--weights for {', '.join(sorted(idle))}, which --encoder does not name")
     built: dict[str, System] = {}
     for name in asked:
-        system = build(name, models=models, weights=weights.get(name))
+        system = build(name, models=models, weights=weights.get(name), verify=verify)
         built.setdefault(system.about.name, system)
     return list(built.values())
 

@@ -22,7 +22,7 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
-places = typer.Typer(cls=Commands, help="List, show, edit and forget the places of a map.", no_args_is_help=True)
+places = typer.Typer(cls=Commands, help="List, show, edit and delete the places of a map.", no_args_is_help=True)
 
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
@@ -97,20 +97,20 @@ def edit_place(
     _show_place(ask(Target(url, data_dir), "PATCH", path, json=changes).json(), as_json)
 
 
-@places.command("forget")
-def forget_places(
+@places.command("delete")
+def delete_places(
     map_id: MapId,
     place_ids: Annotated[list[str], typer.Argument(metavar="PLACE…", help="Ids.", show_default=False)],
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Forget places. This cannot be undone."""
+    """Delete places. This cannot be undone."""
 
     async def work() -> None:
         async with open_service(Target(url, data_dir)) as service:
             for place_id in place_ids:
                 await service.request("DELETE", path_of("maps", map_id, "places", place_id))
-                remark(f"The place {place_id} is forgotten.")
+                remark(f"The place {place_id} is deleted.")
 
     run(work())
 
@@ -166,7 +166,7 @@ def _show_place(place: dict[str, Any], as_json: bool) -> None:
     show(shown)
 
 
-sequences = typer.Typer(cls=Commands, help="List and forget the traverses of a map.", no_args_is_help=True)
+sequences = typer.Typer(cls=Commands, help="List and delete the traverses of a map.", no_args_is_help=True)
 
 
 @sequences.command("list")
@@ -182,16 +182,16 @@ def list_sequences(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_
     show(shown)
 
 
-@sequences.command("forget")
-def forget_sequence(
+@sequences.command("delete")
+def delete_sequence(
     map_id: MapId,
     sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="Name of the traverse.", show_default=False)],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Forget all places of a traverse. This cannot be undone."""
+    """Delete all places of a traverse. This cannot be undone."""
     if not yes:
-        typer.confirm(f"Forget all places of the sequence {sequence} of the map {map_id}?", abort=True)
-    forgotten = ask(Target(url, data_dir), "DELETE", path_of("maps", map_id, "sequences", sequence)).json()
-    remark(f"The sequence {sequence} is forgotten: {forgotten['places']} places.")
+        typer.confirm(f"Delete all places of the sequence {sequence} of the map {map_id}?", abort=True)
+    deleted = ask(Target(url, data_dir), "DELETE", path_of("maps", map_id, "sequences", sequence)).json()
+    remark(f"The sequence {sequence} is deleted: {deleted['places']} places.")

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.commands.connection.client import Service, failures
+from service.commands.connection.client import Service, failures, path_of
 from service.commands.console import Failure, progress
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ async def download(
     Raises:
         Refused, Failure: the download failed; its part stays, to be continued.
     """
-    lab = service.patient(PATIENCE).maps[map_id]
     with failures(), _bar(f"download {map_id}") as advance:
+        lab = service.patient(PATIENCE).maps[map_id]
         return await lab.export(path, overwrite=overwrite, known=known, progress=advance)
 
 
@@ -77,7 +77,7 @@ async def upload(service: Service, path: Path, map_id: str | None) -> dict[str, 
     """
     with failures(), _bar(f"send {path.name}") as advance:
         job = await service.client.maps.import_(path, id=map_id, progress=advance)
-    found: dict[str, Any] = await service.get(f"/v1/jobs/{job.id}")
+    found: dict[str, Any] = await service.get(path_of("jobs", job.id))
     return found
 
 

@@ -57,6 +57,11 @@ def health(
         show(again)
     else:
         output.print("No stretch has to be recorded again.", highlight=False)
+    for stop in report["stops"]:
+        remark(
+            f"{stop['frames']} frames of traverse {stop['sequence']} show one view, from place {stop['place']} "
+            f"on: placerec maps prune {map_id} removes most of them."
+        )
     if not report["complete"]:
         remark("The time was up before the whole map was examined; --seconds gives it more.")
 
@@ -123,7 +128,7 @@ def prune(
     similarity: Annotated[
         float | None, typer.Option(help="Instead: least similarity of two frames for one to replace the other.")
     ] = None,
-    sequence: Annotated[str | None, typer.Option(help="Forget only places of this traverse.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Delete only places of this traverse.")] = None,
     queries: Annotated[str | None, typer.Option(help="Measure the loss with the frames of this traverse.")] = None,
     yes: Yes = False,
     wait: Wait = True,
@@ -131,7 +136,7 @@ def prune(
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Forget places that their neighbours can replace; without --yes only report the loss of recall."""
+    """Delete places that their neighbours can replace; without --yes only report the loss of recall."""
     given = {"similarity": similarity, "sequence": sequence, "queries": queries}
     body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     body |= {"max_recall_loss": max_recall_loss, "dry_run": not yes}

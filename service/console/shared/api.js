@@ -32,6 +32,15 @@ export class Disconnected extends Error {
   }
 }
 
+/** Nothing can have this name, so nothing was sent. */
+export class InvalidName extends Error {
+  constructor(name) {
+    super(`${JSON.stringify(name)} is no name: it is empty, "." or "..", or has a slash.`);
+    this.title = "This is no name";
+    this.detail = this.message;
+  }
+}
+
 // The key, and who it is
 
 function storedKey() {
@@ -146,6 +155,21 @@ function next() {
   const first = waiting.shift();
   if (first) first();
   else running -= 1;
+}
+
+/** Whether a text can be a segment of a path. */
+export function isName(text) {
+  return !["", ".", ".."].includes(text) && !String(text).includes("/");
+}
+
+/** The path of these segments below v1, which are quoted; every path with a name in it is made here.
+ *
+ * A URL has no segment "." or "..": the browser takes them out, whether they are quoted or not, and ".." with the one
+ * before it.  No name has a slash, which servers unquote.  Throws if a segment is one of these, or empty.
+ */
+export function pathOf(...segments) {
+  for (const one of segments) if (!isName(one)) throw new InvalidName(one);
+  return `/${segments.map(encodeURIComponent).join("/")}`;
 }
 
 function address(path, query = {}) {

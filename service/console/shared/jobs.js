@@ -1,5 +1,5 @@
 // Long work: a job is followed to its end, with its progress and a way to cancel it.
-import { follow, get, may, post } from "./api.js";
+import { follow, get, may, pathOf, post } from "./api.js";
 import { Moment, Pill, Progress, Trouble } from "./elements.js";
 import { integer } from "./formats.js";
 import { html, useEffect, useRef, useState } from "./view.js";
@@ -33,9 +33,9 @@ export function useJob(job, onEnd) {
         ended.current?.(told);
       }
     };
-    follow(`/jobs/${job.id}/events`, { onEvent, signal: controller.signal })
+    follow(pathOf("jobs", job.id, "events"), { onEvent, signal: controller.signal })
       .then(async () => {
-        if (!controller.signal.aborted && !hasEnded(last)) onEvent("", await get(`/jobs/${job.id}`));
+        if (!controller.signal.aborted && !hasEnded(last)) onEvent("", await get(pathOf("jobs", job.id)));
       })
       .catch(setError);
     return () => controller.abort();
@@ -69,7 +69,7 @@ export function JobProgress({ job, onEnd, what }) {
 
 export function CancelJob({ job, done }) {
   const [error, setError] = useState(null);
-  const cancel = () => post(`/jobs/${job.id}/cancel`).then((told) => done?.(told), setError);
+  const cancel = () => post(pathOf("jobs", job.id, "cancel")).then((told) => done?.(told), setError);
   return html`
     <button type="button" class="small" onClick=${cancel}>Cancel</button>
     ${error && html`<span class="faint small" role="alert">${error.detail || error.message}</span>`}

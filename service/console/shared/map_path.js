@@ -1,4 +1,6 @@
 // Paths of the API below one map.
+import { pathOf } from "./api.js";
+
 export function mapPath(map, ...parts) {
-  return ["/maps", map, ...parts].map((part, index) => (index === 0 ? part : encodeURIComponent(part))).join("/");
+  return pathOf("maps", map, ...parts);
 }

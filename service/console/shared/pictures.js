@@ -1,5 +1,6 @@
 // Pictures of places: fetched with the key when they come into sight, and kept as blobs for a while.
 import { key, send } from "./api.js";
+import { mapPath } from "./map_path.js";
 import { effect, html, useEffect, useRef, useState } from "./view.js";
 
 const MOST = 400;
@@ -68,7 +69,7 @@ export function Picture({ path, version = "", alt, children }) {
 }
 
 export function thumbnailPath(map, place) {
-  return `/maps/${encodeURIComponent(map)}/places/${encodeURIComponent(place)}/thumbnail`;
+  return mapPath(map, "places", place, "thumbnail");
 }
 
 export function Thumbnail({ map, place, version, children }) {

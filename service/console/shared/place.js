@@ -19,7 +19,7 @@ export function Place({ map, id }) {
         <a class="button" href=${href("maps", map, "plan", { place: id })}>On the plan</a>
         ${may("enrol") && html`
           <button type="button" onClick=${() => setDialog(html`<${Edit} map=${map} place=${place.data} close=${close} changed=${place.set} />`)}>Edit</button>
-          <button type="button" class="danger" onClick=${() => setDialog(html`<${Forget} map=${map} id=${id} close=${close} />`)}>Forget</button>
+          <button type="button" class="danger" onClick=${() => setDialog(html`<${Delete} map=${map} id=${id} close=${close} />`)}>Delete</button>
         `}
       `}
     <//>
@@ -236,14 +236,14 @@ function metadataChanges(old, text) {
   return { ...cleared(old), ...read };
 }
 
-function Forget({ map, id, close }) {
-  const forget = async () => {
+function Delete({ map, id, close }) {
+  const send = async () => {
     await remove(mapPath(map, "places", id));
-    say(`${id} was forgotten.`);
+    say(`${id} was deleted.`);
     go("maps", map, "places");
   };
   return html`
-    <${ByName} title=${`Forget ${id}`} name=${id} action="Forget the place" close=${close} send=${forget}>
+    <${ByName} title=${`Delete ${id}`} name=${id} action="Delete the place" close=${close} send=${send}>
       <p>No later query finds it. This cannot be undone.</p>
     <//>
   `;

@@ -188,7 +188,7 @@ function Prune({ map }) {
   return html`
     <section class="panel" aria-label="Prune">
       <h2>Prune</h2>
-      <p class="faint">Removes places whose neighbours can stand in for them.</p>
+      <p class="faint">Deletes places whose neighbours can stand in for them.</p>
       <${Field} label=${html`Recall that may be lost: <strong>${decimal(loss, 1)} %</strong>`}>
         <input type="range" min="0" max="10" step="0.5" value=${loss} onInput=${(event) => setLoss(event.target.valueAsNumber)} />
       <//>
@@ -202,9 +202,9 @@ function Prune({ map }) {
           ["Recall after", shareText(report.recall_after)],
           ["Measured on", `${report.measured_on}, ${integer(report.queries)} queries`],
         ]} />
-        ${removed > 0 && order.dry_run && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Remove ${integer(removed)} places</button></div>`}
+        ${removed > 0 && order.dry_run && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Delete ${integer(removed)} places</button></div>`}
       `}
-      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Remove the places" close=${() => setDialog(null)} send=${apply}>
+      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Delete the places" close=${() => setDialog(null)} send=${apply}>
         <p>${integer(removed)} places go, with their pictures. This cannot be undone; export the map first if they may be wanted again.</p>
       <//>`}
     </section>

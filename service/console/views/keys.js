@@ -1,5 +1,5 @@
-// Keys: who may do what.  A new one is shown once; one in force can be narrowed or revoked.
-import { all, identify, send, useKey } from "../shared/api.js";
+// Keys: who may do what.  A new one is shown once; one in force can be narrowed or deleted.
+import { all, identify, pathOf, send, useKey } from "../shared/api.js";
 import { ByName, Copy, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
 import { MapsField } from "../shared/maps_field.js";
 import { Shown, useResource } from "../shared/resource.js";
@@ -16,7 +16,7 @@ export default function Keys() {
   const tools = { open: setDialog, close, changed: keys.reload };
   const create = () => setDialog(html`<${Create} first=${keys.data?.length === 0} ...${tools} />`);
   return html`
-    <${Head} title="Keys" note="Each caller has a key of its own, so that one can be revoked alone.">
+    <${Head} title="Keys" note="Each caller has a key of its own, so that one can be deleted alone.">
       <label class="row"><input type="checkbox" checked=${ended} onChange=${() => setEnded(!ended)} /> also ended ones</label>
       <button type="button" class="primary" onClick=${create}>Create a key</button>
     <//>
@@ -50,7 +50,7 @@ function Table({ items, open, close, changed }) {
               <td class="actions-cell">
                 ${key.state === "in force" && html`
                   <button type="button" class="small" aria-label=${`Narrow ${key.name}`} onClick=${() => open(html`<${Narrow} key_=${key} close=${close} changed=${changed} />`)}>Narrow</button>
-                  <button type="button" class="small danger" aria-label=${`Revoke ${key.name}`} onClick=${() => open(html`<${Revoke} key_=${key} close=${close} changed=${changed} />`)}>Revoke</button>
+                  <button type="button" class="small danger" aria-label=${`Delete ${key.name}`} onClick=${() => open(html`<${Delete} key_=${key} close=${close} changed=${changed} />`)}>Delete</button>
                 `}
               </td>
             </tr>
@@ -141,7 +141,7 @@ function Narrow({ key_: key, close, changed }) {
     if (role !== key.role) changes.role = role;
     if (JSON.stringify(maps) !== JSON.stringify(key.maps)) changes.maps = maps;
     if (expires && expires !== key.expires_at?.slice(0, 16)) changes.expires_at = new Date(`${expires}Z`).toISOString();
-    await send("PATCH", `/keys/${key.id}`, { query, json: changes });
+    await send("PATCH", pathOf("keys", key.id), { query, json: changes });
     say(`The key ${key.name} was narrowed.`);
     if (key.own) await identify();
     changed();
@@ -157,15 +157,15 @@ function Narrow({ key_: key, close, changed }) {
   `;
 }
 
-function Revoke({ key_: key, close, changed }) {
+function Delete({ key_: key, close, changed }) {
   const { guarded, box } = useLocking();
-  const revoke = guarded(async (query) => {
-    await send("DELETE", `/keys/${key.id}`, { query });
-    say(`The key ${key.name} was revoked.`);
+  const remove = guarded(async (query) => {
+    await send("DELETE", pathOf("keys", key.id), { query });
+    say(`The key ${key.name} was deleted.`);
     changed();
   });
   return html`
-    <${ByName} title=${`Revoke ${key.name}`} name=${key.name} action="Revoke the key" close=${close} send=${revoke}>
+    <${ByName} title=${`Delete ${key.name}`} name=${key.name} action="Delete the key" close=${close} send=${remove}>
       <p>Whoever uses it is refused from the next request on. This cannot be undone.${key.own && html` <strong>It is the key that you use now.</strong>`}</p>
       ${box}
     <//>

@@ -3,6 +3,7 @@ import { all, caller, download, everyMap, get, getTagged, may, patch, post, remo
 import { ByName, complain, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
 import { bytes, counted, encoderName, integer } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
+import { mapPath } from "../shared/map_path.js";
 import { MapSettings } from "../shared/map_settings.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href } from "../shared/router.js";
@@ -176,7 +177,7 @@ function Edit({ map, close, changed }) {
 }
 
 function getTaggedMap(map) {
-  return getTagged(`/maps/${encodeURIComponent(map)}`);
+  return getTagged(mapPath(map));
 }
 
 const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification"];
@@ -187,7 +188,7 @@ function EditForm({ map, read, close, changed }) {
     index: read.data.index.setting,
   });
   const save = async () => {
-    await patch(`/maps/${encodeURIComponent(map)}`, fields, read.tag);
+    await patch(mapPath(map), fields, read.tag);
     say(`The map ${map} was changed.`);
     changed();
   };
@@ -200,7 +201,7 @@ function EditForm({ map, read, close, changed }) {
 
 function Delete({ map, places, close, changed }) {
   const destroy = async () => {
-    await remove(`/maps/${encodeURIComponent(map)}`);
+    await remove(mapPath(map));
     say(`The map ${map} was deleted.`);
     changed();
   };
@@ -212,7 +213,7 @@ function Delete({ map, places, close, changed }) {
 }
 
 function Verify({ map, close }) {
-  const report = useResource((signal) => post(`/maps/${encodeURIComponent(map)}/verify`, undefined, { signal }), [map]);
+  const report = useResource((signal) => post(mapPath(map, "verify"), undefined, { signal }), [map]);
   return html`
     <${Dialog} title=${`Verify ${map}`} close=${close}>
       <${Shown} resource=${report}>
@@ -232,7 +233,7 @@ function Export({ map, close }) {
     setState({ done: 0, total: null, controller });
     try {
       const progress = (done, total) => setState((old) => ({ ...old, done, total }));
-      await download(`/maps/${encodeURIComponent(map.id)}/export`, `${map.id}.tar`, { progress, signal: controller.signal });
+      await download(mapPath(map.id, "export"), `${map.id}.tar`, { progress, signal: controller.signal });
       say(`${map.id}.tar was saved.`);
       close();
     } catch (error) {

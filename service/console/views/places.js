@@ -31,7 +31,7 @@ function List({ map, query }) {
   const page = useResource((signal) => get(mapPath(map, "places"), { ...filter, limit: PAGE, cursor }, { signal }), [map, filter, cursor]);
   const about = useResource((signal) => get(mapPath(map), {}, { signal }), [map]);
   const toggle = (id) => setChosen((old) => toggled(old, id));
-  const forget = (order) => {
+  const remove = (order) => {
     const close = () => setDialog(null);
     const done = () => {
       setChosen(new Set());
@@ -39,16 +39,16 @@ function List({ map, query }) {
       page.reload();
       about.reload();
     };
-    setDialog(html`<${Forget} map=${map} order=${order} close=${close} done=${done} />`);
+    setDialog(html`<${Delete} map=${map} order=${order} close=${close} done=${done} />`);
   };
   return html`
     <${Head} title="Places" note=${about.data && `${counted(about.data.places, "place")} in ${map}`}>
       ${may("enrol") && chosen.size > 0 && html`
         <button type="button" onClick=${() => setChosen(new Set())}>Choose none</button>
-        <button type="button" class="danger" onClick=${() => forget({ ids: [...chosen] })}>Forget ${integer(chosen.size)} chosen</button>
+        <button type="button" class="danger" onClick=${() => remove({ ids: [...chosen] })}>Delete ${integer(chosen.size)} chosen</button>
       `}
       ${may("enrol") && chosen.size === 0 && present !== "{}" && html`
-        <button type="button" class="danger" onClick=${() => forget({ filter: asOrder(filter) })}>Forget all of these</button>
+        <button type="button" class="danger" onClick=${() => remove({ filter: asOrder(filter) })}>Delete all of these</button>
       `}
     <//>
     <${Filters} map=${map} filter=${filter} />
@@ -71,7 +71,7 @@ function toggled(set, id) {
   return made;
 }
 
-/** The filters of a listing as the filter of an order to forget. */
+/** The filters of a listing as the filter of an order to delete. */
 function asOrder({ where, ...others }) {
   return where ? { ...others, where: JSON.parse(where) } : others;
 }
@@ -157,11 +157,11 @@ function Tile({ map, place, chosen, toggle }) {
   `;
 }
 
-/** Forget places: what would go is counted first, and what was counted is what goes. */
-function Forget({ map, order, close, done }) {
-  const report = useResource((signal) => post(`${mapPath(map, "places")}:forget`, { ...order, dry_run: true }, { signal }), [order]);
-  const forget = async () => {
-    await post(`${mapPath(map, "places")}:forget`, { ids: report.data.ids, dry_run: false }).catch((error) => {
+/** Delete places: what would go is counted first, and what was counted is what goes. */
+function Delete({ map, order, close, done }) {
+  const report = useResource((signal) => post(`${mapPath(map, "places")}:delete`, { ...order, dry_run: true }, { signal }), [order]);
+  const send = async () => {
+    await post(`${mapPath(map, "places")}:delete`, { ids: report.data.ids, dry_run: false }).catch((error) => {
       if (error.status === 404) complain(error);
       throw error;
     });
@@ -170,7 +170,7 @@ function Forget({ map, order, close, done }) {
   if (report.data === undefined) return html`<${Shown} resource=${report} />`;
   const { places, ids } = report.data;
   return html`
-    <${ByName} title=${places === 1 ? "Forget a place" : `Forget ${integer(places)} places`} name=${map} action="Forget" close=${close} send=${forget}>
+    <${ByName} title=${places === 1 ? "Delete a place" : `Delete ${integer(places)} places`} name=${map} action="Delete" close=${close} send=${send}>
       <p>No later query finds ${places === 1 ? "it" : "them"}. This cannot be undone.</p>
       <p class="row">${ids.slice(0, 12).map((id) => html`<${Pill}>${id}<//>`)}${ids.length > 12 && html`<span class="faint">and ${integer(ids.length - 12)} more</span>`}</p>
     <//>

@@ -13,7 +13,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Literal, Self, TypeAlias
 
-Fault = Literal["none", "cut-before", "cut-request", "lose-answer", "cut-answer", "delay", "duplicate"]
+Fault = Literal["none", "cut-before", "cut-request", "lose-answer", "cut-answer", "delay", "duplicate", "silence"]
 FAULTS: tuple[Fault, ...] = ("cut-before", "cut-request", "lose-answer", "cut-answer", "delay", "duplicate")
 DELAY_SECONDS = 0.2
 _LENGTH = re.compile(rb"(?i)\r\ncontent-length: *(\d+)")
@@ -116,6 +116,9 @@ class FaultProxy:
         fault = self._choose(head)
         self.happened[fault] += 1
         if fault == "cut-before":
+            return False
+        if fault == "silence":
+            await reader.read()  # until the client hangs up
             return False
         if fault == "cut-request":
             await self._send(request[: len(request) // 2])

@@ -23,11 +23,12 @@ METHODS = ("get", "post", "put", "patch", "delete")
 
 SENT = (
     *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Merging", "Reencoding"),
-    *("CalibrationOrder", "CameraDefinition", "NewKey", "KeyChanges", "Forgetting", "LabelOrder"),
+    *("CalibrationOrder", "CameraDefinition", "NewKey", "KeyChanges", "Deletion", "LabelOrder"),
 )
 """Schemas of bodies. They lose their required fields, which the calls take by position."""
 
-LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str", "bbox": "float"}
+LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str"}
+LISTS |= {"bbox": "float", "odometry_covariance": "float"}
 OBJECTS = {"where", "metadata", "cameras"}
 """Parameters of the query string that hold lists and JSON objects; the client takes them as such, too."""
 

@@ -62,7 +62,7 @@ def enrol(server: Server, map_id: str, count: int, way: Mischief, patience: floa
     async def work() -> None:
         retry = Retry(patience, first_pause=0.05)
         async with AsyncClient(str(server.client.base_url), transport=way, retry=retry) as client:
-            async for one in client.maps[map_id].enrol(places, known=()):
+            async for one in client.maps[map_id].enrol_each(places, known=()):
                 told.append(one)  # noqa: PERF401 # what was told before an error counts
 
     try:
@@ -93,6 +93,22 @@ def test_two_at_a_time_in_line(server: Server, map_id: str) -> None:
     assert way.most == 2 and len(way.sent) == 7
     names = [line["batch"] for line in way.sent]
     assert [line.get("after") for line in way.sent] == [None, None, *names[1:-1]]
+
+
+def test_enrolling_is_done_when_it_is_called(server: Server, url: str, map_id: str) -> None:
+    def places(name: str) -> list[NewPlace]:
+        return [NewPlace(f"{name}{index}", jpeg(index, 64, 48), {"sequence": name}) for index in range(6)]
+
+    async def work() -> list[Enrolled]:
+        async with AsyncClient(url) as client:
+            return await client.maps[map_id].enrol(places("b"))
+
+    with Client(url) as client:
+        client.maps[map_id].enrol(places("a"))
+        assert sorted(server.places(map_id)) == [f"a{index}" for index in range(6)]
+    told = asyncio.run(work())
+    assert [(one.place.id, one.change) for one in told] == [(f"b{index}", "created") for index in range(6)]
+    assert len(server.places(map_id)) == 12
 
 
 def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, map_id: str) -> None:

@@ -70,13 +70,13 @@ class Campaign:
 
     async def _forget(self, name: str, number: int) -> None:
         await self._put(name, number)
-        await self._lab.places.forget(name)
+        await self._lab.places.delete(name)
         del self.places[name], self.lines[name]
 
     async def _enrol(self, name: str, number: int) -> None:
         ids = [f"{name}-{index}" for index in range(3)]
         frames = [NewPlace(one, jpeg(200 + number, 64, 48), {"sequence": name}) for one in ids]
-        changes = [outcome.change async for outcome in self._lab.enrol(frames, known=())]
+        changes = [outcome.change for outcome in await self._lab.enrol(frames, known=())]
         assert set(changes) <= {"created", "unchanged"} and len(changes) == 3
         self.places.update(dict.fromkeys(ids))
         self.lines[name] = ids

@@ -112,7 +112,7 @@ def the_service(client: Client) -> None:
     made = client.keys.create("robot-7", "enrol", maps=["tour"])
     assert made.key.startswith("placerec_") and client.keys.read(made.id).name == "robot-7"
     assert client.keys.narrow(made.id, {"role": "query"}).role == "query"
-    assert client.keys.revoke(made.id).state == "revoked"
+    assert client.keys.delete(made.id).state == "revoked"
     assert made.id in [key.id for key in client.keys]
     assert "create_key" in [entry.operation for entry in client.audit()]
 
@@ -133,8 +133,8 @@ def tour(client: Client, folder: Path) -> None:
     assert lab.places.read("p1").pose == models.Pose(x=2, y=0)
     assert lab.places.edit("p1", {"pose": {"heading": 90}}).pose == models.Pose(x=2, y=0, heading=90)
     assert lab.places.thumbnail("p1").startswith(b"\xff\xd8")
-    lab.places.forget("q2")
-    assert lab.places.forget_many(ids=["q1", "q9"], dry_run=False).missing == ["q9"]
+    lab.places.delete("q2")
+    assert lab.places.delete_many(ids=["q1", "q9"], dry_run=False).missing == ["q9"]
     plan = lab.plan()
     assert len(plan.ids) == plan.places == 13
     answer = lab.query(jpeg(3), k=2, explain=True, where={"floor": 3}, camera="front")
@@ -168,8 +168,8 @@ def tour(client: Client, folder: Path) -> None:
         lab.edit({"description": "again"}, if_match=edited.revision - 1)
     jobs(client, folder)
     assert [one.name for one in lab.sequences] == ["monday", "tuesday"]
-    assert lab.sequences.forget("tuesday").places == 1
-    lab.cameras.forget("front")
+    assert lab.sequences.delete("tuesday").places == 1
+    lab.cameras.delete("front")
     for name in [one.id for one in client.maps if one.id.startswith("tour")]:
         client.maps[name].delete()
 
@@ -185,7 +185,7 @@ def labelling(lab: Any) -> None:
 
 
 def session(lab: Any) -> None:
-    with lab.sessions.begin(filter="bayes", advance=1) as one:
+    with lab.sessions.begin(advance=1) as one:
         first = one.send(jpeg(0))
         assert (first.frame, one.send(jpeg(1), forward=2.0).frame) == (0, 1)
         assert one.read().frames == 2 and one.id in [other.id for other in lab.sessions]
@@ -208,7 +208,7 @@ def jobs(client: Client, folder: Path) -> None:
     assert lab.prune(max_recall_loss=0.1).wait().state == "succeeded"
     assert lab.reencode("tour-2").wait().state == "succeeded"
     assert client.maps["tour-2"].merge("tour", on_conflict="skip").wait().state == "succeeded"
-    lab.sequences.forget("tuesday")
+    lab.sequences.delete("tuesday")
     lab.query_or_enrol("again", stranger(70), sequence="tuesday")
     tag = lab.export(folder / "tour.tar")
     assert tag and lab.export(folder / "tour.tar", overwrite=True, known=tag) is None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import random
 import socket
 import time
 from collections.abc import Callable
@@ -14,14 +16,18 @@ import pytest
 
 from placerec_client import (
     Client,
+    ClientClosed,
     ConnectionFailed,
     DeadlineExceeded,
+    Map,
     PlacerecError,
     Problem,
     Retry,
     UnexpectedAnswer,
     problems,
+    retry,
 )
+from placerec_client._sync import connection
 from placerec_client.answers import problem_of
 from placerec_client.requests import path_of
 from tests.clients.python.fault_proxy import Fault, FaultProxy
@@ -123,10 +129,55 @@ def test_another_service_is_told_apart() -> None:
     with pytest.raises(UnexpectedAnswer, match=r"answered 404\. Is it a placerec service") as answered:
         ask(handle)
     assert answered.value.status == 404
-    with pytest.raises(ConnectionFailed, match="has to start with http"):
-        Client("ftp://robot")
+
+
+@pytest.mark.parametrize(
+    ("url", "host"),
+    [
+        ("127.0.0.1:8211", "127.0.0.1:8211"),
+        ("robot", "robot"),
+        ("robot.local:80/behind/a/proxy/", "robot.local"),
+        ("[::1]:8000", "[::1]:8000"),
+        ("https://robot/", "robot"),
+    ],
+)
+def test_a_host_is_a_url(url: str, host: str) -> None:
+    handle, asked = in_turn(httpx.Response(200, json={"status": "ok"}))
+    with Client(url, transport=httpx.MockTransport(handle)) as client:
+        client.liveness()
+    assert asked[0].headers["Host"] == host
+    assert asked[0].url.scheme == ("https" if "https" in url else "http") and asked[0].url.path.endswith("/livez")
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["ftp://robot", "unix:/run/placerec.sock", "robot:", "robot:x", "http://robot:x", "http://", "robot?key=1", ""],
+)
+def test_what_is_no_url_is_refused_at_once(url: str) -> None:
     with pytest.raises(ConnectionFailed, match="is not a URL"):
-        Client("http://robot:x")
+        Client(url)
+
+
+def test_a_closed_client_says_so(url: str, lab: Map) -> None:
+    client = Client(url)
+    there, patient = client.maps[lab.id], client.patient(Retry(60))
+    session = there.sessions.begin()
+    session.begin()
+    there.read()
+    stream, events = session.stream(), there.events()
+    client.close()
+    client.close()
+    calls: list[Callable[[], object]] = [
+        there.read,
+        patient.liveness,
+        lambda: list(client.maps),
+        lambda: next(iter(events)),
+        lambda: stream.send(jpeg(0, 64, 48)),
+        client.__enter__,
+    ]
+    for call in calls:
+        with pytest.raises(ClientClosed, match="was closed"):
+            call()
 
 
 def test_an_answer_that_is_no_answer() -> None:
@@ -147,7 +198,7 @@ def test_pages_are_followed_to_the_last() -> None:
 
 
 def test_names_are_quoted_in_paths() -> None:
-    assert path_of("maps", "lab", "sequences", "a b/ü?") == "/v1/maps/lab/sequences/a%20b%2F%C3%BC%3F"
+    assert path_of("maps", "lab", "sequences", "a b\\ü?%2e") == "/v1/maps/lab/sequences/a%20b%5C%C3%BC%3F%252e"
 
 
 def test_the_key_is_sent() -> None:
@@ -214,6 +265,54 @@ def trickle(listening: socket.socket, pieces: int, pause: float) -> int:
                 return sent
             time.sleep(pause)
     return pieces
+
+
+class Moments:
+    """A clock that only goes on while the client pauses; the client's own waits for it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        monkeypatch.setattr(retry, "time", self)
+        monkeypatch.setattr(connection, "sleep", self.sleep)
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("seconds", "deadline"), [(0.7, True), (20.0, True), (30.0, False)])
+def test_attempts_go_on_to_the_end(seconds: float, deadline: bool, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "random", random.Random(seed))
+    moments, asked = Moments(monkeypatch), list[float]()
+
+    def refuse(_: httpx.Request) -> httpx.Response:
+        asked.append(moments.now)
+        raise httpx.ConnectError("refused")
+
+    rule, transport = Retry(60 if deadline else seconds), httpx.MockTransport(refuse)
+    error = DeadlineExceeded if deadline else ConnectionFailed
+    with Client("robot", retry=rule, transport=transport) as client, pytest.raises(error, match="cannot be reached"):
+        client.connection.request("GET", "/v1/x", deadline=seconds if deadline else None)
+    assert seconds - 0.1 <= asked[-1] < seconds and len(asked) < 20
+    pauses = [after - before for before, after in itertools.pairwise(asked)]
+    assert min(pauses) > 0.999 * retry.SHORTEST_PAUSE
+
+
+@pytest.mark.parametrize("back", [1.0, 5.0, 8.0, 9.0])
+def test_a_service_that_is_back_before_the_deadline_answers(back: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    moments = Moments(monkeypatch)
+
+    def handle(_: httpx.Request) -> httpx.Response:
+        if moments.now < back:
+            raise httpx.ConnectError("refused")
+        return httpx.Response(200)
+
+    with Client("http://robot", transport=httpx.MockTransport(handle)) as client:
+        assert client.connection.request("GET", "/v1/x", deadline=10).is_success
+    assert moments.now <= (back + 10) / 2, "half of the time that was left is there for the answer"
 
 
 # Keys and proxies
@@ -305,7 +404,7 @@ def test_what_was_done_before_the_answer_was_lost_counts(server: Server) -> None
     server.enrol("lost-answer", "p", jpeg(1), sequence="walk")
     with through(server, "DELETE", "lose-answer", "none", "lose-answer") as way, Client(way.url) as client:
         lab = client.maps["lost-answer"]
-        lab.places.forget("p")
+        lab.places.delete("p")
         lab.delete()
         with pytest.raises(problems.UnknownMap):
             lab.delete()
@@ -325,8 +424,8 @@ def test_a_session_whose_answer_was_lost_is_not_begun_twice(server: Server) -> N
     server.create_map("session-once")
     with through(server, "POST /v1/maps/session-once/sessions ", "lose-answer") as way, Client(way.url) as client:
         lab = client.maps["session-once"]
-        with lab.sessions.begin(filter="path") as session:
+        with lab.sessions.begin(lag=1) as session:
             assert [one.id for one in lab.sessions] == [session.id]
-            with lab.sessions.begin(filter="path") as other:
+            with lab.sessions.begin(lag=1) as other:
                 assert other.id != session.id, "it is another request"
         assert way.happened["lose-answer"] == 1

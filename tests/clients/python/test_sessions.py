@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
 
+import httpx
 import pytest
 
-from placerec_client import Client, ConnectionFailed, Map, PlacerecError, Retry, problems
-from tests.clients.python.fault_proxy import FaultProxy
+from placerec_client import (
+    AsyncClient,
+    Client,
+    ConnectionFailed,
+    DeadlineExceeded,
+    Map,
+    Odometry,
+    PlacerecError,
+    Retry,
+    UnexpectedAnswer,
+    models,
+    problems,
+)
+from placerec_client.parameters import SendFrame
+from tests.clients.python.fault_proxy import Fault, FaultProxy
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -40,6 +58,65 @@ def test_a_stream_is_taken_up_again(server: Server, walk: Map) -> None:
         assert way.happened["cut-stream"] > 1
 
 
+WAY = (0, 1, 2, 3, 2, 1, 0, 1, 2, 3)
+"""The places before which the robot stands, one after the other; it drives back and forth."""
+
+
+def odometry_at(place: int) -> Odometry:
+    """Odometry that began askew, somewhere else."""
+    grown = 0.01 * place
+    return Odometry(3.0, 2.0 * place - 8, 90.0, [grown, 0, 0, 0, grown, 0, 0, 0, 0], "morning")
+
+
+@pytest.mark.parametrize("patience", [0, 60])
+def test_odometry_counts_once_whatever_is_lost(server: Server, walk: Map, patience: float) -> None:
+    fates: list[Fault] = ["none", "lose-answer", "cut-request", "lose-answer", "lose-answer", "cut-before", "none"]
+
+    def fate(head: bytes) -> Fault:
+        return fates.pop(0) if fates and b"/frames" in head else "none"
+
+    with (
+        FaultProxy(server.port, choose=fate) as way,
+        Client(way.url, retry=Retry(patience, 0.02, 0.2)) as client,
+        client.maps[walk.id].sessions.begin() as session,
+        walk.sessions.begin() as expected,
+    ):
+        last: int | None = None
+        for number, place in enumerate(WAY):
+            told, frame = None, jpeg(place, 64, 48)
+            with suppress(ConnectionFailed):
+                told = session.send(frame, odometry=odometry_at(place))
+            report = session.read()
+            if report.last_frame != number:
+                assert told is None
+                continue
+            motion: SendFrame = {"frame": number}
+            if last is not None:
+                deviation = max(0.0, 0.01 * (place - WAY[last])) ** 0.5
+                motion |= {"forward": 2.0 * (place - WAY[last]), "deviation": deviation}
+            true = expected.send(frame, **motion)
+            last = number
+            for found in (report.belief, told or report.belief):
+                assert found.candidates[0].place.id == true.candidates[0].place.id
+                assert found.candidates[0].probability == pytest.approx(true.candidates[0].probability, abs=1e-5)
+        assert last == len(WAY) - 1 and not fates and true.motion == "odometry"
+        assert report.frames == (len(WAY) if patience else len(WAY) - 2)
+
+
+def test_a_stream_that_is_cut_counts_odometry_once(server: Server, walk: Map) -> None:
+    with FaultProxy(server.port, share=0, messages=5) as way, Client(way.url, retry=Retry(60, 0.02, 0.2)) as client:
+        sessions = client.maps[walk.id].sessions
+        with sessions.begin() as session, session.stream() as stream, walk.sessions.begin() as expected:
+            for number, place in enumerate(WAY):
+                told = stream.send(jpeg(place, 64, 48), odometry=replace(odometry_at(place), covariance=None))
+                motion: SendFrame = {"forward": 2.0 * (place - WAY[number - 1])} if number else {}
+                true = expected.send(jpeg(place, 64, 48), **motion)
+                assert (told.frames, told.motion) == (true.frames, true.motion)
+                assert [one.place.id for one in told.candidates] == [one.place.id for one in true.candidates]
+                assert told.unknown == pytest.approx(true.unknown, abs=1e-5)
+        assert way.happened["cut-stream"] > 1
+
+
 def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
     with walk.sessions.begin() as session:
         session.send(jpeg(0, 64, 48), frame=41)
@@ -51,6 +128,54 @@ def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
             session.send(jpeg(1, 64, 48), frame=7)
 
 
+@pytest.mark.parametrize("streamed", [False, True])
+def test_frames_at_the_same_time_are_sent_in_their_order(url: str, walk: Map, streamed: bool) -> None:
+    async def work() -> list[models.SessionAnswer]:
+        async with AsyncClient(url) as client, client.maps[walk.id].sessions.begin() as session:
+            stream = session.stream()
+            send = stream.send if streamed else session.send
+            try:
+                return await asyncio.gather(*(send(jpeg(number % 4, 64, 48)) for number in range(8)))
+            finally:
+                await stream.close()
+
+    answers = asyncio.run(work())
+    assert [(one.frame, one.frames) for one in answers] == [(number, number + 1) for number in range(8)]
+
+
+def test_frames_of_several_threads_are_sent_one_after_the_other(walk: Map) -> None:
+    with walk.sessions.begin() as session, ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda number: session.send(jpeg(number, 64, 48)), range(4)))
+    assert sorted((one.frame, one.frames) for one in answers) == [(number, number + 1) for number in range(4)]
+
+
+def test_a_frame_whose_turn_does_not_come_in_time() -> None:
+    """It has no number and is not sent; the deadline begins with the call, not with its turn."""
+    moment = asyncio.Event()
+    asked: list[httpx.Request] = []
+
+    async def slow(request: httpx.Request) -> httpx.Response:
+        asked.append(request)
+        await moment.wait()
+        return httpx.Response(418)
+
+    async def work() -> None:
+        async with AsyncClient("robot", transport=httpx.MockTransport(slow)) as client:
+            session = client.maps["lab"].sessions["of-before"]
+            first = asyncio.create_task(session.send(b"first", frame=0))
+            await asyncio.sleep(0)  # it is under way
+            with pytest.raises(DeadlineExceeded, match=r"frames before took longer than 0\.05 s"):
+                await session.send(b"second", deadline=0.05)
+            moment.set()
+            with pytest.raises(UnexpectedAnswer):
+                await first
+            with pytest.raises(UnexpectedAnswer):
+                await session.send(b"third")
+
+    asyncio.run(work())
+    assert [request.url.params["frame"] for request in asked] == ["0", "1"]
+
+
 def test_what_ends(walk: Map) -> None:
     session = walk.sessions.begin()
     with pytest.raises(PlacerecError, match="has not begun"):
@@ -58,10 +183,10 @@ def test_what_ends(walk: Map) -> None:
     session.begin()
     with session.stream() as stream:
         stream.send(jpeg(0, 64, 48))
-        session.end()
+        session.delete()
         with pytest.raises((problems.SessionExpired, problems.UnknownSession)):
             stream.send(jpeg(1, 64, 48))
-    session.end()
+    session.delete()
 
 
 def test_one_stream_at_a_time(server: Server, walk: Map) -> None:

@@ -17,7 +17,7 @@ from tests.service.server import Server
 @pytest.fixture
 def full(lab: Map) -> Map:
     """A map whose file has several pieces."""
-    list(lab.enrol(NewPlace(f"p{number}", jpeg(number, 64, 48)) for number in range(12)))
+    lab.enrol(NewPlace(f"p{number}", jpeg(number, 64, 48)) for number in range(12))
     return lab
 
 

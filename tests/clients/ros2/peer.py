@@ -19,11 +19,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
@@ -47,7 +47,7 @@ BAG_TYPES = {
     "CameraInfo": "sensor_msgs/msg/CameraInfo",
     "Odometry": "nav_msgs/msg/Odometry",
 }
-PATIENCE = 15.0
+PATIENCE = 40.0
 
 
 class Peer:
@@ -216,6 +216,12 @@ class Peer:
         request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         done = self._call(SetParameters, "/placerec/set_parameters", request)
         return {"refused": [result.reason for result in done.results if not result.successful]}
+
+    def get(self, names: list[str], node: str) -> dict[str, Any]:
+        """The values of parameters of a node, by their names; of strings and numbers."""
+        done = self._call(GetParameters, f"/{node}/get_parameters", GetParameters.Request(names=names))
+        values = {one: parameter_value_to_python(value) for one, value in zip(names, done.values, strict=True)}
+        return {"values": values}
 
     def describe(self, names: list[str]) -> dict[str, Any]:
         """What the node says of its parameters."""

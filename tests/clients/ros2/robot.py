@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ def ros_environment(**more: str) -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PLACEREC_", "ROS_", "RMW_"))}
     own = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),  # tests that run beside these have nodes of the same name
         "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
         "PYTHONUNBUFFERED": "1",
     }
@@ -59,16 +60,25 @@ class Node:
         folder: for its log.
         parameters: its parameters.
         name: of the node.
+        wrapper: words before the command.
+        arguments: of ROS, besides, such as those of a namespace.
         environment: variables, such as PLACEREC_KEY.
     """
 
     def __init__(
-        self, folder: Path, parameters: Mapping[str, object], name: str = "placerec", **environment: str
+        self,
+        folder: Path,
+        parameters: Mapping[str, object],
+        name: str = "placerec",
+        wrapper: Sequence[str] = (),
+        arguments: Sequence[str] = (),
+        **environment: str,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.log_file = folder / "node.log"
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={_yaml(value)}")]
-        command = [str(PYTHON), "-m", "placerec_ros.node", "--ros-args", "-r", f"__node:={name}", *words]
+        command = [*wrapper, str(PYTHON), "-m", "placerec_ros.node", "--ros-args", "-r", f"__node:={name}"]
+        command += [*words, *arguments]
         with self.log_file.open("ab") as log:
             variables = ros_environment(ROS_LOG_DIR=str(folder / "ros"), **environment)
             self.process = subprocess.Popen(command, env=variables, stdout=log, stderr=log, cwd=folder)

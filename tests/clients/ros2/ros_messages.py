@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,13 +18,21 @@ def header(stamp: float, frame_id: str) -> Any:
     )
 
 
-def odometry(stamp: float, x: float, y: float, yaw: float = 0.0, frame_id: str = "odom") -> Any:
+def odometry(
+    stamp: float,
+    x: float,
+    y: float,
+    yaw: float = 0.0,
+    frame_id: str = "odom",
+    covariance: Sequence[float] = (0.0,) * 36,
+) -> Any:
     turned = quaternion(yaw)
     pose = SimpleNamespace(
         position=SimpleNamespace(x=x, y=y, z=0.0),
         orientation=SimpleNamespace(x=turned[0], y=turned[1], z=turned[2], w=turned[3]),
     )
-    return SimpleNamespace(header=header(stamp, frame_id), child_frame_id="base_link", pose=SimpleNamespace(pose=pose))
+    told = SimpleNamespace(pose=pose, covariance=covariance)
+    return SimpleNamespace(header=header(stamp, frame_id), child_frame_id="base_link", pose=told)
 
 
 def image(encoding: str, width: int, height: int, data: bytes, step: int = 0, big: int = 0) -> Any:

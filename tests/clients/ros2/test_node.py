@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
 import httpx
 import pytest
 
+from placerec_client.parameters import SendFrame
 from placerec_ros.parameters import PARAMETERS
-from tests.clients.ros2.robot import Node, Peer, Robot, Site, until
+from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.clients.ros2.robot import Node, Peer, Robot, Site, ros_environment, until
 from tests.service.scenes import blank, encoded, stranger
+from tests.service.server import ROOT
+from tests.watch import Watch, missing
 
 
 @pytest.fixture
@@ -20,19 +28,24 @@ def image(robot: Robot) -> Robot:
     return robot
 
 
-def over_http(site: Site, frames: list[tuple[int, float, bytes]], **options: Any) -> list[dict[str, Any]]:
-    """The answers of a session over HTTP to numbered, stamped frames."""
+def over_http(
+    site: Site, frames: list[tuple[int, float, bytes]], motions: Sequence[float | None] | None = None
+) -> list[dict[str, Any]]:
+    """The answers of a session over HTTP to numbered, stamped frames, with the metres forward to each if it has any."""
     from placerec_client import Client
     from placerec_ros.run import moment_of
 
     with (
         Client(site.url, key=site.keys["query"]) as client,
-        client.maps["walk"].sessions.begin(**options) as session,
+        client.maps["walk"].sessions.begin() as session,
     ):
-        return [
-            session.send(data, frame=number, timestamp=moment_of(round(stamp * 1e9))).model_dump(mode="json")
-            for number, stamp, data in frames
-        ]
+        answers = []
+        for (number, stamp, data), motion in zip(frames, motions or [None] * len(frames), strict=True):
+            options: SendFrame = {"frame": number, "timestamp": moment_of(round(stamp * 1e9))}
+            if motion is not None:
+                options["forward"] = motion
+            answers.append(session.send(data, **options).model_dump(mode="json"))
+        return answers
 
 
 def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
@@ -177,6 +190,28 @@ def test_a_node_that_starts_by_itself(image: Robot) -> None:
     assert robot.site.keys["query"] not in node.log()
 
 
+def test_a_node_speaks_to_its_service_and_to_ros_alone(image: Robot, tmp_path: Path) -> None:
+    """Each address that it uses is the service's, or one of DDS on this machine; it writes where ROS logs."""
+    robot, watch = image, Watch(tmp_path)
+    if reason := missing():
+        pytest.skip(f"nobody can watch what a program does: {reason}")
+    parameters: dict[str, object] = {"url": robot.site.url, "map": "walk", "use_camera_info": False, "autostart": True}
+    words = {"PLACEREC_KEY": robot.site.keys["query"], "HOME": str(tmp_path / "home")}
+    with watch:
+        node = Node(tmp_path / "watched", parameters, name="watched", wrapper=watch.wrapper, **words)
+        try:
+            robot.connected()
+            robot.peer.do("listen", topic="answer", node="watched")
+            robot.look(number=0)
+            assert until(lambda: robot.peer.take("answer"))[0]["place"] == "p00"
+        finally:
+            assert node.stop() == 0, node.log()
+    first = 7400 + 250 * int(ros_environment()["ROS_DOMAIN_ID"])
+    of_dds = {f"{host}:{port}" for host in ("127.0.0.1", "239.255.0.1") for port in range(first, first + 250)}
+    assert watch.told() - of_dds == {f"127.0.0.1:{robot.site.server.port}"}
+    assert watch.written([tmp_path / "watched"]) == set()
+
+
 def test_parameters_that_cannot_be_are_refused(robot: Robot) -> None:
     robot.begin(active=False)
     assert robot.transition("cleanup")
@@ -187,6 +222,62 @@ def test_parameters_that_cannot_be_are_refused(robot: Robot) -> None:
     assert robot.state == "unconfigured"
     said = robot.peer.do("describe", names=[one.name for one in PARAMETERS])["descriptions"]
     assert said == {one.name: one.description for one in PARAMETERS}
+
+
+def test_a_parameter_that_would_be_ignored_is_refused(robot: Robot) -> None:
+    def refused(**values: object) -> list[str]:
+        found: list[str] = robot.peer.do("set", values=values)["refused"]
+        return found
+
+    robot.begin()
+    for state in ("active", "inactive"):
+        for name, value in (("map", "other"), ("deadline", 3.0), ("verify", "never"), ("use_camera_info", True)):
+            (said,) = refused(**{name: value})
+            assert said.startswith(f"The parameter {name} is read when the node is configured: ")
+        assert refused(map="walk", deadline=20.0) == [], "they have these values"
+        assert "when the node starts" in refused(autostart=True)[0]
+        assert robot.state == state
+        if state == "active":
+            assert robot.transition("deactivate")
+    assert robot.transition("cleanup")
+    assert refused(deadline=3.0) == []
+    assert robot.peer.do("get", names=["deadline", "map"], node="placerec")["values"] == {
+        "deadline": 3.0,
+        "map": "walk",
+    }
+
+
+def test_a_parameter_that_may_change_is_applied(image: Robot) -> None:
+    robot = image
+    robot.begin(picture_period=3600.0)
+    robot.connected()
+    robot.peer.do("listen", topic="annotated/compressed")
+    robot.drive(0, 2)
+    until(lambda: robot.peer.take("annotated/compressed"))  # the only one for an hour
+    assert robot.peer.do("set", values={"picture_period": 0.1})["refused"] == []
+    assert "range" in robot.peer.do("set", values={"picture_period": 0.0})["refused"][0]
+
+    def pictured() -> bool:
+        robot.asked(2)
+        return bool(robot.peer.take("annotated/compressed"))
+
+    until(pictured)
+    robot.peer.do("deafen", topic="annotated/compressed")
+
+
+@pytest.mark.parametrize(("key", "map_id"), [("/**", "lab"), ("/robot1/other", "lab"), ("other", "")])
+def test_the_file_of_parameters_holds_in_a_namespace(robot: Robot, key: str, map_id: str, tmp_path: Path) -> None:
+    """The file as it is shipped, and under the keys that ROS takes for a node's full name."""
+    file = tmp_path / "placerec.yaml"
+    shipped = (ROOT / "clients/ros2/config/placerec.yaml").read_text()
+    file.write_text(shipped.replace("\n/**:", f"\n{key}:"))
+    words = ["-r", "__ns:=/robot1", "--params-file", str(file)]
+    node = Node(tmp_path / "node", {}, name="other", arguments=words)
+    try:
+        found = robot.peer.do("get", names=["map", "queue_length"], node="robot1/other")["values"]
+        assert found == {"map": map_id, "queue_length": 2}
+    finally:
+        assert node.stop() == 0, node.log()
 
 
 def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) -> None:
@@ -324,6 +415,41 @@ def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None
     pose = robot.peer.take("pose")[-1]
     # Map = R(90°) * odometry + t, with the odometry at (-2, 0): t = pose - (0, -2).
     assert (found["x"], found["y"]) == pytest.approx((pose["x"], pose["y"] + 2.0), abs=0.5)
+
+
+def test_odometry_counts_once_if_answers_are_lost(image: Robot) -> None:
+    robot, site = image, image.site
+    fates: list[Fault] = ["none", "none", "lose-answer", "lose-answer", "cut-before", "none", "lose-answer", "none"]
+    taken = [number for number, fate in enumerate(fates) if fate != "cut-before"]
+    left = list(fates)
+
+    def fate(head: bytes) -> Fault:
+        return left.pop(0) if left and b"/frames" in head else "none"
+
+    def heard(before: int) -> bool:
+        return len(left) < before
+
+    robot.peer.do("advertise", topic="/odom", kind="Odometry")
+    with FaultProxy(site.server.port, choose=fate) as way:
+        robot.begin(url=way.url)
+        robot.connected()
+        robot.connected("/odom")
+        for number, happens in enumerate(fates):
+            odometry(robot, -2.0, float(number), 90.0)
+            if happens == "none":
+                answer = robot.asked(number)
+            else:
+                left_then = len(left)
+                robot.look(number=number)
+                until(partial(heard, left_then))
+        assert robot.transition("deactivate") and robot.transition("cleanup")
+    moved = [None, *(float(after - before) for before, after in pairwise(taken))]
+    frames = [(number, robot.BASE + 0.1 * number, site.again[number]) for number in taken]
+    expected = over_http(site, frames, motions=moved)[-1]
+    assert answer["answer"]["frames"] == len(taken) and not left
+    assert answer["answer"]["motion"] == expected["motion"] == "odometry"
+    assert (answer["verdict"], answer["place"]) == ("recognized", expected["place"]["id"])
+    assert answer["probability"] == pytest.approx(expected["probability"], abs=1e-5)
 
 
 def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:

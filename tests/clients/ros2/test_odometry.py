@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from placerec_ros.odometry import MOST_KEPT, NANOSECONDS, Odometer, increment
+from core.belief import OdometryPose
+from placerec_ros.odometry import MOST_KEPT, NANOSECONDS, Odometer
 from placerec_ros.planar import Planar, map_to_odom, quaternion, wrapped, yaw_of
 from tests.clients.ros2.ros_messages import odometry
 
@@ -75,12 +77,57 @@ def test_a_pose_that_is_none_is_refused(broken: tuple[float, float, float]) -> N
     assert odometer.frame == ""
 
 
+def told(odometer: Odometer, seconds: float, camera_yaw: float = 0.0) -> OdometryPose:
+    """What the service makes of what the node tells."""
+    found = odometer.told(round(seconds * NANOSECONDS), camera_yaw)
+    assert found is not None
+    covariance = None if found.covariance is None else tuple(found.covariance)
+    return OdometryPose(found.x, found.y, math.radians(found.heading), covariance, found.origin)
+
+
 def test_the_motion_is_that_of_the_robot_or_of_a_camera_that_looks_aside() -> None:
-    before, after = Planar(3.0, 1.0, math.radians(90)), Planar(3.0, 3.0, math.radians(120))
-    straight = increment(before, after)
-    assert (straight.forward, straight.left, straight.turn) == pytest.approx((2.0, 0.0, 30.0))
-    aside = increment(before, after, camera_yaw=math.radians(90))
-    assert (aside.forward, aside.left, aside.turn) == pytest.approx((0.0, -2.0, 30.0))
+    odometer = Odometer()
+    odometer.add(odometry(10.0, 3.0, 1.0, math.radians(90)))
+    odometer.add(odometry(10.4, 3.0, 3.0, math.radians(120)))
+    for camera, forward, left in ((0.0, 2.0, 0.0), (math.radians(90), 0.0, -2.0)):
+        moved = told(odometer, 10.4, camera).since(told(odometer, 10.0, camera))
+        assert (moved.forward, moved.left, math.degrees(moved.turn)) == pytest.approx((forward, left, 30.0))
+    assert odometer.told(12 * NANOSECONDS) is None
+
+
+def test_the_covariance_is_that_of_the_plane() -> None:
+    odometer, grown = Odometer(), np.zeros((6, 6))
+    grown[np.ix_((0, 1, 5), (0, 1, 5))] = [[0.4, 0.02, 0.0], [0.02, 0.2, 0.1], [0.0, 0.1, 0.3]]
+    odometer.add(odometry(10.0, 0.0, 0.0))
+    odometer.add(odometry(10.4, 1.0, 0.0, covariance=grown.ravel().tolist()))
+    found = told(odometer, 10.2).covariance
+    assert found is not None
+    np.testing.assert_allclose(np.reshape(found, (3, 3)), grown[np.ix_((0, 1, 5), (0, 1, 5))] / 2)
+    for number, broken in enumerate((math.nan, -1.0, math.inf)):
+        odometer.add(odometry(11.0 + number, 1.0, 0.0, covariance=[broken] * 36))
+        assert told(odometer, 11.0 + number).covariance is None
+
+
+def test_odometry_that_begins_anew_is_told_as_another() -> None:
+    odometer = Odometer()
+    origins = []
+    for stamp, x, yaw, frame in (
+        (10.0, 30.0, 1.0, "odom"),
+        (10.1, 30.2, 1.0, "odom"),
+        (13.0, 0.0, 0.0, "odom"),  # its node was restarted
+        (13.1, 0.1, 0.0, "odom"),
+        (13.2, 60.0, 0.0, "odom"),  # it was set
+        (13.3, 60.5, 0.0, "odom"),
+        (13.4, 61.0, 0.0, "visual"),
+        (5.0, 61.0, 0.0, "visual"),  # the clock was set back
+        (5.1, 0.5, 0.0, "visual"),
+        (5.2, 0.0, 0.0, "visual"),  # it drives back to where it began
+    ):
+        odometer.add(odometry(stamp, x, 0.0, yaw, frame))
+        origins.append(told(odometer, stamp).origin)
+    changes = [one != other for one, other in pairwise(origins)]
+    assert changes == [False, True, False, True, False, True, True, True, False]
+    assert at(odometer, 5.15) is not None and at(odometer, 5.05) is None, "nothing is read across a beginning"
 
 
 @given(poses, poses)

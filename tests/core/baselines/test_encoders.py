@@ -7,6 +7,7 @@ import pytest
 
 from core.baselines.encoders import PAPERS, TITLES, EncoderSystem, constants
 from core.baselines.registry import build
+from core.baselines.stages import TWO_STAGES
 from core.baselines.system import About
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.presets import PRESETS
@@ -21,7 +22,7 @@ def models() -> EncoderCatalogue:
 
 
 def test_an_encoder_system_gives_the_encoders_own_scores(models: EncoderCatalogue) -> None:
-    system, encoder = build(DEFAULT_ENCODER, models=models), models.get(DEFAULT_ENCODER)
+    system, encoder = build(DEFAULT_ENCODER + TWO_STAGES, models=models), models.get(DEFAULT_ENCODER)
     generator = np.random.default_rng(4)
     frames = [np.kron(generator.integers(0, 255, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8) for _ in range(3)]
     described = [system.describe(frame) for frame in frames]

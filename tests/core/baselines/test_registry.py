@@ -108,6 +108,7 @@ def test_encoders_are_systems_by_name_and_by_identity(models: EncoderCatalogue) 
         system = build(asked, models=models)
         assert isinstance(system, EncoderSystem)
         assert system.identity == encoder.identity and not system.sequential
+    assert isinstance(build(f"{DEFAULT_ENCODER}.two-stages", models=models), EncoderSystem)
     with pytest.raises(InvalidModel, match="no file of weights"):
         build(DEFAULT_ENCODER, models=models, weights=Path(__file__))
 

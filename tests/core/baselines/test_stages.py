@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from core.baselines.encoders import EncoderSystem
 from core.baselines.registry import build, systems
-from core.baselines.stages import ThreeStages, VerifiedSystem, keypoints_in
-from core.baselines.system import Array, Description
+from core.baselines.stages import VerifiedSystem, keypoints_in
 from core.errors import InvalidModel, UnknownEncoder
-from core.geometry.keypoints import Keypoints
+from core.frames.images import decode
 from core.judgement.geometry import WEIGHT
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.recognition.verification import CANDIDATES
-from tests.service.scenes import blank, scene, seen_again
+from core.places import PlaceFields
+from core.recognition.recognition import enrol, recognize
+from core.recognition.verification import CANDIDATES, Verify
+from core.storage import Atlas
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,8 @@ def test_the_first_stage_gives_the_encoders_vectors_and_their_mean_cosines(model
 
 def test_names_and_titles_say_which_stages_there_are(models: EncoderCatalogue) -> None:
     titles = {about.name: about.title for about in systems(models)}
-    assert titles[DEFAULT_ENCODER] == "M-Region-VLAD with local agreement"
+    assert titles[DEFAULT_ENCODER] == ("M-Region-VLAD with local agreement and verification where these leave doubt")
+    assert titles[f"{DEFAULT_ENCODER}.two-stages"] == "M-Region-VLAD with local agreement"
     assert titles[f"{DEFAULT_ENCODER}.first-stage"] == "M-Region-VLAD, first stage alone"
     assert titles[f"{DEFAULT_ENCODER}.verified"] == "M-Region-VLAD with local agreement and verification"
     shown = {about.name: about.configuration for about in systems(models)}
@@ -50,7 +53,7 @@ def test_names_and_titles_say_which_stages_there_are(models: EncoderCatalogue) -
     assert "region-vlad" in titles and "region-vlad.first-stage" not in titles and "region-vlad.verified" not in titles
 
 
-@pytest.mark.parametrize("ending", [".first-stage", ".verified"])
+@pytest.mark.parametrize("ending", [".first-stage", ".two-stages", ".verified"])
 def test_each_has_an_identity_of_its_own(ending: str, models: EncoderCatalogue) -> None:
     system = build(DEFAULT_ENCODER + ending, models=models)
     assert system.identity.startswith(f"{DEFAULT_ENCODER}{ending}@")
@@ -69,7 +72,7 @@ def test_variants_take_no_file_of_weights(models: EncoderCatalogue) -> None:
 
 
 def test_verification_adds_the_share_of_inliers(models: EncoderCatalogue) -> None:
-    plain, system = (build(DEFAULT_ENCODER + ending, models=models) for ending in ("", ".verified"))
+    plain, system = (build(DEFAULT_ENCODER + ending, models=models) for ending in (".two-stages", ".verified"))
     assert isinstance(system, VerifiedSystem) and not system.sequential
     places, query = [scene(0), scene(1), blank()], seen_again(scene(0))
     described = [system.describe(frame) for frame in places]
@@ -83,22 +86,43 @@ def test_verification_adds_the_share_of_inliers(models: EncoderCatalogue) -> Non
     assert len(keypoints_in(described[2])) == 0
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """An index with scores that are known."""
-
-    scores: Array
-
-    def score(self, queries: Sequence[Description]) -> Array:
-        return np.repeat(self.scores[None], len(queries), axis=0)
-
-
 def test_only_the_best_places_are_verified(models: EncoderCatalogue) -> None:
-    system = build(f"{DEFAULT_ENCODER}.verified", models=models)
+    plain, system = (build(DEFAULT_ENCODER + ending, models=models) for ending in (".two-stages", ".verified"))
     described = system.describe(scene(0))
-    place = keypoints_in(described)
-    assert isinstance(place, Keypoints) and len(place) > 50
-    scores = np.linspace(0.9, 0.1, CANDIDATES + 3).astype(np.float32)
-    gains = ThreeStages(Fixed(scores), [place] * len(scores)).score([described])[0] - scores
+    places = [described] * (CANDIDATES + 3)
+    gains = (system.index(places).score([described]) - plain.index(places).score([described]))[0]
     np.testing.assert_allclose(gains[CANDIDATES:], 0)
     assert (gains[:CANDIDATES] > 0.5 * WEIGHT).all()  # each is the same picture
+
+
+@pytest.mark.parametrize("verify", ["auto", "always", "never"])
+def test_a_default_encoder_is_judged_by_what_the_service_answers(
+    verify: Verify, models: EncoderCatalogue, tmp_path: Path
+) -> None:
+    """A map of the same frames, asked as the service asks it, orders its places by the same values."""
+    encoder, system = models.get(DEFAULT_ENCODER), build(DEFAULT_ENCODER, models=models, verify=verify)
+    assert isinstance(system, EncoderSystem) and system.identity == encoder.identity
+    places = [jpeg(seed) for seed in (0, 1, 2, 3, 4, 5, 0)]
+    queries = [encoded(seen_again(scene(seed))) for seed in (0, 3)] + [jpeg(40)]
+    atlas = Atlas(tmp_path)
+    lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
+    for number, picture in enumerate(places):
+        enrol(lab, f"p{number}", picture, encoder, PlaceFields(sequence="walk"))
+    answers = [recognize(lab, query, encoder, verify=verify) for query in queries]
+    described = [[system.describe(decode(one)) for one in pictures] for pictures in (places, queries)]
+    scores = system.index(described[0]).score(described[1])
+    for row, answer in zip(scores, answers, strict=True):
+        values = np.empty(len(places))
+        values[answer.candidates.rows] = answer.candidates.values
+        np.testing.assert_allclose(row, values, atol=0.01)  # a map keeps its vectors in half precision
+    states = {answer.third_stage.state for answer in answers}
+    assert states == {"never"} if verify == "never" else "verified" in states
+    atlas.close()
+
+
+def test_by_default_a_best_match_that_fits_is_verified_alone(models: EncoderCatalogue) -> None:
+    systems_ = [build(DEFAULT_ENCODER, models=models, verify=verify) for verify in ("never", "auto", "always")]
+    described = [systems_[1].describe(scene(seed)) for seed in range(24)]
+    never, automatic, always = (system.index(described).score([described[5]])[0] for system in systems_)
+    assert np.flatnonzero(automatic != never).tolist() == [5] and never.argmax() == 5
+    assert automatic[5] == always[5] and 1 < np.count_nonzero(always != never) <= CANDIDATES

@@ -79,7 +79,7 @@ def test_what_cannot_be_a_key_is_refused(store: KeyStore) -> None:
 
 def test_a_name_is_free_again_when_its_key_is_revoked(store: KeyStore) -> None:
     first, _ = store.create("ann", "query")
-    with pytest.raises(InvalidRequest, match="Revoke it first"):
+    with pytest.raises(InvalidRequest, match="Delete it first"):
         store.create("ann", "admin")
     assert store.revoke("ann").id == first.id
     moment = store.revoke(first.id).revoked_at

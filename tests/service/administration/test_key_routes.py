@@ -194,7 +194,7 @@ def test_changes_are_in_the_audit_trail_with_who_made_them(keyed: Server) -> Non
         ("create_key", 201),
         ("narrow_key", 200),
         ("narrow_key", 409),
-        ("revoke_key", 200),
+        ("delete_key", 200),
     ]
     for line in of_key:
         assert (line["principal"], line["key"]) == ("ops", ops["id"])

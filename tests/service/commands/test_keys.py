@@ -34,8 +34,8 @@ def test_a_key_is_shown_once(placerec: Placerec, tmp_path: Path) -> None:
     assert timedelta(days=29, hours=23) < left <= timedelta(days=30)
     table = placerec("keys", "list").stdout
     assert "robot-7" in table and token not in table and token[-43:] not in table
-    placerec("keys", "revoke", "robot-7")
-    told = placerec("keys", "revoke", second["id"]).stderr
+    placerec("keys", "delete", "robot-7")
+    told = placerec("keys", "delete", second["id"]).stderr
     assert "No key is in force" in told
     assert [key["state"] for key in json.loads(placerec("keys", "list", "--json").stdout)] == ["revoked"] * 2
     assert (tmp_path / "data" / "keys.sqlite").exists() and not (tmp_path / "data" / "maps").exists()
@@ -43,7 +43,7 @@ def test_a_key_is_shown_once(placerec: Placerec, tmp_path: Path) -> None:
 
 def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Path) -> None:
     assert "No key was ever created" in placerec("keys", "list").stderr
-    assert "No key was ever created" in placerec("keys", "revoke", "ann", status=1).stderr
+    assert "No key was ever created" in placerec("keys", "delete", "ann", status=1).stderr
     placerec("keys", "create", "ann", "--role", "root", status=2)
     assert (
         "neither a span" in placerec("keys", "create", "ann", "--role", "query", "--expires", "soon", status=1).stderr
@@ -51,7 +51,7 @@ def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Pa
     KeyStore(tmp_path / "data").create("ann", "query")
     assert "already" in placerec("keys", "create", "ann", "--role", "query", status=1).stderr
     (tmp_path / "data" / "keys.sqlite").write_bytes(b"no database")
-    for words in (("list",), ("revoke", "ann"), ("create", "bob", "--role", "query")):
+    for words in (("list",), ("delete", "ann"), ("create", "bob", "--role", "query")):
         assert "keys.sqlite" in placerec("keys", *words, status=1).stderr
 
 

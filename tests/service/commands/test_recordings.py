@@ -139,6 +139,14 @@ def test_a_video_is_enrolled_by_its_keyframes(placerec: Placerec, tmp_path: Path
     assert "4 unchanged" in again.stdout and "0 sent" in again.stdout
 
 
+def test_of_a_video_the_frames_of_a_stop_are_left_out_unless_wanted(placerec: Placerec, tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.mp4")
+    moved = placerec("enroll", tmp_path / "walk.mp4", "--map", "moved", "--create")
+    assert "8 of 12 frames show the same" in moved.stderr and "4 of 4 frames are places" in moved.stdout
+    whole = placerec("enroll", tmp_path / "walk.mp4", "--map", "whole", "--create", "--keep-standing")
+    assert "12 of 12 frames are places" in whole.stdout
+
+
 def test_keyframes_of_a_bag_follow_its_poses(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(6))
     words = ("enroll", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)

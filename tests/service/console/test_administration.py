@@ -44,9 +44,9 @@ def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed
     dialog.get_by_role("button", name="Narrow").click()
     dialog.wait_for(state="detached")
     assert may_list("GET", f"/v1/maps/{LAB}") == 200 and may_list("GET", "/v1/maps/none") == 403
-    row.get_by_role("button", name="Revoke fleet-7").click()
+    row.get_by_role("button", name="Delete fleet-7").click()
     dialog.get_by_role("textbox").fill("fleet-7")
-    dialog.get_by_role("button", name="Revoke the key").click()
+    dialog.get_by_role("button", name="Delete the key").click()
     row.wait_for(state="detached")
     assert may_list("GET", "/v1/maps") == 401
     page.get_by_label("also ended ones").check()
@@ -55,12 +55,12 @@ def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed
 
 def test_nobody_locks_all_admins_out_by_accident(admin: Operator) -> None:
     page = admin.go("keys")
-    page.get_by_role("button", name="Revoke admin-key").click()
+    page.get_by_role("button", name="Delete admin-key").click()
     dialog = page.get_by_role("dialog")
     dialog.get_by_text("It is the key that you use now.").wait_for()
     dialog.get_by_role("textbox").fill("admin-key")
     admin.foresee("409")
-    dialog.get_by_role("button", name="Revoke the key").click()
+    dialog.get_by_role("button", name="Delete the key").click()
     dialog.get_by_role("alert").wait_for()
     dialog.get_by_label("Do it although", exact=False).wait_for()
     page.keyboard.press("Escape")

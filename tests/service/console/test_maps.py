@@ -184,33 +184,33 @@ def test_metadata_that_is_no_json_is_told_before_it_is_sent(admin: Operator, spa
     page.get_by_role("dialog").get_by_text("Write the metadata as a JSON object.").wait_for()
 
 
-def test_one_place_is_forgotten_by_its_name(admin: Operator, keyed: Server, spare: str) -> None:
+def test_one_place_is_deleted_by_its_name(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go(f"maps/{spare}/places/p2")
-    page.get_by_role("button", name="Forget").click()
+    page.get_by_role("button", name="Delete").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("p2")
-    page.get_by_role("button", name="Forget the place").click()
+    page.get_by_role("button", name="Delete the place").click()
     page.wait_for_url("**/places")
     assert "p2" not in keyed.places(spare)
 
 
 @pytest.mark.parametrize("way", ["chosen", "filtered"])
-def test_many_places_are_forgotten_together(visit: Visit, keyed: Server, spare: str, way: str) -> None:
+def test_many_places_are_deleted_together(visit: Visit, keyed: Server, spare: str, way: str) -> None:
     operator = visit("enrol")
     page = operator.go(f"maps/{spare}/places")
     if way == "chosen":
         page.get_by_label("Choose p1").check()
         page.get_by_label("Choose p3").check()
-        page.get_by_role("button", name="Forget 2 chosen").click()
+        page.get_by_role("button", name="Delete 2 chosen").click()
     else:
         page.get_by_label("Metadata").fill("floor = 1")
         page.get_by_label("Metadata").press("Enter")
-        page.get_by_role("button", name="Forget all of these").click()
-    dialog = page.get_by_role("dialog", name="Forget 2 places")
+        page.get_by_role("button", name="Delete all of these").click()
+    dialog = page.get_by_role("dialog", name="Delete 2 places")
     for name in ("p1", "p3"):
         expect(dialog).to_contain_text(name)
     assert len(keyed.places(spare)) == 4
     dialog.get_by_role("textbox").fill(spare)
-    dialog.get_by_role("button", name="Forget", exact=True).click()
+    dialog.get_by_role("button", name="Delete", exact=True).click()
     dialog.wait_for(state="detached")
     assert keyed.places(spare).keys() == {"p0", "p2"}
 

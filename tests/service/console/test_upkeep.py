@@ -155,9 +155,9 @@ def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> 
     prune.get_by_role("button", name="What would it cost?").click()
     prune.get_by_text("Recall after").wait_for()
     assert len(keyed.places("pruned")) == enrolled, "a dry run removes nothing"
-    prune.get_by_role("button", name=re.compile(r"Remove \d+ places")).click()
+    prune.get_by_role("button", name=re.compile(r"Delete \d+ places")).click()
     page.get_by_role("dialog").get_by_role("textbox").fill("pruned")
-    page.get_by_role("dialog").get_by_role("button", name="Remove the places").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete the places").click()
     prune.get_by_text("Gone").wait_for()
     assert len(keyed.places("pruned")) < enrolled
 

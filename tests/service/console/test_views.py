@@ -47,7 +47,7 @@ def open_to(role: str, needed: str) -> bool:
 @pytest.mark.parametrize("role", LEVELS[:2])
 def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) -> None:
     operator = visit(role)
-    changes = "Create|Delete|Edit|Forget|Import|Export|Calibrate|Apply"
+    changes = "Create|Delete|Edit|Import|Export|Calibrate|Apply"
     refused = (
         rf"^\s*({changes}|Align|What would alignment)"
         if role == "query"

@@ -142,7 +142,7 @@ def test_enrolments_are_told_by_commit(quick: Server, lab: str) -> None:
         ).json()
         assert closed["change"] == "created", closed
         order = {"ids": ["b0", "b1"], "dry_run": False}
-        assert quick.client.post(f"/v1/maps/{lab}/places:forget", json=order).json()["places"] == 2
+        assert quick.client.post(f"/v1/maps/{lab}/places:delete", json=order).json()["places"] == 2
         assert quick.client.delete(f"/v1/maps/{lab}/places/b2").is_success
         told = ear.some(10, "enrolment")
     assert [one.data["changes"] for one in told] == [

@@ -19,7 +19,7 @@ NO_LIMITS = {
     "store", "milvus", "milvus_token", "milvus_certificate", "milvus_database", "postgres",
     "objects", "objects_endpoint", "objects_region", "objects_access_key", "objects_secret_key", "objects_certificate",
     "ray", "ray_address", "ray_batch", "ray_replicas", "ray_max_replicas", "ray_replica_cpus", "ray_replica_gpus",
-    "ray_scale_seconds",
+    "ray_scale_seconds", "rehearsal",
 }  # fmt: skip
 """Settings by which nobody is refused."""
 

@@ -17,9 +17,9 @@ OPERATIONS = {
     "check_liveness", "check_readiness", "read_metrics", "read_version",
     "create_map", "list_maps", "read_map", "edit_map", "delete_map", "verify_map",
     "follow_map",
-    "enrol_place", "enrol_places", "list_places", "read_place", "edit_place", "forget_place", "see_thumbnail",
+    "enrol_place", "enrol_places", "list_places", "read_place", "edit_place", "delete_place", "see_thumbnail",
     "list_sequences", "delete_sequence",
-    "put_camera", "list_cameras", "read_camera", "forget_camera",
+    "put_camera", "list_cameras", "read_camera", "delete_camera",
     "query", "query_batch", "query_maps", "query_or_enrol", "see_explanation",
     "create_session", "list_sessions", "read_session", "delete_session", "send_frame",
     "compare_traverses", "calibrate_map", "reencode_map", "check_health", "align_map", "prune_map", "merge_map",
@@ -28,8 +28,8 @@ OPERATIONS = {
     "list_review", "see_review_picture", "label_frame", "export_labels",
     "list_jobs", "read_job", "follow_job", "cancel_job",
     "encode", "regions", "match", "list_encoders",
-    "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "revoke_key", "read_audit", "read_service",
-    "read_plan", "list_answers", "list_place_matches", "forget_places",
+    "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "delete_key", "read_audit", "read_service",
+    "read_plan", "list_answers", "list_place_matches", "delete_places",
     "read_calibration",
 }  # fmt: skip
 FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from core.errors import InvalidCursor, TooManyToForget
+from core.errors import InvalidCursor, TooManyToDelete
 from core.maps import MapSettings
 from core.maps.place_filter import PlaceFilter
 from core.storage import Atlas
@@ -62,7 +62,7 @@ def test_a_listing_and_a_dry_run_choose_the_same_places(server: Server, filled: 
         }
         page = server.client.get(places, params=parameters).json()
         assert [item["id"] for item in page["items"]] == expected, conditions
-        would = server.client.post(f"{places}:forget", json={"filter": conditions}).json()
+        would = server.client.post(f"{places}:delete", json={"filter": conditions}).json()
         assert would == {"dry_run": True, "places": len(expected), "ids": expected, "missing": []}, conditions
     assert len(server.places(filled)) == 6
 
@@ -79,7 +79,7 @@ def test_pages_of_a_filtered_listing(server: Server, filled: str) -> None:
 
 
 def test_many_are_forgotten_in_one_request(server: Server, filled: str) -> None:
-    forget = f"/v1/maps/{filled}/places:forget"
+    forget = f"/v1/maps/{filled}/places:delete"
     before = server.client.get(f"/v1/maps/{filled}/plan").headers["etag"]
     done = server.client.post(forget, json={"ids": ["p4", "p0", "p4", "absent"], "dry_run": False})
     assert done.json() == {"dry_run": False, "places": 2, "ids": ["p0", "p4"], "missing": ["absent"]}
@@ -94,7 +94,7 @@ def test_many_are_forgotten_in_one_request(server: Server, filled: str) -> None:
 
 
 def test_what_does_not_say_which_is_refused(server: Server, filled: str) -> None:
-    forget = f"/v1/maps/{filled}/places:forget"
+    forget = f"/v1/maps/{filled}/places:delete"
     wrong: list[dict[str, Any]] = [
         {},
         {"dry_run": False},
@@ -114,7 +114,7 @@ def test_what_does_not_say_which_is_refused(server: Server, filled: str) -> None
     for parameters in ({"where": "{"}, {"where": "[]"}, {"after": DAY.format(22), "before": DAY.format(20)}):
         response = server.client.get(f"/v1/maps/{filled}/places", params=parameters)
         assert_problem(response, 422, "invalid-request")
-    assert_problem(server.client.post("/v1/maps/absent/places:forget", json={"ids": ["p"]}), 404, "unknown-map")
+    assert_problem(server.client.post("/v1/maps/absent/places:delete", json={"ids": ["p"]}), 404, "unknown-map")
     assert len(server.places(filled)) == 6
 
 
@@ -124,7 +124,7 @@ def test_more_than_may_be_forgotten_at_once_are_all_kept(tmp_path: Path) -> None
     lab.enrol([frame(f"p{number}", sequence="s") for number in range(5)])
     wanted = PlaceFilter(sequence="s")
     for choose in (lab.ids_of, lab.forget_all):
-        with pytest.raises(TooManyToForget):
+        with pytest.raises(TooManyToDelete):
             choose(wanted, 4)
     assert lab.count_places() == 5
     assert lab.forget_all(wanted, 5) == [f"p{number}" for number in range(5)]

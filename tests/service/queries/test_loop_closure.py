@@ -5,6 +5,8 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
+import numpy as np
+import pytest
 
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text, typed
@@ -56,6 +58,15 @@ def test_a_known_frame_does_not_become_a_place(server: Server, map_id: str) -> N
     assert server.client.get(f"/v1/maps/{map_id}/places/p2").status_code == 404
 
 
+def test_the_very_picture_of_a_place_does_not_become_another(server: Server, map_id: str) -> None:
+    """No parallax tells the two frames apart, so that no fundamental matrix alone could be found."""
+    server.enrol(map_id, "p37", jpeg(37))
+    response = close(server, map_id, "again", jpeg(37))
+    answer = response.json()
+    assert response.status_code == 200 and answer["verdict"] == "recognized" and answer["place"]["id"] == "p37", answer
+    assert answer["change"] is None and count(server, map_id) == 1
+
+
 def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
     fill(server, map_id)
     first = close(server, map_id, "p1", jpeg(1), x=0, y=0)
@@ -105,6 +116,19 @@ def test_a_blank_frame_is_no_place(server: Server, map_id: str) -> None:
         "unknown", "no-regions", None, None,
     )  # fmt: skip
     assert count(server, map_id) == 0
+
+
+@pytest.mark.parametrize(("level", "noise"), [(20, 10), (128, 30)])
+def test_what_a_covered_camera_shows_is_no_place(server: Server, map_id: str, level: int, noise: int) -> None:
+    fill(server, map_id)
+    random = np.random.default_rng(level)
+    looks = [np.clip(random.normal(level, noise, (240, 320, 3)), 0, 255).astype(np.uint8) for _ in range(2)]
+    for number, look in enumerate(looks):
+        response = close(server, map_id, f"p{number}", encoded(look), x=0, y=0)
+        answer = response.json()
+        assert response.status_code == 200, answer
+        assert (answer["verdict"], answer["change"], answer["enrolled"]) == ("unknown", None, None)
+    assert count(server, map_id) == len(BACKGROUND)
 
 
 def test_invalid_loop_closures(server: Server, map_id: str) -> None:

@@ -109,4 +109,4 @@ def test_keys_work_at_all_services(
         within_a_second(lambda: len(trail(one)) == 2)
         assert trail(one) == trail(other)
         (revoked, at_other), (created, at_one) = trail(one)
-        assert (revoked, created) == ("revoke_key", "create_key") and at_one != at_other
+        assert (revoked, created) == ("delete_key", "create_key") and at_one != at_other

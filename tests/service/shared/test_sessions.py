@@ -50,9 +50,12 @@ def test_services_go_on_with_one_session(services: tuple[Server, Server]) -> Non
     one, other = services
     alone, shared = begin(one, MAP), begin(one, MAP)
     for number in range(8):
-        expected = send(one, MAP, alone, again(number), frame=number)
-        answer = send(services[number % 2], MAP, shared, again(number), frame=number)
+        motion = {"forward": 2.0} if number else {}
+        pose = {"odometry_x": 5.0, "odometry_y": 2.0 * number, "odometry_heading": 90.0, "odometry_origin": "a"}
+        expected = send(one, MAP, alone, again(number), frame=number, **motion)
+        answer = send(services[number % 2], MAP, shared, again(number), frame=number, **pose)
         assert beliefs(answer) == pytest.approx(beliefs(expected), abs=1e-3)
+        assert answer["motion"] == expected["motion"]
         assert (answer["frames"], answer["saved"], answer["frames_lost"]) == (number + 1, True, None)
     # The last frame again, at the service that did not process it.
     repeated = send(one, MAP, shared, again(7), frame=7)

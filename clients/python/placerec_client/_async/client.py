@@ -30,7 +30,7 @@ class AsyncClient:
     time.
 
     Args:
-        url: of the service.
+        url: of the service; a host without ``http://``, such as ``127.0.0.1:8000``, is one by http.
         key: to send with every request; None for a service without keys.
         timeout: seconds to wait for one answer.
         retry: for how long a request is sent again while the service is overloaded, restarts or cannot be reached.
@@ -64,6 +64,7 @@ class AsyncClient:
         self.keys = AsyncKeys(connection)
 
     async def __aenter__(self) -> Self:
+        self.connection.check_open()
         return self
 
     async def __aexit__(
@@ -72,7 +73,7 @@ class AsyncClient:
         await self.close()
 
     async def close(self) -> None:
-        """Close all connections; the client cannot be used any more."""
+        """Close all connections; a call afterwards raises ``ClientClosed``."""
         await self.connection.close()
 
     def patient(self, retry: Retry) -> AsyncClient:

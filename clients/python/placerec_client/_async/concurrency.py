@@ -22,6 +22,16 @@ async def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
     return await asyncio.to_thread(work, *arguments)
 
 
+async def within(seconds: float, work: Callable[[], Awaitable[Result]]) -> Result:
+    """The result of work that is waited for so long.
+
+    Raises:
+        TimeoutError: there is none yet; the work is broken off.
+    """
+    async with asyncio.timeout(seconds):
+        return await work()
+
+
 class Task(Generic[Result]):
     """Work that goes on while other things are done."""
 
@@ -45,6 +55,16 @@ class Task(Generic[Result]):
 
 
 Lock = asyncio.Lock
+
+
+async def acquire(lock: Lock, seconds: float | None) -> None:
+    """Take a lock, which those who ask for it get in their order.
+
+    Raises:
+        TimeoutError: it has not become free within so many seconds; None waits for any time.
+    """
+    async with asyncio.timeout(seconds):
+        await lock.acquire()
 
 
 async def received(socket: ClientConnection, seconds: float) -> str | bytes:

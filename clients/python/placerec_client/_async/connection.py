@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -13,7 +14,7 @@ from placerec_client._async.concurrency import sleep
 from placerec_client._async.lanes import AsyncLanes
 from placerec_client._http import httpx
 from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
-from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
+from placerec_client.errors import ClientClosed, ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
 from placerec_client.model import Model
 from placerec_client.requests import dumps, query_string
 from placerec_client.retry import Clock, Retry
@@ -38,6 +39,9 @@ PAGE = 500
 
 KNOWN_URLS = 1000
 
+HOST = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[^\s:/?#@\[\]]+)(:[0-9]+)?(/[^\s?#]*)?")
+"""What is taken for the URL of a service without its scheme: a host, perhaps with a port and a path."""
+
 KEY = re.compile(r"[!-~]+")
 """The visible characters of ASCII, of which a header may be made."""
 
@@ -46,7 +50,7 @@ class AsyncConnection:
     """The connection to a service, which all objects of one client share.
 
     Args:
-        url: of the service.
+        url: of the service; ``http://`` if it begins with a host.
         key: that is sent with every request; None for none.
         timeout: seconds to wait for one answer.
         retry: when a request is sent again.
@@ -66,13 +70,10 @@ class AsyncConnection:
         transport: httpx.AsyncBaseTransport | None,
         name: str | None = None,
     ) -> None:
-        if not url.startswith(("http://", "https://")):
-            raise ConnectionFailed(f"{url} is not a URL of a service: it has to start with http:// or https://.")
-        self.url, self.name, self.timeout, self.retry = url.rstrip("/"), name or url, timeout, retry
-        try:
-            parsed_url = httpx.URL(self.url)
-        except (httpx.InvalidURL, ValueError) as error:
-            raise ConnectionFailed(f"{url} is not a URL: {error}.") from error
+        self.url = service_url(url)
+        self.name, self.timeout, self.retry = name or self.url, timeout, retry
+        parsed_url = httpx.URL(self.url)
+        self._closed = threading.Event()  # shared with the connections that differ in patience
         self._transport = transport or AsyncLanes(parsed_url, IDLE_SECONDS)
         self.headers = [
             (b"Host", parsed_url.netloc),
@@ -96,8 +97,14 @@ class AsyncConnection:
         return self.patient(replace(retry, patience=max(patience, retry.patience))) if retry.patience else self
 
     async def close(self) -> None:
-        """Close all connections."""
+        """Close all connections; what is asked afterwards is refused."""
+        self._closed.set()
         await self._transport.aclose()
+
+    def check_open(self) -> None:
+        """Raise ClientClosed after ``close``."""
+        if self._closed.is_set():
+            raise ClientClosed
 
     async def request(
         self,
@@ -131,6 +138,7 @@ class AsyncConnection:
         Raises:
             Problem: the service answers with a problem.
             ConnectionFailed, DeadlineExceeded, UnexpectedAnswer: no answer of a service came, or none in time.
+            ClientClosed: the connection was closed.
         """
         if json is not None:
             content, media_type = dumps(json).encode(), "application/json"
@@ -155,17 +163,18 @@ class AsyncConnection:
                 if not is_passing(outcome) or (isinstance(failure, Problem) and failure.slug in final):
                     raise failure
                 clock.lost = clock.lost or outcome.status_code in UNKNOWN_OUTCOME
-                wait = max(self.retry.pause(clock.attempts), retry_after(outcome) or 0.0)
+                pause = clock.pause(retry_after(outcome))
             else:
-                failure, wait = outcome, self.retry.pause(clock.attempts)
-            if not clock.allows(wait):
+                failure, pause = outcome, clock.pause()
+            if pause is None:
                 raise self._given_up(clock, failure)
-            await sleep(wait)
+            await sleep(pause)
 
     async def _attempt(
         self, method: str, url: httpx.URL, headers: list[tuple[bytes, bytes]], content: Content, clock: Clock
     ) -> httpx.Response | PlacerecError:
         """One attempt: its answer, or why there is none."""
+        self.check_open()
         clock.attempts += 1
         left = clock.left()
         limit = self.timeout
@@ -240,7 +249,9 @@ class AsyncConnection:
 
         Raises:
             Problem, ConnectionFailed, UnexpectedAnswer: it is no success, or none came.
+            ClientClosed: the connection was closed.
         """
+        self.check_open()
         sent = [*self.headers, *((name.encode(), value.encode()) for name, value in headers.items())]
         limit = min(self.timeout, SILENCE_SECONDS)
         times = {"connect": CONNECT_SECONDS, "read": limit, "write": limit, "pool": limit}
@@ -257,6 +268,27 @@ class AsyncConnection:
                 await response.aclose()
         except httpx.HTTPError as error:
             raise self._failure("cannot be reached", error) from error
+
+
+def service_url(url: str) -> str:
+    """The URL of a service in full, without a slash at its end; a host, with a port or without, is one by ``http``.
+
+    Raises:
+        ConnectionFailed: it is none.
+    """
+    full = url if url.startswith(("http://", "https://")) else f"http://{url}" if HOST.fullmatch(url) else None
+    if full is None:
+        raise ConnectionFailed(
+            f"{url!r} is not a URL of a service: it has to start with http:// or https://, or with the service's host."
+        )
+    try:
+        parsed_url = httpx.URL(full)
+    except (httpx.InvalidURL, ValueError) as error:
+        raise ConnectionFailed(f"{url!r} is not a URL: {error}.") from error
+    if not parsed_url.host or parsed_url.query or parsed_url.fragment:
+        reason = "names no host" if not parsed_url.host else "has a query string or a fragment"
+        raise ConnectionFailed(f"{url!r} is not a URL of a service: it {reason}.")
+    return full.rstrip("/")
 
 
 class AsyncTimely(httpx.AsyncByteStream):

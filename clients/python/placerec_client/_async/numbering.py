@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 from placerec_client import models, parameters
+from placerec_client._async.concurrency import Lock, acquire
 from placerec_client._async.connection import AsyncConnection
+from placerec_client.errors import DeadlineExceeded
 
 
 class AsyncNumbering:
-    """Counts the frames of one session.
+    """Counts the frames of one session, which are sent one after the other, whoever sends them.
 
     Args:
         connection: to the service.
@@ -17,6 +23,24 @@ class AsyncNumbering:
 
     def __init__(self, connection: AsyncConnection, path: str, first: int | None) -> None:
         self._connection, self._path, self._next = connection, path, first
+        self._lock = Lock()
+
+    @asynccontextmanager
+    async def turn(self, deadline: float | None) -> AsyncIterator[float | None]:
+        """Wait for the frames before; yield the seconds that are left until the deadline, None without one.
+
+        Raises:
+            DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
+        """
+        began = time.monotonic()
+        try:
+            await acquire(self._lock, deadline)
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
+        try:
+            yield None if deadline is None else deadline - round(time.monotonic() - began, 3)
+        finally:
+            self._lock.release()
 
     async def number(self, options: parameters.SendFrame) -> parameters.SendFrame:
         """Return the options of a frame with its number: the caller's own, or the next one."""

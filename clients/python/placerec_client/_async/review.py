@@ -7,6 +7,7 @@ from typing import Unpack
 
 from placerec_client import models, parameters
 from placerec_client._async.connection import AsyncConnection
+from placerec_client.requests import path_of
 
 
 class AsyncReview:
@@ -30,11 +31,12 @@ class AsyncReview:
 
     async def picture(self, frame: int) -> bytes:
         """Return the file of a frame."""
-        return (await self._connection.request("GET", f"{self._path}/{frame}/picture")).content
+        path = path_of(frame, "picture", below=self._path)
+        return (await self._connection.request("GET", path)).content
 
     async def label(
         self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]
     ) -> models.Labelled:
         """Say what a frame shows: a ``place``, a ``new`` place, a ``stranger``; or ``discard`` it."""
-        path = f"{self._path}/{frame}"
+        path = path_of(frame, below=self._path)
         return await self._connection.ask(models.Labelled, "POST", path, json=options, deadline=deadline)

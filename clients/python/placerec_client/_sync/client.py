@@ -31,7 +31,7 @@ class Client:
     time.
 
     Args:
-        url: of the service.
+        url: of the service; a host without ``http://``, such as ``127.0.0.1:8000``, is one by http.
         key: to send with every request; None for a service without keys.
         timeout: seconds to wait for one answer.
         retry: for how long a request is sent again while the service is overloaded, restarts or cannot be reached.
@@ -65,6 +65,7 @@ class Client:
         self.keys = Keys(connection)
 
     def __enter__(self) -> Self:
+        self.connection.check_open()
         return self
 
     def __exit__(
@@ -73,7 +74,7 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close all connections; the client cannot be used any more."""
+        """Close all connections; a call afterwards raises ``ClientClosed``."""
         self.connection.close()
 
     def patient(self, retry: Retry) -> Client:

@@ -27,6 +27,15 @@ def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
     return work(*arguments)
 
 
+def within(seconds: float, work: Callable[[], Result]) -> Result:
+    """The result of work that is waited for so long, in a thread: looking up a name, for one, has no other end.
+
+    Raises:
+        TimeoutError: there is none yet; the work goes on behind.
+    """
+    return Task(work).result(seconds)
+
+
 class Task(Generic[Result]):
     """Work that goes on in a thread of its own, which does not keep the process from ending."""
 
@@ -42,9 +51,9 @@ class Task(Generic[Result]):
         self._thread = threading.Thread(target=run, daemon=True, name="placerec")
         self._thread.start()
 
-    def result(self) -> Result:
-        """Wait for the end of the work; return its result or raise its error."""
-        return self._future.result()
+    def result(self, seconds: float | None = None) -> Result:
+        """Wait for the end of the work; return its result or raise its error, or TimeoutError after so many seconds."""
+        return self._future.result(seconds)
 
     def end(self) -> None:
         """Wait for a moment that the work ends, whatever comes of it."""
@@ -52,6 +61,16 @@ class Task(Generic[Result]):
 
 
 Lock = threading.Lock
+
+
+def acquire(lock: threading.Lock, seconds: float | None) -> None:
+    """Take a lock.
+
+    Raises:
+        TimeoutError: it has not become free within so many seconds; None waits for any time.
+    """
+    if not lock.acquire(timeout=-1 if seconds is None else max(seconds, 0.0)):
+        raise TimeoutError
 
 
 def received(socket: ClientConnection, seconds: float) -> str | bytes:

@@ -8,11 +8,12 @@ from typing import Literal, Unpack
 
 from placerec_client import models, parameters
 from placerec_client._sync.connection import Connection
-from placerec_client.requests import quoted
+from placerec_client.renamed import OldNames
+from placerec_client.requests import path_of
 from placerec_client.retry import Retry
 
 
-class Keys:
+class Keys(OldNames):
     """The keys of a service; iterated, all that were ever created, without their secrets. They need the role admin."""
 
     def __init__(self, connection: Connection) -> None:
@@ -37,7 +38,7 @@ class Keys:
     ) -> models.CreatedKey:
         """Create a key; its secret is in this answer only.
 
-        It is sent once: if the answer is lost, the key may be there all the same, and should be revoked.
+        It is sent once: if the answer is lost, the key may be there all the same, and should be deleted.
 
         Args:
             name: whose key it is.
@@ -59,9 +60,9 @@ class Keys:
             models.KeyView, "PATCH", self._of(key_id), params={"lock_out": lock_out}, json=changes
         )
 
-    def revoke(self, key_id: str, *, lock_out: bool | None = None) -> models.KeyView:
-        """Revoke a key, so that nobody is let in with it."""
+    def delete(self, key_id: str, *, lock_out: bool | None = None) -> models.KeyView:
+        """Delete a key: it is revoked, so that nobody is let in with it."""
         return self._connection.ask(models.KeyView, "DELETE", self._of(key_id), params={"lock_out": lock_out})
 
     def _of(self, key_id: str) -> str:
-        return f"{self._path}/{quoted(key_id)}"
+        return path_of(key_id, below=self._path)

@@ -22,7 +22,8 @@ from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
 from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import Part, dumps, fields, form, path_of, quoted
+from placerec_client.renamed import OldNames
+from placerec_client.requests import Part, dumps, fields, form, path_of
 
 TRANSFER_PATIENCE = 3600.0
 """Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
@@ -239,8 +240,8 @@ class Map:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
-    ) -> Generator[Enrolled]:
-        """Enrol many frames in their order, and yield what became of each.
+    ) -> list[Enrolled]:
+        """Enrol many frames in their order, and return what became of each.
 
         It can be broken off and called again with the same frames: those that the map holds already are neither sent
         nor encoded a second time; their fields are updated. A frame that cannot be used has an ``error``, and the
@@ -249,13 +250,33 @@ class Map:
         ::
 
             frames = (NewPlace(path.stem, path, {"sequence": "monday"}) for path in sorted(folder.glob("*.jpg")))
-            for one in lab.enrol(frames):
-                print(one.place.id, one.change or one.error)
+            refused = [one.error for one in lab.enrol(frames) if one.error]
 
         Args:
             places: read in a thread when their turn comes.
             known: ids that the map has; found out if left out.
             encoder: name or identity that the map must have.
+        """
+        return [one for one in self.enrol_each(places, known=known, encoder=encoder)]
+
+    def enrol_each(
+        self,
+        places: Iterable[NewPlace],
+        *,
+        known: Container[str] | None = None,
+        encoder: str | None = None,
+    ) -> Generator[Enrolled]:
+        """Enrol many frames as ``enrol`` does, and yield what became of each as soon as it is known.
+
+        Frames are sent only while the outcomes are taken: called without a loop over it, it does nothing.
+
+        ::
+
+            for one in lab.enrol_each(frames):
+                print(one.place.id, one.change or one.error)
+
+        Args:
+            places, known, encoder: as of ``enrol``.
         """
         if known is None:
             known = {place.id for place in self.places.list()}
@@ -329,8 +350,8 @@ class Map:
 
     def explanation(self, explanation: str) -> bytes:
         """Return the picture of an explanation, a PNG file, by its id or the address in an answer."""
-        name = explanation.rpartition("/")[2]
-        return (self.connection.request("GET", f"{self.path}/explanations/{quoted(name)}")).content
+        path = path_of("explanations", explanation.rpartition("/")[2], below=self.path)
+        return (self.connection.request("GET", path)).content
 
     @overload
     def calibrate(
@@ -442,7 +463,7 @@ class Map:
         return Job.submit(self.connection, path, **options)
 
 
-class Sequences:
+class Sequences(OldNames):
     """The traverses of a map."""
 
     def __init__(self, connection: Connection, path: str) -> None:
@@ -457,18 +478,18 @@ class Sequences:
             for item in page.items:
                 yield item
 
-    def forget(self, name: str) -> models.ForgottenSequence:
+    def delete(self, name: str) -> models.DeletedSequence:
         """Delete all places of a traverse. If the answer to the first attempt is lost, 0 places are reported."""
         try:
-            path = f"{self._path}/{quoted(name)}"
-            return self._connection.ask(models.ForgottenSequence, "DELETE", path)
+            path = path_of(name, below=self._path)
+            return self._connection.ask(models.DeletedSequence, "DELETE", path)
         except problems.UnknownSequence as problem:
             if not problem.after_loss:
                 raise
-            return models.ForgottenSequence(name=name, places=0)
+            return models.DeletedSequence(name=name, places=0)
 
 
-class Cameras:
+class Cameras(OldNames):
     """The cameras of a map."""
 
     def __init__(self, connection: Connection, path: str) -> None:
@@ -491,8 +512,8 @@ class Cameras:
         """Return one camera."""
         return self._connection.ask(models.CameraView, "GET", self._of(name))
 
-    def forget(self, name: str) -> None:
-        """Forget a camera; places that were enrolled with it stay."""
+    def delete(self, name: str) -> None:
+        """Delete a camera; places that were enrolled with it stay."""
         try:
             self._connection.request("DELETE", self._of(name))
         except problems.UnknownCamera as problem:
@@ -500,7 +521,7 @@ class Cameras:
                 raise
 
     def _of(self, name: str) -> str:
-        return f"{self._path}/{quoted(name)}"
+        return path_of(name, below=self._path)
 
 
 def _condition(if_match: int | str | None) -> dict[str, str]:

@@ -3,12 +3,18 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from placerec_client import models, parameters
+from placerec_client._sync.concurrency import Lock, acquire
 from placerec_client._sync.connection import Connection
+from placerec_client.errors import DeadlineExceeded
 
 
 class Numbering:
-    """Counts the frames of one session.
+    """Counts the frames of one session, which are sent one after the other, whoever sends them.
 
     Args:
         connection: to the service.
@@ -18,6 +24,24 @@ class Numbering:
 
     def __init__(self, connection: Connection, path: str, first: int | None) -> None:
         self._connection, self._path, self._next = connection, path, first
+        self._lock = Lock()
+
+    @contextmanager
+    def turn(self, deadline: float | None) -> Iterator[float | None]:
+        """Wait for the frames before; yield the seconds that are left until the deadline, None without one.
+
+        Raises:
+            DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
+        """
+        began = time.monotonic()
+        try:
+            acquire(self._lock, deadline)
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
+        try:
+            yield None if deadline is None else deadline - round(time.monotonic() - began, 3)
+        finally:
+            self._lock.release()
 
     def number(self, options: parameters.SendFrame) -> parameters.SendFrame:
         """Return the options of a frame with its number: the caller's own, or the next one."""

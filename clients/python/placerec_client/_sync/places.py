@@ -9,10 +9,11 @@ from typing import Unpack
 from placerec_client import models, parameters, problems
 from placerec_client._sync.connection import Connection
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import fields, quoted
+from placerec_client.renamed import OldNames
+from placerec_client.requests import fields, path_of
 
 
-class Places:
+class Places(OldNames):
     """The places of a map; iterated, in the order of their enrolment."""
 
     def __init__(self, connection: Connection, path: str) -> None:
@@ -69,7 +70,7 @@ class Places:
         """Change fields of a place; those left out stay, and None clears a field."""
         return self._connection.ask(models.PlaceView, "PATCH", self._of(place_id), json=changes)
 
-    def forget(self, place_id: str) -> None:
+    def delete(self, place_id: str) -> None:
         """Delete a place: no later query finds it."""
         try:
             self._connection.request("DELETE", self._of(place_id))
@@ -77,22 +78,23 @@ class Places:
             if not problem.after_loss:
                 raise
 
-    def forget_many(self, **options: Unpack[parameters.Forgetting]) -> models.ForgottenPlaces:
+    def delete_many(self, **options: Unpack[parameters.Deletion]) -> models.DeletedPlaces:
         """Delete the places of these ``ids``, or those that a ``filter`` lets through, in one commit.
 
         It only reports which these are unless ``dry_run=False``.
         """
-        path = self._path + ":forget"
-        return self._connection.ask(models.ForgottenPlaces, "POST", path, json=fields(options))
+        path = self._path + ":delete"
+        return self._connection.ask(models.DeletedPlaces, "POST", path, json=fields(options))
 
     def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
         """Return the latest answers in which a place was a match."""
-        path = self._of(place_id) + "/matches"
+        path = path_of(place_id, "matches", below=self._path)
         return self._connection.ask(models.PlaceMatchList, "GET", path, params=options)
 
     def thumbnail(self, place_id: str) -> bytes:
         """Return a small picture of a place, a JPEG file, if the map keeps one."""
-        return (self._connection.request("GET", self._of(place_id) + "/thumbnail")).content
+        path = path_of(place_id, "thumbnail", below=self._path)
+        return (self._connection.request("GET", path)).content
 
     def _of(self, place_id: str) -> str:
-        return f"{self._path}/{quoted(place_id)}"
+        return path_of(place_id, below=self._path)

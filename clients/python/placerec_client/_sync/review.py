@@ -8,6 +8,7 @@ from typing import Unpack
 
 from placerec_client import models, parameters
 from placerec_client._sync.connection import Connection
+from placerec_client.requests import path_of
 
 
 class Review:
@@ -31,11 +32,12 @@ class Review:
 
     def picture(self, frame: int) -> bytes:
         """Return the file of a frame."""
-        return (self._connection.request("GET", f"{self._path}/{frame}/picture")).content
+        path = path_of(frame, "picture", below=self._path)
+        return (self._connection.request("GET", path)).content
 
     def label(
         self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]
     ) -> models.Labelled:
         """Say what a frame shows: a ``place``, a ``new`` place, a ``stranger``; or ``discard`` it."""
-        path = f"{self._path}/{frame}"
+        path = path_of(frame, below=self._path)
         return self._connection.ask(models.Labelled, "POST", path, json=options, deadline=deadline)

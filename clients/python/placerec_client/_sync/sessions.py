@@ -5,18 +5,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from logging import getLogger
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, Unpack
 
 from placerec_client import models, parameters, problems
+from placerec_client._sync.concurrency import within
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.numbering import Numbering
 from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import quoted
+from placerec_client.odometry import Odometry
+from placerec_client.renamed import OldNames
+from placerec_client.requests import path_of
+from placerec_client.retry import Retry
 
 if TYPE_CHECKING:
     from placerec_client._sync.streams import Stream
+
+
+LEAVE_SECONDS = 1.0
+"""How long leaving a session waits for the service."""
+
+log = getLogger("placerec_client")
 
 
 class Sessions:
@@ -40,27 +51,35 @@ class Sessions:
     def begin(self, **options: Unpack[parameters.NewSession]) -> Session:
         """Return a session that begins when it is entered, and ends when it is left.
 
+        Leaving takes a second at most and raises nothing: of a session that the service did not end in that time the
+        log ``placerec_client`` has a warning, and it ends by itself after ``expires_after``.
+
         ::
 
-            with lab.sessions.begin(filter="bayes") as session:
+            with lab.sessions.begin() as session:
                 answer = session.send(frame)
 
         Args:
-            options: such as ``filter``, ``advance``, ``lag``, ``camera``, ``verify``, ``expires_after``.
+            options: such as ``advance``, ``lag``, ``camera``, ``verify``, ``expires_after``.
         """
         return Session(self._connection, self._path, options)
 
 
-class Session:
-    """One session of one robot. Its frames are sent one after the other.
+class Session(OldNames):
+    """One session of one robot. Its frames are sent one after the other, also by ``asyncio.gather`` or several threads.
 
     Attributes:
         id: of the session; empty before it has begun.
     """
 
-    def __init__(self, connection: Connection, path: str, options: parameters.NewSession, session_id: str = "") -> None:
-        self._connection, self._sessions, self._options, self.id = connection, path, options, session_id
-        self._numbering = Numbering(connection, self.path, None) if session_id else None
+    def __init__(
+        self, connection: Connection, path: str, options: parameters.NewSession, session_id: str | None = None
+    ) -> None:
+        self._connection, self._sessions, self._options = connection, path, options
+        self.id = session_id or ""
+        self._numbering = None
+        if session_id is not None:
+            self._numbering = Numbering(connection, path_of(session_id, below=path), None)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.id!r})"
@@ -73,17 +92,26 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.end()
+        try:
+            within(LEAVE_SECONDS, self._leave)
+        except (PlacerecError, TimeoutError) as failure:
+            reason = str(failure) or f"no answer came within {LEAVE_SECONDS:g} s."
+            log.warning("The session %s was left, but the service did not end it now: %s", self.id, reason)
+
+    def _leave(self) -> None:
+        """End the session by one attempt; one that has ended already, or with its map, is left so."""
+        with suppress(problems.UnknownSession, problems.SessionExpired, problems.UnknownMap):
+            self._connection.patient(Retry(0)).request("DELETE", self.path, deadline=LEAVE_SECONDS)
 
     def begin(self) -> models.SessionView:
         """Begin the session. If the answer to an attempt is lost, the next one gets the session that it has begun."""
         view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
         self.id = view.id
-        self._numbering = Numbering(self._connection, self.path, 0)
+        self._numbering = Numbering(self._connection, path_of(self.id, below=self._sessions), 0)
         return view
 
-    def end(self) -> None:
-        """End the session; one that has ended already is left so."""
+    def delete(self) -> None:
+        """Delete the session, for the run is over; one that is gone already is no error."""
         with suppress(problems.UnknownSession, problems.SessionExpired):
             self._connection.request("DELETE", self.path)
 
@@ -95,6 +123,7 @@ class Session:
         self,
         image: Frame,
         *,
+        odometry: Odometry | None = None,
         deadline: float | None = None,
         request_id: str | None = None,
         **options: Unpack[parameters.SendFrame],
@@ -105,22 +134,28 @@ class Session:
 
         Args:
             image: the frame.
+            odometry: where odometry says that the robot is; whatever was lost before, the motion since counts once.
             deadline: seconds after which an answer is of no use.
             request_id: under which the service logs the request; made if left out.
             options: such as ``frame`` (the robot's own number of the frame, growing; counted here if left out),
-                ``timestamp``, ``forward``, ``left``, ``turn``.
+                ``timestamp``; and, instead of ``odometry``, ``forward``, ``left``, ``turn`` since the last frame that
+                the service took in: the session's ``last_frame``.
         """
         data = frame_bytes(image)
-        return self._connection.ask(
-            models.SessionAnswer,
-            "POST",
-            self.path + "/frames",
-            params=self._numbers().number(options),
-            content=data,
-            media_type=media_type(data),
-            deadline=deadline,
-            request_id=request_id,
-        )
+        if odometry is not None:
+            options = {**options, **odometry.fields()}
+        numbering = self._numbers()
+        with numbering.turn(deadline) as left:
+            return self._connection.ask(
+                models.SessionAnswer,
+                "POST",
+                self.path + "/frames",
+                params=numbering.number(options),
+                content=data,
+                media_type=media_type(data),
+                deadline=left,
+                request_id=request_id,
+            )
 
     def stream(self) -> Stream:
         """Return a WebSocket to the session, for frames without a request for each.
@@ -144,4 +179,5 @@ class Session:
     @property
     def path(self) -> str:
         """The path of the session at the service."""
-        return f"{self._sessions}/{quoted(self.id)}"
+        self._numbers()
+        return path_of(self.id, below=self._sessions)

@@ -19,6 +19,7 @@ from placerec_client._sync.numbering import Numbering
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
+from placerec_client.odometry import Odometry
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
@@ -53,12 +54,18 @@ class Stream:
         self._opened.close()
 
     def send(
-        self, image: Frame, *, deadline: float | None = None, **options: Unpack[parameters.SendFrame]
+        self,
+        image: Frame,
+        *,
+        odometry: Odometry | None = None,
+        deadline: float | None = None,
+        **options: Unpack[parameters.SendFrame],
     ) -> models.SessionAnswer:
         """Send one frame, and return the belief after it.
 
         Args:
             image: the frame.
+            odometry: as of ``session.send``.
             deadline: seconds after which an answer is of no use.
             options: as of ``session.send``.
 
@@ -67,10 +74,15 @@ class Stream:
                 ``UnknownSession``.
         """
         data = frame_bytes(image)
-        numbered = self._numbering.number(options)
-        head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
-        retry = self._connection.retry
-        clock = Clock(deadline, retry)
+        if odometry is not None:
+            options = {**options, **odometry.fields()}
+        with self._numbering.turn(deadline) as left:
+            numbered = self._numbering.number(options)
+            head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
+            return self._answer(head, data, Clock(left, self._connection.retry))
+
+    def _answer(self, head: str, data: bytes, clock: Clock) -> models.SessionAnswer:
+        """The answer to a frame, which is sent again where that may help."""
         while True:
             clock.attempts += 1
             try:
@@ -79,16 +91,17 @@ class Stream:
                 if problem.status not in OVERLOADED or (problem.retry_after is None and not _passes(problem)):
                     raise
                 failure: PlacerecError = problem
-                wait = max(retry.pause(clock.attempts), problem.retry_after or 0.0)
+                pause = clock.pause(problem.retry_after)
             except ConnectionFailed as lost:
-                failure, wait = lost, retry.pause(clock.attempts)
-            if not clock.allows(wait):
-                if deadline is None:
+                failure, pause = lost, clock.pause()
+            if pause is None:
+                if clock.deadline is None:
                     raise failure
-                raise DeadlineExceeded(f"No answer came within {deadline:g} s: {failure}") from failure
-            sleep(wait)
+                raise DeadlineExceeded(f"No answer came within {clock.deadline:g} s: {failure}") from failure
+            sleep(pause)
 
     def _attempt(self, head: str, data: bytes, clock: Clock) -> models.SessionAnswer:
+        self._connection.check_open()
         left = clock.left()
         limit = self._connection.timeout if left is None else max(min(self._connection.timeout, left), 0.001)
         try:

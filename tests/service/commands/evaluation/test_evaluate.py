@@ -73,7 +73,7 @@ def test_the_figures_by_hand(placerec: Placerec, traverses: tuple[Path, Path], t
     assert figures["recall_at_full_precision"] == (0.25 if scores[3] > scores[1] else 0.0)
     assert (figures["queries"], figures["references"]) == (4, 4)
     assert figures["encoder"].startswith("m-region-vlad@")
-    assert set(figures["milliseconds"]) == {"forward", "regions", "vlad", "match"}
+    assert set(figures["milliseconds"]) == {"forward", "regions", "vlad", "keypoints", "match"}
     assert all(value > 0 for value in figures["milliseconds"].values())
     assert [one["encoder"] for one in figures["encoders"]] == [figures["encoder"]]
 
@@ -114,6 +114,26 @@ def test_several_encoders_and_a_tolerance(placerec: Placerec, traverses: tuple[P
     assert figures["auc_pr"] == 1.0
     other = (tmp_path / "out.m-region-vlad.csv").read_text().splitlines()
     assert len(other) == 5
+
+
+def test_the_default_is_judged_as_the_service_answers(
+    placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
+) -> None:
+    two = ("--tolerance", 0, "--encoder", "m-region-vlad", "--encoder", "m-region-vlad.two-stages")
+    found = {}
+    for verify in ("auto", "always", "never"):
+        words = () if verify == "auto" else ("--verify", verify)
+        figures, rows = evaluated(placerec, traverses, tmp_path, *two, *words)
+        plain, beside = figures["encoders"]
+        assert plain["encoder"].startswith("m-region-vlad@") and beside["encoder"].startswith("m-region-vlad.two-")
+        assert plain["configuration"].get("verification.verify", "never") == verify
+        assert plain["cached"] is False, "what another way of verifying gave is not taken"
+        found[verify] = {retrieved: score for _, retrieved, score, _ in rows}
+        with (tmp_path / "out.m-region-vlad.two-stages.csv").open() as file:
+            stages = {int(row["retrieved"]): float(row["score"]) for row in csv.DictReader(file)}
+        assert (found[verify] == stages) == (verify == "never")
+    assert all(found["always"][place] > score for place, score in found["never"].items())
+    placerec("evaluate", "--reference", traverses[0], "--query", traverses[1], *two, "--verify", "often", status=2)
 
 
 def test_an_image_that_cannot_be_decoded_stops_the_run(

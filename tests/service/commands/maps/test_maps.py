@@ -79,10 +79,10 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     shown = placerec("maps", "places", "show", name, "9", *where).stdout
     assert "monday" in shown
 
-    placerec("maps", "places", "forget", name, "1", "2", *where)
+    placerec("maps", "places", "delete", name, "1", "2", *where)
     listed = json.loads(placerec("maps", "places", "list", name, "--sequence", "monday", "--json", *where).stdout)
     assert [place["id"] for place in listed] == ["9", "10"]
-    forgotten = placerec("maps", "sequences", "forget", name, "monday", "--yes", *where)
+    forgotten = placerec("maps", "sequences", "delete", name, "monday", "--yes", *where)
     assert "2 places" in forgotten.stderr
     assert json.loads(placerec("maps", "sequences", "list", name, "--json", *where).stdout) == []
 

@@ -1,0 +1,97 @@
+"""What can be a name, told again by what Unicode says of its characters, and what becomes of names in a URL."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import unicodedata
+from urllib.parse import quote
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
+
+from core.errors import InvalidIdentifier
+from core.names import LONGEST, TEXT, check_name, word
+from core.networks.network import NAME as ENCODER_NAME
+from core.places import MAP_ID, PLACE_ID, Camera, Sequence, check_map_id, check_place_id, check_sequence
+
+MARKS = {"\u061c", "\u200e", "\u200f"}
+TURNING = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
+ODD = "./\\%2e \n\r\0\x7f\x80\x9f\u061c\u200d\u200e\u200f\u2028\u2029\u202a\u202e\u2066\u2069üА日💡"
+SEQUENCE: TypeAdapter[str] = TypeAdapter(Sequence)
+WORDS = (MAP_ID, PLACE_ID, ENCODER_NAME.strip("^$"), word(64), word(64, more="@"))
+
+
+def can_be(text: str) -> bool:
+    return 0 < len(text) <= LONGEST and text not in (".", "..") and not any(map(cannot_be_in, text))
+
+
+def cannot_be_in(letter: str) -> bool:
+    unseen = unicodedata.category(letter) in ("Cc", "Zl", "Zp") or unicodedata.bidirectional(letter) in TURNING
+    return letter == "/" or letter in MARKS or unseen
+
+
+def taken(text: str) -> bool:
+    """Whether a text passes, which the function and the model agree on."""
+    try:
+        check_sequence(text)
+        passes = True
+    except InvalidIdentifier:
+        passes = False
+    try:
+        SEQUENCE.validate_python(text)
+    except ValidationError:
+        assert not passes
+    else:
+        assert passes
+    return passes
+
+
+@given(st.one_of(st.text(max_size=LONGEST + 2), st.text(ODD, max_size=5), st.from_regex(TEXT, fullmatch=True)))
+def test_a_name_is_what_can_be_read_and_stands_in_a_path(text: str) -> None:
+    assert taken(text) == can_be(text)
+
+
+@pytest.mark.parametrize("letter", [chr(point) for point in range(0x3000) if cannot_be_in(chr(point))], ids=ascii)
+def test_no_name_has_an_unseen_character(letter: str) -> None:
+    for text in (letter, f"a{letter}", f"{letter}a", f"a{letter}b", f"..{letter}", f"...{letter}"):
+        assert not taken(text)
+
+
+def test_dots_are_names_only_from_three_on() -> None:
+    assert [taken("." * count) for count in range(5)] == [False, False, False, True, True]
+    assert all(map(taken, (".a", "..a", "a..", "a.", "a", ". ", ".%", "…", "x" * LONGEST)))
+    assert not taken("x" * (LONGEST + 1))
+
+
+@given(st.from_regex(TEXT, fullmatch=True))
+def test_a_path_keeps_a_name_whatever_normalizes_it(text: str) -> None:
+    path = f"/v1/maps/lab/sequences/{quote(text, safe='')}"
+    assert httpx.URL(f"http://robot{path}").raw_path.decode() == path == posixpath.normpath(path)
+
+
+@pytest.mark.parametrize("pattern", WORDS)
+def test_a_word_is_a_text(pattern: str) -> None:
+    @given(st.from_regex(pattern, fullmatch=True))
+    def is_text(name: str) -> None:
+        assert can_be(name) and taken(name)
+
+    is_text()
+    assert not any(re.fullmatch(pattern, one) for one in ("", ".", "..", "a/b", "%2e%2e", "\n", "a\n", "\u202e"))
+
+
+def test_ids_and_cameras_follow_the_rule() -> None:
+    for name in ("", ".", "..", "a/b", "%2e%2e", "a\n", "\u202e", "a\u2066b"):
+        for check in (check_map_id, check_place_id):
+            with pytest.raises(InvalidIdentifier):
+                check(name)
+        with pytest.raises(ValidationError):
+            TypeAdapter(Camera).validate_python(name)
+
+
+def test_the_message_shows_what_is_unseen() -> None:
+    with pytest.raises(InvalidIdentifier, match=r"^'a\\u202eb' cannot name a lamp: .* is not '\.' or '\.\.'\.$"):
+        check_name("a\u202eb", "a lamp")
