@@ -16,7 +16,7 @@ import httpx
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-START_SECONDS = 120.0
+START_SECONDS = 300.0
 BATCH = 64
 
 
@@ -98,7 +98,11 @@ def _status(pid: int, name: str) -> float:
 
 @contextmanager
 def service(
-    data_dir: Path, threads: int = 0, settings: Mapping[str, object] | None = None, log: Path = Path("/dev/stderr")
+    data_dir: Path,
+    threads: int = 0,
+    settings: Mapping[str, object] | None = None,
+    log: Path = Path("/dev/stderr"),
+    port: int = 0,
 ) -> Iterator[Process]:
     """``placerec serve`` on a directory, until the block ends.
 
@@ -106,10 +110,12 @@ def service(
         threads: of a forward pass, 0 for torch's choice.
         settings: others, by their variables without the prefix.
         log: where it logs to.
+        port: that it listens on; 0 for a free one.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    if not port:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
     own = {"DATA_DIR": data_dir, "THREADS": threads, "LOG_LEVEL": "warning", **(settings or {})}
     environment = {**os.environ, **{f"PLACEREC_{name}": str(value) for name, value in own.items()}}
     command = [sys.executable, "-m", "service.commands", "serve", "--host", "127.0.0.1", "--port", str(port)]

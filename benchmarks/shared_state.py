@@ -53,7 +53,7 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A frame of a session: what is asked before it, and what is saved after it."""
     session = StoredSession(
-        "s-1", "lab", "2026", '{"filter": "bayes", "expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
+        "s-1", "lab", "2026", '{"expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
         bytes(BELIEF_BYTES), '{"frame": 7}' + " " * 4000,
     )  # fmt: skip
     store, table = SessionStore(folder), SessionTable(database)

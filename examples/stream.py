@@ -39,7 +39,7 @@ def run(url: str, map_id: str, frames: Path) -> None:
     pictures = [path for path in sorted(frames.iterdir()) if path.suffix.lower() in PICTURES]
     with (
         Client(url, key=key) as client,
-        client.maps[map_id].sessions.begin(filter="bayes") as session,
+        client.maps[map_id].sessions.begin() as session,
         session.stream() as stream,
     ):
         for path in pictures:

@@ -102,8 +102,8 @@ def measure(server: Process, rounds: int) -> dict[str, float]:
     last = {"after": (BEGAN + timedelta(days=1)).isoformat(), "where": '{"floor": 3}', "limit": "100"}
     filtered = [seconds(client, "GET", f"{lab}/places", params=last) for _ in range(rounds)]
     ids = [f"place-{number}" for number in range(0, 20_000, 2)]
-    dry = seconds(client, "POST", f"{lab}/places:forget", json={"ids": ids})
-    forgotten = seconds(client, "POST", f"{lab}/places:forget", json={"ids": ids, "dry_run": False})
+    dry = seconds(client, "POST", f"{lab}/places:delete", json={"ids": ids})
+    forgotten = seconds(client, "POST", f"{lab}/places:delete", json={"ids": ids, "dry_run": False})
     return {
         "plan": median(first),
         "again": median(again),

@@ -46,7 +46,7 @@ OBJECTS: tuple[tuple[str, type], ...] = (
 
 VALUES: tuple[Any, ...] = (
     *(placerec_client.Picture, placerec_client.NewPlace, placerec_client.Enrolled, placerec_client.Located),
-    *(placerec_client.MapEvent, placerec_client.Retry),
+    *(placerec_client.Odometry, placerec_client.MapEvent, placerec_client.Retry),
 )
 
 FRAMES = """

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
+from core.silence import SWITCHES
 from service.settings import Settings, SettingsError
 
 ROOT = Path(__file__).parents[2]
@@ -52,6 +53,11 @@ def test_image_runs_as_a_user_of_its_own() -> None:
     assert re.search(r"useradd --uid [1-9]\d+ .*placerec", stage["RUN"])
     assert stage["VOLUME"] == "/data"
     assert re.search(r"install .*--owner placerec .*/data", stage["RUN"])
+
+
+def test_what_would_report_is_switched_off() -> None:
+    """Also where ``ray start`` runs in the image, which imports nothing of the project."""
+    assert environment().items() >= SWITCHES.items()
 
 
 def test_nothing_but_the_cpu_build_of_torch_is_chosen_unless_given() -> None:

@@ -80,7 +80,7 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
         refused = operator.get(f"/v1/maps/lab/places?cursor={'x' * 60_000}")
         assert refused.headers["content-type"] == "application/problem+json"
 
-        session = operator.post("/v1/maps/lab/sessions", json={"filter": "bayes"}).json()["id"]
+        session = operator.post("/v1/maps/lab/sessions", json={}).json()["id"]
     address = f"wss://localhost:{proxied.port}/v1/maps/lab/sessions/{session}/stream"
     headers = {"Authorization": f"Bearer {proxied.key}"}
     with connect(address, ssl=proxied.trust, compression=None, additional_headers=headers) as stream:
@@ -94,7 +94,7 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
     with httpx.Client(transport=transport, base_url=f"https://localhost:{proxied.port}", headers=forged) as robot:
         assert robot.delete("/v1/maps/lab/places/p1").status_code == 204
     until = time.monotonic() + 60  # the line is written after the answer
-    while not (trail := proxied.server.lines(logger="placerec.audit", operation="forget_place")):
+    while not (trail := proxied.server.lines(logger="placerec.audit", operation="delete_place")):
         assert time.monotonic() < until
         time.sleep(0.02)
     assert [line["client"] for line in trail] == ["127.0.0.9"]

@@ -44,7 +44,7 @@ def test_versions_are_those_of_the_client() -> None:
 
 def test_the_files_for_launch_name_parameters_of_the_node() -> None:
     text = (NODE / "config" / "placerec.yaml").read_text()
-    given = yaml.safe_load(text)["placerec"]["ros__parameters"]
+    given = yaml.safe_load(text)["/**"]["ros__parameters"]
     known = {one.name: type(one.default) for one in PARAMETERS}
     assert {name: type(value) for name, value in given.items()} == {name: known[name] for name in given}
     launch = (NODE / "launch" / "placerec.launch.py").read_text()

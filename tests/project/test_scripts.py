@@ -22,7 +22,7 @@ case "$1 $2" in
     "-m venv") mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python" && echo venv >>"$LOG" ;;
     "-m pip") sleep 0.1 && echo "${*: -1}" >>"$LOG" && [ ! -e "$LOG.full" ] ;;
     "scripts/packages.py "*) echo "$2 ${TORCH_BACKEND:-}" >>"$LOG" && [ ! -e "$LOG.full" ] ;;
-    "-c import service.app.application") ;;
+    "-c import service.app.application"*) ;;
     *) exec REAL "$@" ;;
 esac
 """

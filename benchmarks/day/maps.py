@@ -1,0 +1,82 @@
+"""The maps of a walk: of one traverse enrolled once, or in the ways in which maps come about as well."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from benchmarks.day.pictures import another_look, file
+from benchmarks.day.walks import Pose, Walk, pixels
+from placerec_client import Client, NewPlace
+
+Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike"]
+Size: TypeAlias = Literal["small", "large", "bare"]
+"""Of the walk alone; with the pictures of other environments in traverses of their own; of the walk, without poses."""
+
+STOOD, LOOKS = 0.4, 30
+"""Where the mapping robot stood, as a share of the walk, and how many more looks it took there."""
+
+ALIKE = (0.4, 0.55)
+"""The stretch that another one looks like, as shares of the walk."""
+
+TRAVERSE = 400
+"""Frames of a traverse of other pictures."""
+
+
+def fields(pose: Pose | None, sequence: str) -> dict[str, object]:
+    """The fields of a place."""
+    if pose is None:
+        return {"sequence": sequence}
+    return {"sequence": sequence, "x": pose.x, "y": pose.y, "heading": float(np.degrees(pose.heading))}
+
+
+def places(walk: Walk, change: Change, size: Size, others: Sequence[bytes]) -> Iterator[NewPlace]:
+    """The places of a map; their ids end with the number of the reference that they show, those of others with none."""
+    random = np.random.default_rng(3)
+    count = len(walk.references)
+    stood = walk.reference(round(STOOD * (len(walk.frames) - 1)))
+
+    def place(kind: str, number: int, data: bytes, metres: float, serial: int = 0) -> NewPlace:
+        pose = None if size == "bare" else walk.pose(metres)
+        return NewPlace(f"{kind}-{serial:03d}-{number:05d}", data, fields(pose, kind))
+
+    for number, data in enumerate(walk.references):
+        yield place("walk", number, data, number * walk.spacing)
+        for look in range(LOOKS if change == "stood" and number == stood else 0):
+            again = file(another_look(pixels(data), random))
+            yield place("walk", number, again, number * walk.spacing, 1 + look)
+    if change == "twice":
+        for number, data in enumerate(walk.references):
+            yield place("again", number, data, number * walk.spacing)
+    if change == "look-alike":
+        first, last = (round(share * count) for share in ALIKE)
+        for offset, data in enumerate(walk.references[first:last]):
+            far = (count + 30 + offset) * walk.spacing
+            yield NewPlace(
+                f"alike-{offset:05d}-other", data, fields(None if size == "bare" else walk.pose(far), "alike")
+            )
+    if size == "large":
+        for offset, data in enumerate(others):
+            sequence = f"others-{offset // TRAVERSE}"
+            aside = walk.pose(offset % TRAVERSE * walk.spacing, 1000.0 * (1 + offset // TRAVERSE))
+            yield NewPlace(f"others-{offset:05d}-other", data, fields(aside, sequence))
+
+
+def shown_by(place_id: str) -> int | None:
+    """The number of the reference that a place of :func:`places` shows; None for another environment or stretch."""
+    number = place_id.rpartition("-")[2]
+    return int(number) if number.isdigit() else None
+
+
+def make_map(client: Client, map_id: str, walk: Walk, change: Change, size: Size, others: Sequence[bytes]) -> None:
+    """Enrol a map.
+
+    Raises:
+        PlacerecError: a frame was refused.
+    """
+    made = client.maps.create(map_id)
+    for one in made.enrol(places(walk, change, size, others), known=()):
+        if one.error is not None:
+            raise one.error

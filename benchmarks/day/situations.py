@@ -1,0 +1,223 @@
+"""The table of situations: how the robot moves, what its camera shows, and what becomes of its messages.
+
+A situation is data. Its stretches follow one another; :func:`moments` makes the frames of a walk of them, with the
+truth of each.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from benchmarks.day import pictures
+from benchmarks.day.maps import STOOD, Change
+from benchmarks.day.pictures import UPRIGHT, Look, Random, another_look
+from benchmarks.day.walks import Pose, Walk, pixels
+
+Fate = Literal["answered", "lost", "unanswered"]
+"""Of a frame: its answer comes, it does not reach the service, or the service takes it in and its answer is lost."""
+
+SLIP = 0.02
+"""Standard deviation of what wheels measure, as a share of the way."""
+
+SPIN = np.radians(0.3)
+"""Standard deviation of the measured turn, in radians for each square root of a metre."""
+
+LONGEST = 150
+"""Frames of a situation at most."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Some seconds in which nothing changes.
+
+    pace: frames of the walk a second; negative backwards, facing ahead.
+    start: where the robot is put at first, as a share of the walk, if it is not where it was: it is carried there.
+    aside: metres a second to the left, out of what the map shows and back.
+    look: what the camera makes of the view.
+    orientation: that the files state.
+    own: the pictures are those that the map was made of.
+    fate: of every second frame, of all if ``whole``.
+    restart: the service is restarted before the first frame.
+    again: the frames until the answer is right are counted from here.
+    """
+
+    seconds: float
+    pace: float = 1.0
+    start: float | None = None
+    aside: float = 0.0
+    look: Look | None = None
+    orientation: int = UPRIGHT
+    own: bool = False
+    fate: Fate = "answered"
+    whole: bool = True
+    restart: bool = False
+    again: bool = False
+
+
+@dataclass(frozen=True)
+class Situation:
+    """An ordinary thing that happens to a robot.
+
+    rate: frames a second; the map was made at one.
+    start: where the robot begins, as a share of the walk.
+    map: how the map differs from one traverse enrolled once.
+    """
+
+    name: str
+    stretches: tuple[Stretch, ...]
+    rate: float = 1.0
+    start: float = 0.1
+    map: Change = "plain"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of a robot.
+
+    second: when, from the beginning.
+    at: where, in frames of the robot's walk.
+    aside: metres beside the walk; the map shows nothing of it there.
+    pose: the true one, in the map's frame; ``wheels``: what the odometry says, in its own.
+    right: the references whose place the frame shows; none if it shows nothing of the map.
+    again: it is the first after a disturbance.
+    """
+
+    second: float
+    at: float
+    aside: float
+    picture: bytes
+    pose: Pose
+    wheels: Pose
+    right: frozenset[int]
+    fate: Fate
+    restart: bool
+    again: bool
+
+
+def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Moment]:
+    """The frames of a situation on a walk, the same ones each time.
+
+    Args:
+        scale: of the stretches' seconds.
+    """
+    random = np.random.default_rng([7, zlib.crc32(f"{situation.name} {walk.name}".encode())])
+    last = len(walk.frames) - 1
+    at, aside, second, sent = situation.start * last, 0.0, 0.0, 0
+    at = float(round(at))
+    pose = walk.pose(walk.where(at))
+    wheels = Pose(0.0, 0.0, 0.0)
+    before: tuple[float, float] | None = None
+    for stretch in situation.stretches:
+        carried = stretch.start is not None
+        if stretch.start is not None:
+            at = float(round(stretch.start * last))
+        for number in range(max(1, round(stretch.seconds * scale * situation.rate))):
+            if sent == LONGEST or not -1e-9 <= at <= last + 1e-9:
+                return
+            now = walk.pose(walk.where(at), aside)
+            wheels = wheels if carried or before is None else _measured(wheels, pose, now, random)
+            pose, carried = now, False
+            out = abs(aside) > 1e-9
+            shown = _picture(stretch, walk, at, number, aside, before == (at, aside), random)
+            hit = stretch.whole or number % 2 == 1
+            yield Moment(
+                second,
+                at,
+                aside,
+                shown,
+                pose,
+                wheels,
+                frozenset() if out else walk.right(at),
+                stretch.fate if hit else "answered",
+                stretch.restart and number == 0,
+                stretch.again and number == 0,
+            )
+            before, sent = (at, aside), sent + 1
+            second += 1 / situation.rate
+            at += stretch.pace / situation.rate
+            aside += stretch.aside / situation.rate
+
+
+def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float, same: bool, random: Random) -> bytes:
+    """What the camera sends; a view that is between two frames of the walk, or stays, is drawn anew each time."""
+    nearest, out = round(at), abs(aside) > 1e-9
+    if out:
+        data = walk.strangers[round(aside / walk.spacing) % len(walk.strangers)]
+    elif stretch.own:
+        data = walk.references[walk.reference(at)]
+    else:
+        data = walk.frames[nearest]
+    between = not out and abs(at - nearest) > 1e-6
+    if not (between or same or stretch.look or stretch.orientation != UPRIGHT):
+        return data
+    view = pixels(data)
+    if between or same:
+        view = another_look(view, random, at - nearest if between else 0.0)
+    if stretch.look is not None:
+        view = stretch.look(view, random, number)
+    return pictures.file(view, stretch.orientation)
+
+
+def _measured(wheels: Pose, old: Pose, new: Pose, random: Random) -> Pose:
+    """What the odometry says after a motion: the motion with its errors, on top of what it said before."""
+    way = (new.x - old.x) + 1j * (new.y - old.y)
+    length = abs(way)
+    slipped = way * np.exp(1j * (wheels.heading - old.heading)) * (1 + SLIP * random.normal())
+    turn = new.heading - old.heading + SPIN * np.sqrt(length) * random.normal()
+    return Pose(wheels.x + float(slipped.real), wheels.y + float(slipped.imag), wheels.heading + float(turn))
+
+
+def _disturbed(name: str, stretch: Stretch, **options: object) -> Situation:
+    """Ten seconds of an undisturbed walk, the stretch, and twelve undisturbed seconds."""
+    return replace(Situation(name, (Stretch(10), stretch, Stretch(12, again=True))), **options)  # type: ignore[arg-type]
+
+
+def _throughout(name: str, look: Look | None, orientation: int = UPRIGHT) -> Situation:
+    """A walk on which every picture is changed in one way."""
+    return Situation(name, (Stretch(30, look=look, orientation=orientation),))
+
+
+PACES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.5, 2.0, 3.0, 5.0, 10.0)
+
+SITUATIONS: dict[str, Situation] = {
+    one.name: one
+    for one in (
+        Situation("passing", (Stretch(40),)),
+        _disturbed("standing", Stretch(30, pace=0)),
+        _disturbed("standing on a mapped view", Stretch(20, pace=0, own=True)),
+        Situation("standing where the map stood", (Stretch(20, pace=0), Stretch(12)), start=STOOD, map="stood"),
+        Situation("passing where the map stood", (Stretch(30),), start=STOOD - 0.15, map="stood"),
+        *(Situation(f"pace {pace:g}", (Stretch(40, pace=pace),)) for pace in PACES),
+        Situation("reverse", (Stretch(10), Stretch(16, pace=-1, again=True)), start=0.3),
+        Situation("stop and go", tuple(Stretch(5, pace=one % 2, again=one == 1) for one in (1, 0, 1, 0, 1, 0, 1, 0))),
+        _disturbed("people passing", Stretch(12, look=pictures.people)),
+        _disturbed("people passing while standing", Stretch(25, pace=0, look=pictures.people)),
+        _disturbed("hand over the camera", Stretch(8, look=pictures.hand)),
+        _disturbed("frames lost", Stretch(8, fate="lost")),
+        _disturbed("every second frame lost", Stretch(16, fate="lost", whole=False)),
+        _disturbed("answers lost", Stretch(6, fate="unanswered")),
+        _disturbed("every second answer lost", Stretch(16, fate="unanswered", whole=False)),
+        Situation("restart", (Stretch(12), Stretch(12, restart=True, again=True))),
+        Situation("carried off", (Stretch(14), Stretch(20, start=0.7, again=True))),
+        Situation(
+            "leaving and coming back",
+            (Stretch(10), Stretch(8, 0, aside=2), Stretch(8, 0, aside=-2), Stretch(12, again=True)),
+        ),
+        Situation("map enrolled twice", (Stretch(30),), map="twice"),
+        Situation("look-alike stretch", (Stretch(40),), start=0.25, map="look-alike"),
+        _throughout("on its side", pictures.on_its_side),
+        _throughout("on its side, with EXIF", pictures.on_its_side, pictures.ON_ITS_SIDE),
+        _throughout("upside down", pictures.upside_down),
+        _throughout("upside down, with EXIF", pictures.upside_down, pictures.UPSIDE_DOWN),
+        _throughout("half the lens dirty", pictures.dirty),
+        _throughout("exposure jumps", pictures.exposure),
+        _throughout("longer lens", pictures.narrower),
+        Situation("5 frames a second", (Stretch(12),), rate=5.0),
+        Situation("60 frames a second", (Stretch(2),), rate=60.0),
+    )
+}

@@ -1,0 +1,273 @@
+"""Maps of a robot that stood still, or of a camera much faster than the robot: is the place recognized all the same?
+
+    python -m benchmarks.day.standing --datasets ../shared/datasets
+
+Forty neighbouring references of corridor, and as many of lip6_outdoor, are a map.  At five of them the robot stood, and
+the map has k looks: the picture with the noise of a camera, a little more or less light, and compression.  It is asked
+further looks at the five spots, the frames of the other traverse that show them, and strangers, of the same traverse
+(farther than ``FAR`` frames) and of the other environment.  Places have no poses, poses a few decimetres off, or poses
+rounded to ten metres.  ``walk`` is the same walk at 25 times the rate, frames between two references made by optical
+flow: a thousand frames of a walk of forty seconds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import cv2
+import numpy as np
+import typer
+
+from benchmarks.report import report
+from core.belief import Run, RunOptions, Step, View, evidence, place_graph, view_of
+from core.frames.preprocessing import Pixels
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
+from core.maps import Enrolment, Map, MapSettings
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder, Encoding
+from core.networks.xfeat import packaged_xfeat
+from core.places import PlaceFields, Pose
+from core.recognition.recognition import Answer, locate
+from core.recognition.stages import neighborhood_of
+from core.recognition.verification import Verifier, Verify
+from core.storage import Atlas
+from core.threads import cores, share_cores
+from training.map_sizes import corridor_and_lip6
+from training.validation import TraverseTask
+
+Poses = Literal["none", "radius", "coarse"]
+
+LOOKS = (1, 2, 5, 10, 20, 50, 100, 200)
+PLACES, SPOTS = 40, (5, 12, 20, 27, 34)
+FROM = {"corridor": 30, "lip6": 120}
+"""The first reference of each map."""
+
+FRESH, OTHER, STRANGERS = 3, 3, 30
+"""Further looks at a spot, frames of the other traverse that show it, and strangers of either kind, at most."""
+
+FAR, NEAR = 8, 3
+METRES, ROUNDED = 1.5, 10.0
+RATE = 25
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame, encoded; ``shows`` are the references that show its place."""
+
+    encoding: Encoding
+    keypoints: Keypoints
+    view: View
+    shows: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Questions:
+    """What maps of one traverse are asked."""
+
+    fresh: list[Shot]
+    other: list[Shot]
+    strangers: list[Shot]
+    run: list[Shot]
+
+
+class Camera:
+    """Encodes frames and finds their keypoints."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.encoder, self._keypoints = encoder, packaged_xfeat()
+
+    def shot(self, pixels: Pixels, shows: Sequence[int] = ()) -> Shot:
+        """One frame."""
+        found = find_keypoints(self._keypoints, pixels)
+        return Shot(self.encoder.encode(pixels), found, view_of(pixels), frozenset(shows))
+
+
+def noisy(pixels: Pixels, random: np.random.Generator) -> Pixels:
+    """A further look: noise of two to four grey levels, up to 5 % of exposure, JPEG."""
+    light = pixels * random.uniform(0.95, 1.05) + random.normal(0, random.uniform(2, 4), pixels.shape)
+    quality = int(random.choice([60, 75, 90]))
+    _, data = cv2.imencode(".jpg", np.clip(light, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def between(one: Pixels, other: Pixels, count: int) -> list[Pixels]:
+    """``count`` frames from one picture towards another, the first included, by optical flow."""
+    grey = [cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) for pixels in (one, other)]
+    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    there, back = flow.calc(grey[0], grey[1], None), flow.calc(grey[1], grey[0], None)
+    height, width = grey[0].shape
+    column, row = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    made = []
+    for share in np.arange(count) / count:
+        moved = [
+            cv2.remap(
+                pixels,
+                column - np.float32(part) * by[..., 0],
+                row - np.float32(part) * by[..., 1],
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+            for pixels, by, part in ((one, there, share), (other, back, 1 - share))
+        ]
+        made.append(np.asarray(cv2.addWeighted(moved[0], float(1 - share), moved[1], float(share), 0), np.uint8))
+    return made
+
+
+def pose(poses: Poses, place: int, random: np.random.Generator) -> Pose | None:
+    """The pose of a frame at a reference."""
+    x = METRES * place
+    if poses == "none":
+        return None
+    return Pose(x=ROUNDED * round(x / ROUNDED), y=0) if poses == "coarse" else Pose(x=x + random.normal(0, 0.2), y=0)
+
+
+def fill(atlas: Atlas, name: str, encoder: Encoder, shots: Sequence[tuple[int, Shot]], poses: Poses) -> Map:
+    """A map of frames, each at a reference, in their order."""
+    random = np.random.default_rng(7)
+    made = atlas.create(name, encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
+    items = [
+        Enrolment(
+            id=f"{place:03d}.{number}",
+            fields=PlaceFields(sequence="walk", pose=pose(poses, place, random)),
+            descriptor=shot.encoding.descriptor,
+            local=shot.encoding.local,
+            regions=len(shot.encoding.regions),
+            digest=hashlib.sha256(f"{number}".encode()).digest(),
+            thumbnail=None,
+            image=None,
+            keypoints=shot.keypoints,
+        )
+        for number, (place, shot) in enumerate(shots)
+    ]
+    for start in range(0, len(items), 64):
+        made.enrol(items[start : start + 64])
+    return made
+
+
+def asked(map_: Map, encoder: Encoder, shots: Sequence[Shot], verify: Verify) -> list[Answer]:
+    """The answers to frames, each asked alone."""
+    verifiers = [Verifier(verify, partial(getattr, shot, "keypoints")) for shot in shots]
+    return [
+        locate(map_, encoder, [shot.encoding], 1, verifiers=[verifier])[0]
+        for shot, verifier in zip(shots, verifiers, strict=True)
+    ]
+
+
+def right(shot: Shot, place_id: str) -> bool:
+    """Whether a place shows what a frame shows."""
+    return int(place_id.partition(".")[0]) in shot.shows
+
+
+def recognized(shots: Sequence[Shot], answers: Sequence[Answer]) -> int:
+    """How many are recognized and right."""
+    return sum(one.place is not None and right(shot, one.place.id) for shot, one in zip(shots, answers, strict=True))
+
+
+def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> tuple[int, int]:
+    """How many frames of a session over the answers are recognized and right, and how many recognized and wrong."""
+    snapshot, neighborhood = map_.snapshot(), neighborhood_of(map_)
+    graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood)
+    run, good, bad = Run(RunOptions(), graph), 0, 0
+    for shot, answer in zip(shots, answers, strict=True):
+        seen = answer.candidates
+        verified = None if seen.geometry is None else seen.geometry.evidence
+        known = (answer.calibration, neighborhood, seen.examined, verified)
+        run.advance(evidence(seen.rows, seen.scores, seen.whereabouts, *known), Step(), shot.view)
+        found = run.estimate(1, snapshot.alive)
+        if found.verdict == "recognized":
+            (place,) = map_.places_at([found.candidates[0].row])
+            assert place is not None
+            good, bad = (good + 1, bad) if right(shot, place.id) else (good, bad + 1)
+    return good, bad
+
+
+def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: TraverseTask) -> Questions:
+    """What the maps of a traverse are asked."""
+    random, first = np.random.default_rng(11), FROM[name]
+    window = np.arange(first, first + PLACES)
+
+    def near(place: int) -> range:
+        return range(place - NEAR, place + NEAR + 1)
+
+    fresh = [
+        camera.shot(noisy(task.references[first + spot], random), near(spot)) for spot in SPOTS for _ in range(FRESH)
+    ]
+    shown = {
+        query: sorted({near_one for place in np.flatnonzero(row[window]).tolist() for near_one in near(place)})
+        for query, row in enumerate(task.truth)
+    }
+    at = sorted({int(query) for spot in SPOTS for query in np.flatnonzero(task.truth[:, first + spot])[:OTHER]})
+    other = [camera.shot(task.queries[int(query)], shown[int(query)]) for query in at]
+    wide = task.truth[:, max(0, first - FAR) : first + PLACES + FAR].any(axis=1)
+    apart = np.flatnonzero(~wide & task.truth.any(axis=1))
+    pictures = [task.queries[query] for query in apart[:: max(1, len(apart) // STRANGERS)][:STRANGERS]]
+    pictures += elsewhere.queries[:: len(elsewhere.queries) // STRANGERS][:STRANGERS]
+    passing = [int(query) for query in np.flatnonzero(task.truth[:, window].any(axis=1))]
+    run = [camera.shot(task.queries[query], shown[query]) for query in passing]
+    return Questions(fresh, other, [camera.shot(picture) for picture in pictures], run)
+
+
+def main(
+    datasets: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets"),
+    encoder: str = DEFAULT_ENCODER,
+    only: Annotated[list[str] | None, typer.Option(help="Of: never, auto, always; none, radius, coarse.")] = None,
+) -> None:
+    """One table: what is recognized and right, by environment, poses, mode and looks at a spot."""
+    share_cores(cores())
+    camera = Camera(EncoderCatalogue().get(encoder))
+    tasks = dict(corridor_and_lip6(datasets))
+    rows: list[tuple[object, ...]] = []
+    figures: dict[str, Any] = {"encoder": camera.encoder.identity, "rows": rows}
+    for name, task in tasks.items():
+        random, first = np.random.default_rng(5), FROM[name]
+        references = task.references[first : first + PLACES + 1]
+        shots = [camera.shot(pixels) for pixels in references[:PLACES]]
+        looks = {spot: [camera.shot(noisy(references[spot], random)) for _ in range(max(LOOKS))] for spot in SPOTS}
+        maps: dict[str, list[tuple[int, Shot]]] = {
+            str(k): [(at, shot) for at, own in enumerate(shots) for shot in (looks[at][:k] if at in looks else [own])]
+            for k in LOOKS
+        }
+        maps["walk"] = [
+            (at, camera.shot(noisy(pixels, random)))
+            for at in range(PLACES)
+            for pixels in between(references[at], references[at + 1], RATE)
+        ]
+        ask = questions(camera, name, task, next(one for other, one in tasks.items() if other != name))
+        for poses in [one for one in get_args(Poses) if only is None or one in only]:
+            for kind, frames in maps.items():
+                with tempfile.TemporaryDirectory() as folder:
+                    atlas = Atlas(Path(folder))
+                    map_ = fill(atlas, "stood", camera.encoder, frames, poses)
+                    views = len(np.unique(map_.snapshot().whereabouts.ordinal))
+                    for verify in [one for one in ("never", "auto", "always") if only is None or one in only]:
+                        fresh, other, strangers, run = (
+                            asked(map_, camera.encoder, some, verify)
+                            for some in (ask.fresh, ask.other, ask.strangers, ask.run)
+                        )
+                        good, bad = followed(map_, ask.run, run)
+                        standing = followed(map_, ask.fresh, fresh)
+                        row = (
+                            f"{name}, {poses}, {verify}, {kind}",
+                            views,
+                            f"{recognized(ask.fresh, fresh)} / {len(fresh)}",
+                            f"{recognized(ask.other, other)} / {len(other)}",
+                            f"{good}, {bad} / {len(run)}",
+                            f"{standing[0]}, {standing[1]} / {len(fresh)}",
+                            f"{sum(one.place is not None for one in strangers)} / {len(strangers)}",
+                        )
+                        rows.append(row)
+                        print(*row, flush=True)
+                    atlas.close()
+    columns = ["map", "views", "further looks", "other traverse", "session", "session of looks", "strangers"]
+    report("standing", "recognized and right; of sessions also recognized and wrong", columns, rows, figures)
+
+
+if __name__ == "__main__":
+    typer.run(main)
