@@ -1,6 +1,6 @@
 """Whether verification recognizes the view that it was shown, and what it makes of strangers.
 
-    python -m benchmarks.geometry.same_view [--most 600]
+    python -m benchmarks.geometry.same_view [--most 600] [--copies 1]
 
 Each picture of corridor, lip6_outdoor and the training sets is compared with itself and with near copies: JPEG, noise,
 another brightness, shifts, turns about the optical axis, pans.  The changes of geometry are homographies, as of a
@@ -178,6 +178,12 @@ def same_views(network: XFeat, frame: Pixels, picture: str, views: Sequence[str]
     return made
 
 
+def views_in_turn(number: int, copies: int) -> tuple[str, ...]:
+    """The picture itself, and the near copies whose turn it is at the picture of a number."""
+    same, *others = VIEWS
+    return same, *(others[(number * copies + one) % len(others)] for one in range(min(copies, len(others))))
+
+
 def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Comparison]:
     """Queries of a traverse, at most so many, and references that are far from all true ones."""
     task = load_traverses(datasets / "eval" / name, *TRAVERSES[name])
@@ -222,15 +228,18 @@ def _keypoints(network: XFeat, frames: Sequence[Pixels]) -> list[Keypoints]:
 def main(
     datasets: Annotated[Path, typer.Option(help="The folder with train and eval.")] = Path("../shared/datasets"),
     most: Annotated[int, typer.Option(min=0, help="Pictures at most, and queries of a traverse; 0: all.")] = 0,
+    copies: Annotated[int, typer.Option(min=0, help="Near copies of each picture, of all kinds in turn; 0: all.")] = 0,
 ) -> None:
     """Two tables: views of one picture, and strangers; and the comparisons that fail."""
     share_cores(cores())
     network, chosen = load_xfeat(), pictures(datasets, most)
 
-    def of_picture(path: Path) -> list[Comparison]:
-        return same_views(network, read(path), path.relative_to(datasets).as_posix())
+    def of_picture(number: int) -> list[Comparison]:
+        path = chosen[number]
+        views = views_in_turn(number, copies) if copies else tuple(VIEWS)
+        return same_views(network, read(path), path.relative_to(datasets).as_posix(), views)
 
-    views = [one for made in each(of_picture, chosen, cores()) for one in made]
+    views = [one for made in each(of_picture, range(len(chosen)), cores()) for one in made]
     report_views(views, len(chosen))
     strangers = [one for name in TRAVERSES for one in far_frames(network, datasets, name, most)]
     report_strangers(strangers + across_sets(network, datasets, most))
