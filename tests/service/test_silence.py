@@ -26,6 +26,9 @@ MACHINES_THAT_BUILD = (
 )
 """Variables by which ONNX Runtime knows a machine that builds and tests, where it reports nothing by itself."""
 
+CACHES = ("NUMBA_CACHE_DIR", "PYTHONPYCACHEPREFIX")
+"""Variables that move what is compiled once for this checkout to where it would be taken for something else."""
+
 
 @pytest.fixture
 def watch(tmp_path: Path) -> Watch:
@@ -43,7 +46,7 @@ def wrapped(watch: Watch, folder: Path) -> list[str]:
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     wrong = dict.fromkeys(SWITCHES, "0") | {"RAY_USAGE_STATS_ENABLED": "1", "FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
-    unset = [word for name in MACHINES_THAT_BUILD for word in ("-u", name)]
+    unset = [word for name in (*MACHINES_THAT_BUILD, *CACHES) for word in ("-u", name)]
     return ["/usr/bin/env", *unset, *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
 
 
