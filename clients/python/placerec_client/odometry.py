@@ -101,7 +101,7 @@ def _check_covariance(covariance: Any) -> None:
 
 def _number(value: Any) -> float | None:
     """A number of Python or NumPy; None if it is none."""
-    if isinstance(value, bool | str | bytes) or getattr(value, "ndim", 0):
+    if isinstance(value, bool | str | bytes) or getattr(value, "ndim", 0) != 0:
         return None
     try:
         return float(value)

@@ -136,7 +136,13 @@ def test_a_url_with_a_path_too_many_is_told(url: str, lab: Map) -> None:
     hint = rf"{re.escape(url)}/v1 may not be the URL of a service: give {re.escape(url)}, without /v1\.$"
     with Client(f"{url}/v1/") as client:
         there = client.maps[lab.id]
-        for call in (client.liveness, there.read, lambda: list(client.maps), lambda: list(there.events())):
+        calls: list[Callable[[], object]] = [
+            client.liveness,
+            there.read,
+            lambda: list(client.maps),
+            lambda: list(there.events()),
+        ]
+        for call in calls:
             with pytest.raises(UnexpectedAnswer, match=hint) as answered:
                 call()
             assert answered.value.status == 404

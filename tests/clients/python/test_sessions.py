@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -151,7 +151,7 @@ def test_a_motion_that_is_none_is_refused_before_it_is_sent(refusing: tuple[str,
 
 
 def test_odometry_is_what_the_service_takes() -> None:
-    whole = {"x": 1.0, "y": 2.0, "heading": 450.0}
+    whole: dict[str, Any] = {"x": 1.0, "y": 2.0, "heading": 450.0}
     square = [0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.01]
     for name in whole:
         for value in (None, "1", True, (1,), float("nan"), float("inf"), 1e9, np.array([1.0])):
@@ -176,7 +176,13 @@ def test_numbers_of_numpy_and_any_turn_are_taken(walk: Map) -> None:
 
 def test_a_session_that_has_not_begun_says_how_it_begins(lab: Map) -> None:
     session = lab.sessions.begin()
-    for use in (lambda: session.send(jpeg(1, 64, 48)), session.read, session.delete, session.stream):
+    uses: list[Callable[[], object]] = [
+        lambda: session.send(jpeg(1, 64, 48)),
+        session.read,
+        session.delete,
+        session.stream,
+    ]
+    for use in uses:
         with pytest.raises(
             PlacerecError, match=r"has not begun: .*`with lab\.sessions\.begin\(\) as session:`, or by sess"
         ):

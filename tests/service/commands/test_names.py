@@ -111,7 +111,7 @@ def test_old_words_name_the_new_one(placerec: Placerec, group: str, old: str) ->
 @pytest.mark.parametrize("words", [("maps",), ("maps", "places", "lab"), ("maps", "sequences", "lab")])
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_no_name_is_refused_before_a_question(placerec: Placerec, words: tuple[str, ...], name: str) -> None:
-    group, within = (words[:-1], words[-1:]) if words[-1] == "lab" else (words, ())
+    group, within = [one for one in words if one != "lab"], [one for one in words if one == "lab"]
     result = placerec(*group, "delete", *within, "--", name, status=1, stdin="y\n")
     assert "is no name" in result.stderr and "[y/N]" not in result.output
 
