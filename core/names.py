@@ -11,6 +11,11 @@ look like.  Both are patterns without anchors and without assertions, which JSON
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
 from core.errors import InvalidIdentifier
 
@@ -29,18 +34,70 @@ def word(most: int, more: str = "~") -> str:
     return rf"[A-Za-z0-9][A-Za-z0-9._{more}-]{{0,{most - 1}}}"
 
 
-def check_name(text: str, kind: str) -> str:
-    """Return ``text`` if it can be a name.
+@dataclass(frozen=True)
+class Names:
+    """What can be a name of one kind: for code, and as a mark of a model's field, ``Annotated[str, names]``.
 
-    Args:
-        kind: what it is to name, with its article, for the message.
+    A field that is no name is refused with the same sentence as an argument; the JSON Schema has the pattern.
 
-    Raises:
-        InvalidIdentifier: it cannot.
+    what: what it names, with its article.
+    pattern: of every name, without anchors.
+    rule: what the pattern says, in words that go on after "a name".
+    most: characters of the longest one; None: the pattern says it.
+    but: a text of the pattern that is no name all the same; the schema does not say so.
     """
-    if len(text) > LONGEST or not re.fullmatch(TEXT, text):
-        raise InvalidIdentifier(
-            f"{text[:140]!a} cannot name {kind}: a name has 1 to {LONGEST} characters, no slash, no control characters "
-            "and no marks of direction, and is not '.' or '..'."
-        )
-    return text
+
+    what: str
+    pattern: str
+    rule: str
+    most: int | None = None
+    but: str | None = None
+
+    def check(self, text: str) -> str:
+        """Return ``text`` if it can be a name.
+
+        Raises:
+            InvalidIdentifier: it cannot.
+        """
+        too_long = self.most is not None and len(text) > self.most
+        if too_long or text == self.but or not re.fullmatch(self.pattern, text):
+            raise InvalidIdentifier(f"{text[:140]!a} cannot name {self.what}: a name {self.rule}.")
+        return text
+
+    def _check_field(self, text: str) -> str:
+        try:
+            return self.check(text)
+        except InvalidIdentifier as error:
+            raise ValueError(str(error)) from error
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._check_field, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        lengths = {} if self.most is None else {"minLength": 1, "maxLength": self.most}
+        return {**handler(schema), **lengths, "pattern": f"^{self.pattern}$"}
+
+
+def texts(what: str) -> Names:
+    """Names that are texts, of 1 to ``LONGEST`` characters."""
+    rule = (
+        f"has 1 to {LONGEST} characters, no slash, no control characters and no marks of direction, "
+        "and is not '.' or '..'"
+    )
+    return Names(what, TEXT, rule, LONGEST)
+
+
+def words(what: str, most: int, more: str = "~") -> Names:
+    """Names that are words; ``most`` and ``more`` as of ``word``."""
+    return Names(what, word(most, more), rule_of_words(most, f". _ {more} -"))
+
+
+def file_names(what: str, but: str | None = None) -> Names:
+    """Names of what is a file or a folder: words of 1 to 64 characters without capital letters; ``but`` as of Names."""
+    rule = rule_of_words(64, ". _ -", "small letters") + ("" if but is None else f", and is not {but!r}")
+    return Names(what, r"[a-z0-9][a-z0-9._-]{0,63}", rule, but=but)
+
+
+def rule_of_words(most: int, marks: str, letters: str = "letters") -> str:
+    """What a word has, in words."""
+    return f"has 1 to {most} characters: {letters} of ASCII, digits and {marks}, and begins with a letter or a digit"

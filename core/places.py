@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core import names
-from core.errors import InvalidIdentifier
 
-MAP_ID = r"[a-z0-9][a-z0-9._-]{0,63}"
-PLACE_ID = names.word(128)
-RESERVED_MAP_IDS = frozenset({"import"})
+MAP_IDS = names.file_names("a map", but="import")
+PLACE_IDS = names.words("a place", 128)
+SEQUENCES, CAMERAS = names.texts("a sequence"), names.words("a camera", 64)
+MAP_ID, PLACE_ID = MAP_IDS.pattern, PLACE_IDS.pattern
 EARTH_RADIUS = 6_371_008.8  # metres, mean
 
 NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
@@ -42,9 +42,7 @@ def check_map_id(text: str) -> str:
     Raises:
         InvalidIdentifier: it cannot.
     """
-    if not re.fullmatch(MAP_ID, text) or text in RESERVED_MAP_IDS:
-        raise InvalidIdentifier(f"{text[:80]!r} cannot name a map: it must match {MAP_ID} and not be 'import'.")
-    return text
+    return MAP_IDS.check(text)
 
 
 def check_place_id(text: str) -> str:
@@ -53,9 +51,7 @@ def check_place_id(text: str) -> str:
     Raises:
         InvalidIdentifier: it cannot.
     """
-    if not re.fullmatch(PLACE_ID, text):
-        raise InvalidIdentifier(f"{text[:140]!r} cannot name a place: it must match {PLACE_ID}.")
-    return text
+    return PLACE_IDS.check(text)
 
 
 def check_sequence(text: str) -> str:
@@ -64,7 +60,7 @@ def check_sequence(text: str) -> str:
     Raises:
         InvalidIdentifier: it cannot.
     """
-    return names.check_name(text, "a sequence")
+    return SEQUENCES.check(text)
 
 
 class Pose(BaseModel):
@@ -142,9 +138,9 @@ def microseconds(moment: datetime) -> int:
     return (moment - _EPOCH) // timedelta(microseconds=1)
 
 
-Sequence = Annotated[str, Field(min_length=1, max_length=names.LONGEST, pattern=f"^{names.TEXT}$")]
+Sequence = Annotated[str, SEQUENCES]
 
-Camera = Annotated[str, Field(pattern=f"^{names.word(64)}$")]
+Camera = Annotated[str, CAMERAS]
 
 
 class PlaceFields(BaseModel):

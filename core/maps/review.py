@@ -31,6 +31,19 @@ class ReviewFrame:
     label: Mapping[str, Any] | None = None
 
 
+@dataclass(frozen=True)
+class ReviewPage:
+    """Some kept frames, and what there was in all at that moment.
+
+    frames: newest first.
+    count, size: how many frames are kept in all, and their bytes.
+    """
+
+    frames: list[ReviewFrame]
+    count: int
+    size: int
+
+
 class Review(Protocol):
     """The kept frames of one map.  Any thread may use it; every method may raise StorageFull and StorageFailure."""
 
@@ -44,8 +57,8 @@ class Review(Protocol):
     def shrink(self, setting: ReviewSetting) -> None:
         """Drop the oldest frames beyond new limits, and give back the room."""
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
-        """The latest frames, newest first.
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+        """The latest frames, newest first, and how many are kept in all, as of one moment.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -54,9 +67,6 @@ class Review(Protocol):
 
     def labelled(self) -> list[ReviewFrame]:
         """All frames with a label, oldest first."""
-
-    def size(self) -> tuple[int, int]:
-        """How many frames are kept, and their bytes."""
 
     def find(self, number: int) -> ReviewFrame:
         """One frame.

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from core.disk.files import replacing
-from core.errors import InvalidModel, UnknownEncoder
+from core.errors import InvalidIdentifier, InvalidModel, UnknownEncoder
 from core.judgement.verdict import Calibration
 from core.method import DEFAULT_ENCODER as DEFAULT_ENCODER
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
@@ -29,10 +29,11 @@ from core.method.features import FeatureExtractor, projection_tensors
 from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
+from core.names import file_names
 from core.networks.files import open_network
 from core.networks.forward import Device, Precision
 from core.networks.identity import canonical_json
-from core.networks.network import NAME
+from core.networks.network import NAMES as NETWORK_NAMES
 
 PACKAGED = Path(__file__).parents[1] / "models"
 FORMER = PACKAGED / "former"
@@ -89,8 +90,10 @@ def save_encoder(
     Raises:
         InvalidModel: the encoder's name cannot name a file.
     """
-    if not re.match(NAME, encoder.name):
-        raise InvalidModel(f"{encoder.name!r} cannot name an encoder: it must match {NAME}.")
+    try:
+        file_names("an encoder").check(encoder.name)
+    except InvalidIdentifier as error:
+        raise InvalidModel(str(error)) from error
     header = _Header(
         name=encoder.name,
         identity=encoder.identity,
@@ -243,7 +246,7 @@ class EncoderCatalogue:
         """
         for folder in self._folders:
             path = folder / f"{name}{NETWORK_SUFFIX}"
-            if re.match(NAME, name) and path.is_file():
+            if re.fullmatch(NETWORK_NAMES.pattern, name) and path.is_file():
                 return path
         raise InvalidModel(f"no network named {name!r} is installed; its file would be {name}{NETWORK_SUFFIX}.")
 

@@ -19,9 +19,10 @@ from torch import Tensor, nn
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
+from core.names import file_names
 
-NAME = r"^[a-z0-9][a-z0-9._-]{0,63}$"
 FORMAT = "placerec-network/1"
+NAMES = file_names("a network")
 
 
 class _Layer(BaseModel):
@@ -77,7 +78,7 @@ class NetworkDefinition(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str = Field(pattern=NAME)
+    name: Annotated[str, NAMES]
     input: InputDefinition
     layers: tuple[Annotated[Layer, Field(discriminator="type")], ...]
 

@@ -25,7 +25,7 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame, frames_to_drop
+from core.maps.review import ReviewFrame, ReviewPage, frames_to_drop
 from core.maps.stored_fields import moment_text
 
 FILE = "review.sqlite"
@@ -110,8 +110,8 @@ class ReviewFrames:
                 _drop_oldest(connection, setting, self._held)
             connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
-        """The latest frames, newest first.
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+        """The latest frames, newest first, and how many are kept in all, as of one moment.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -119,21 +119,16 @@ class ReviewFrames:
         """
         conditions = ["number < ?1"] + ([] if labelled is None else [f"label IS {'NOT ' * labelled}NULL"])
         query = f"SELECT {_COLUMNS} FROM frames WHERE {' AND '.join(conditions)} ORDER BY number DESC LIMIT ?2"
-        with self._using() as connection:
+        with self._using() as connection:  # nobody writes meanwhile
             rows = connection.execute(query, (2**62 if before is None else before, limit)).fetchall()
-        return [_frame(row) for row in rows]
+            count, size = _size(connection)
+        return ReviewPage([_frame(row) for row in rows], count, size)
 
     def labelled(self) -> list[ReviewFrame]:
         """All frames with a label, oldest first."""
         query = f"SELECT {_COLUMNS} FROM frames WHERE label IS NOT NULL ORDER BY number"
         with self._using() as connection:
             return [_frame(row) for row in connection.execute(query).fetchall()]
-
-    def size(self) -> tuple[int, int]:
-        """How many frames are kept, and their bytes."""
-        with self._using() as connection:
-            count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
-        return int(count), int(size)
 
     def find(self, number: int) -> ReviewFrame:
         """One frame.
@@ -250,12 +245,18 @@ def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: C
 
     Those that are held stay.
     """
-    count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
+    count, size = _size(connection)
     if setting.allows(count, size):
         return
     frames = connection.execute("SELECT number, size FROM frames ORDER BY label IS NOT NULL, number")
     going = frames_to_drop(frames, count, size, setting, held)
     connection.executemany("DELETE FROM frames WHERE number = ?", [(number,) for number in going])
+
+
+def _size(connection: sqlite3.Connection) -> tuple[int, int]:
+    """How many frames are kept, and their bytes."""
+    count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
+    return int(count), int(size)
 
 
 def _expect(connection: sqlite3.Connection, number: int) -> tuple[Any, ...]:

@@ -34,8 +34,8 @@ messages = Console(stderr=True)
 """Standard error: progress, remarks, errors."""
 
 
-RENAMED = {"forget": "delete", "revoke": "delete"}
-"""Commands by the names that they had once."""
+RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("keys", "revoke"): "delete"}
+"""Commands by their group and the names that they had once."""
 
 
 class Failure(Exception):
@@ -52,7 +52,7 @@ class Commands(TyperGroup):
         found = super().get_command(ctx, cmd_name)
         if found is not None:
             add_key(found)
-        elif (new := RENAMED.get(cmd_name)) is not None and super().get_command(ctx, new) is not None:
+        elif (new := RENAMED.get((ctx.info_name, cmd_name))) is not None:
             ctx.fail(f"`{ctx.command_path} {cmd_name}` is `{ctx.command_path} {new}` now: use {new}.")
         return found
 
@@ -114,6 +114,22 @@ def show(made: Table) -> None:
         output.print(made)
     else:
         Console(file=output.file, width=10_000).print(made)
+
+
+def words(value: Any) -> str:
+    """A value of JSON in one cell of a table, without its brackets and quotes."""
+    if value is None or value in ({}, [], ""):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict) and value.keys() == {"value", "low", "high", "count", "of"}:  # a share
+        share = f"{value['count']} of {value['of']}"
+        return f"{value['value']:.3f} ({value['low']:.3f} to {value['high']:.3f}; {share})" if value["of"] else share
+    if isinstance(value, dict):
+        return "; ".join(f"{name}: {words(one)}" for name, one in value.items())
+    return ", ".join(map(words, value)) if isinstance(value, list) else str(value)
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -18,7 +18,7 @@ from service.commands.connection.client import (
     path_of,
     run,
 )
-from service.commands.console import Commands, Failure, progress, remark, show, show_json, table
+from service.commands.console import Commands, Failure, progress, remark, show, show_json, table, words
 
 jobs = typer.Typer(
     cls=Commands, help="List, follow and cancel jobs, which do long work in the background.", no_args_is_help=True
@@ -146,9 +146,25 @@ def show_outcome(job: dict[str, Any], as_json: bool) -> None:
     for name in ("kind", "map", "state", "attempt", "created_at", "started_at", "ended_at"):
         shown.add_row(name, "–" if job[name] is None else str(job[name]))
     shown.add_row("progress", _done(job))
-    for name, value in (job["result"] or {}).items():
-        shown.add_row(name, str(value))
+    result = dict(job["result"] or {})
+    lists = {name: result.pop(name) for name, value in list(result.items()) if _is_table(value)}
+    for name, value in result.items():
+        shown.add_row(name, words(value))
     show(shown)
+    for name, rows in lists.items():
+        shown = table(*rows[0], title=name)
+        for row in rows:
+            shown.add_row(*map(words, row.values()))
+        show(shown)
+
+
+def _is_table(value: Any) -> bool:
+    """Whether a result is a list of objects with the same fields, which have a table of their own."""
+    return (
+        bool(value)
+        and isinstance(value, list)
+        and all(isinstance(one, dict) and [*one] == [*value[0]] for one in value)
+    )
 
 
 def _done(job: dict[str, Any]) -> str:

@@ -229,13 +229,13 @@ def check_free_name(folder: Path, name: str, kind: Literal["encoder", "network"]
     """Check that a new encoder or network may have a name.
 
     Raises:
-        Failure: it cannot name one, a packaged one has it, or an installed one that is not to be overwritten.
+        InvalidIdentifier: it cannot name one.
+        Failure: a packaged one has it, or an installed one that is not to be overwritten.
     """
     from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED
-    from core.networks.network import NAME
+    from core.names import file_names
 
-    if not re.fullmatch(NAME, name):
-        raise Failure(f"{name!r} cannot name an {kind}: it must match {NAME}.")
+    file_names("an encoder" if kind == "encoder" else "a network").check(name)
     file = name + (ENCODER_SUFFIX if kind == "encoder" else NETWORK_SUFFIX)
     if (PACKAGED / file).exists():
         raise Failure(f"{name!r} is the name of a packaged {kind}; choose another.")

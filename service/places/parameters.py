@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from core.names import word
+from core.names import words
 from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
 from service.http.bodies import json_size
@@ -82,7 +82,7 @@ class EnrolParameters(PlaceDescription):
         return self.fields(metadata, settings)
 
 
-BatchName = Annotated[str | None, Field(pattern=f"^{word(64)}$", examples=["monday-17"])]
+BatchName = Annotated[Annotated[str, words("a batch", 64)] | None, Field(examples=["monday-17"])]
 
 
 class BatchParameters(Parameters):

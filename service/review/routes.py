@@ -54,9 +54,9 @@ def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], e
     listing: Listing = ["review-of", map_id, str(page.labelled)]
     before = decode_number(listing, page.cursor)
     found = review.page(None if before < 0 else before, page.limit + 1, page.labelled)
-    shown, more = page_of(listing, found, page.limit, lambda one: one.number)
-    count, size = review.size()
-    return ReviewPage(items=[ReviewFrameView.of(one) for one in shown], next_cursor=more, frames=count, bytes=size)
+    shown, more = page_of(listing, found.frames, page.limit, lambda one: one.number)
+    items = [ReviewFrameView.of(one) for one in shown]
+    return ReviewPage(items=items, next_cursor=more, frames=found.count, bytes=found.size)
 
 
 @router.get("/labels")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.names import word
+from core.names import words
 from core.places import Sequence, Timestamp
 from core.upkeep.coverage import Measure
 from core.upkeep.revisits import Reason
@@ -99,9 +99,8 @@ class Merging(BaseModel):
         "a camera has another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, "
         "and append places of a sequence to the sequence of the same name.",
     )
-    prefix: str | None = Field(
+    prefix: Annotated[str, words("a prefix", 64)] | None = Field(
         default=None,
-        pattern=f"^{word(64)}$",
         description="Put before names on conflict; if left out, the other map's id and a hyphen.",
     )
     sample: int = Field(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import posixpath
 import re
 import unicodedata
+from typing import Annotated
 from urllib.parse import quote
 
 import httpx
@@ -14,15 +15,27 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from core.errors import InvalidIdentifier
-from core.names import LONGEST, TEXT, check_name, word
-from core.networks.network import NAME as ENCODER_NAME
-from core.places import MAP_ID, PLACE_ID, Camera, Sequence, check_map_id, check_place_id, check_sequence
+from core.names import LONGEST, TEXT, Names, texts, word
+from core.networks.network import NAMES as NETWORK_NAMES
+from core.places import (
+    CAMERAS,
+    MAP_ID,
+    MAP_IDS,
+    PLACE_ID,
+    PLACE_IDS,
+    SEQUENCES,
+    Camera,
+    Sequence,
+    check_map_id,
+    check_place_id,
+    check_sequence,
+)
 
 MARKS = {"\u061c", "\u200e", "\u200f"}
 TURNING = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
 ODD = "./\\%2e \n\r\0\x7f\x80\x9f\u061c\u200d\u200e\u200f\u2028\u2029\u202a\u202e\u2066\u2069üА日💡"
 SEQUENCE: TypeAdapter[str] = TypeAdapter(Sequence)
-WORDS = (MAP_ID, PLACE_ID, ENCODER_NAME.strip("^$"), word(64), word(64, more="@"))
+WORDS = (MAP_ID, PLACE_ID, NETWORK_NAMES.pattern, word(64), word(64, more="@"))
 
 
 def can_be(text: str) -> bool:
@@ -94,4 +107,20 @@ def test_ids_and_cameras_follow_the_rule() -> None:
 
 def test_the_message_shows_what_is_unseen() -> None:
     with pytest.raises(InvalidIdentifier, match=r"^'a\\u202eb' cannot name a lamp: .* is not '\.' or '\.\.'\.$"):
-        check_name("a\u202eb", "a lamp")
+        texts("a lamp").check("a\u202eb")
+
+
+@pytest.mark.parametrize("kind", [MAP_IDS, PLACE_IDS, SEQUENCES, CAMERAS, NETWORK_NAMES], ids=lambda kind: kind.what)
+@pytest.mark.parametrize("text", ["", "..", "a/b", "\n", "x" * 129])
+def test_a_field_is_refused_with_the_sentence_of_an_argument(kind: Names, text: str) -> None:
+    with pytest.raises(InvalidIdentifier) as refused:
+        kind.check(text)
+    assert kind.what in str(refused.value) and " has 1 to " in str(refused.value) and "[" not in str(refused.value)
+    with pytest.raises(ValidationError) as invalid:
+        TypeAdapter(Annotated[str, kind]).validate_python(text)
+    assert invalid.value.errors()[0]["msg"] == f"Value error, {refused.value}"
+
+
+def test_the_schema_has_the_pattern() -> None:
+    assert SEQUENCE.json_schema() == {"type": "string", "minLength": 1, "maxLength": 128, "pattern": f"^{TEXT}$"}
+    assert TypeAdapter(Camera).json_schema() == {"type": "string", "pattern": f"^{word(64)}$"}

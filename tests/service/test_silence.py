@@ -20,6 +20,15 @@ from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
 from tests.watch import Watch, missing
 
+MACHINES_THAT_BUILD = (
+    *("CI", "TF_BUILD", "GITHUB_ACTIONS", "GITLAB_CI", "CIRCLECI", "TRAVIS", "JENKINS_URL", "CODEBUILD_BUILD_ID"),
+    *("BUILDKITE", "TEAMCITY_VERSION", "APPVEYOR", "BITBUCKET_BUILD_NUMBER"),
+)
+"""Variables by which ONNX Runtime knows a machine that builds and tests, where it reports nothing by itself."""
+
+CACHES = ("NUMBA_CACHE_DIR", "PYTHONPYCACHEPREFIX")
+"""Variables that move what is compiled once for this checkout to where it would be taken for something else."""
+
 
 @pytest.fixture
 def watch(tmp_path: Path) -> Watch:
@@ -29,12 +38,16 @@ def watch(tmp_path: Path) -> Watch:
 
 
 def wrapped(watch: Watch, folder: Path) -> list[str]:
-    """The words before a command that is watched, with a home and a temporary folder in ``folder``."""
+    """The words before a command that is watched, with a home and a temporary folder in ``folder``.
+
+    The command is not told that a machine tests it, since what is silent there would be so for another reason.
+    """
     places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "home" / "cache", "TMPDIR": folder / "temporary"}
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     wrong = dict.fromkeys(SWITCHES, "0") | {"RAY_USAGE_STATS_ENABLED": "1", "FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
-    return ["/usr/bin/env", *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
+    unset = [word for name in (*MACHINES_THAT_BUILD, *CACHES) for word in ("-u", name)]
+    return ["/usr/bin/env", *unset, *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
 
 
 def written(watch: Watch, folder: Path, *own: Path) -> set[str]:

@@ -44,6 +44,10 @@ class InvalidName(PlacerecError, ValueError):
         self.name = name
 
 
+class InvalidOdometry(PlacerecError, ValueError):
+    """Odometry or a motion that the service would refuse: it is of another type, or out of range. Nothing was sent."""
+
+
 class Renamed(PlacerecError, AttributeError):
     """A method has another name now, which the text says."""
 

@@ -1,22 +1,45 @@
-"""Methods by the names that they had once: each is refused, and the one that does it now is named."""
+"""Methods under names that they had once, or where they never were: the refusal names the one that does it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from placerec_client.errors import Renamed
 
-NOW: Mapping[str, str] = {"forget": "delete", "forget_many": "delete_many", "revoke": "delete", "end": "delete"}
-
 
 class OldNames:
-    """What has no method of a name that is in ``NOW``, but the one that takes its place, says so when it is asked."""
+    """A class whose methods once had other names says so when it is asked for one of these.
+
+    The names are given with the class: ``class Keys(OldNames, revoke="delete")``.
+    """
+
+    _now: ClassVar[Mapping[str, str]] = {}
+
+    def __init_subclass__(cls, **now: str) -> None:
+        super().__init_subclass__()
+        cls._now = now
 
     if not TYPE_CHECKING:  # so that a type checker still knows what there is
 
         def __getattr__(self, name: str) -> Any:
-            new = NOW.get(name)
-            if new is not None and hasattr(type(self), new):
-                raise Renamed(type(self).__name__, name, new)
+            if name in self._now:
+                raise Renamed(type(self).__name__, name, self._now[name])
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+
+
+DELETING = ("forget", "revoke", "end")
+"""Words that some classes once had for ``delete``."""
+
+
+class Subscripted:
+    """A collection whose members have the methods: asked for one of these itself, it says whose it is."""
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            text = f"{type(self).__name__!r} object has no attribute {name!r}"
+            now = "delete" if name in DELETING else name
+            if not name.startswith("_") and hasattr(type(self["id"]), now):
+                text += f"; one of them has it: {type(self).__name__.removeprefix('Async').lower()}[id].{now}"
+            raise AttributeError(text, name=name, obj=self)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
-from placerec_client import Client, DeadlineExceeded, PlacerecError, Problem
+from placerec_client import Client, DeadlineExceeded, InvalidOdometry, PlacerecError, Problem
 from placerec_ros.frame_queue import Frame, FrameQueue
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
@@ -209,7 +209,7 @@ class Localizer:
         """Run a step; what goes wrong is told, and the next attempt waits."""
         try:
             step()
-        except UnfitPicture as error:
+        except (UnfitPicture, InvalidOdometry) as error:
             self._health.frame(f"{_sentence(str(error))}")
         except PlacerecError as error:
             self._heard = time.monotonic()  # the next check of an idle node comes later

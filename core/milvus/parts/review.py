@@ -14,7 +14,7 @@ from psycopg import Connection
 
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame, frames_to_drop
+from core.maps.review import ReviewFrame, ReviewPage, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
@@ -93,8 +93,8 @@ class MilvusReview:
         going = frames_to_drop(connection.execute(query, (self._map,)), count, size, setting, self._held)
         connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
-        """The latest frames, newest first.
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+        """The latest frames, newest first, and how many are kept in all, as of one moment.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -105,8 +105,8 @@ class MilvusReview:
             f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number < %s{also} ORDER BY number DESC LIMIT %s"
         )
         with self._reading() as connection:
-            found = connection.execute(query, (self._map, 2**62 if before is None else before, limit))
-            return [_frame(values) for values in found]
+            found = connection.execute(query, (self._map, 2**62 if before is None else before, limit)).fetchall()
+            return ReviewPage([_frame(values) for values in found], *self._size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
         """All frames with a label, oldest first."""
@@ -114,12 +114,8 @@ class MilvusReview:
         with self._reading() as connection:
             return [_frame(values) for values in connection.execute(query, (self._map,))]
 
-    def size(self) -> tuple[int, int]:
-        """How many frames are kept, and their bytes."""
-        with self._reading() as connection:
-            return self._size(connection)
-
     def _size(self, connection: Connection[Any]) -> tuple[int, int]:
+        """How many frames are kept, and their bytes."""
         query = "SELECT count(*), coalesce(sum(size), 0) FROM review_frames WHERE map = %s"
         ((count, size),) = connection.execute(query, (self._map,)).fetchall()
         return int(count), int(size)

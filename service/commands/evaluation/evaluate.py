@@ -20,6 +20,7 @@ from service.commands.evaluation.output import (
     show_published,
     show_thresholds,
     show_trends,
+    verify_of,
     write_json,
     write_results,
 )
@@ -371,7 +372,8 @@ class _Bar:
 def _show(comparison: Comparison, cache: EvaluationCache) -> None:
     figures = [run.evaluation for run in comparison.runs]
     first = figures[0]
-    show_figures(figures, f"{comparison.name}: {first.queries} queries against {first.references} references")
+    title = f"{comparison.name}: {first.queries} queries against {first.references} references"
+    show_figures(figures, title, [verify_of(run) for run in comparison.runs])
     show_costs([run.evaluation for run in comparison.runs if not run.elsewhere])
     show_thresholds(figures)
     show_trends(comparison)

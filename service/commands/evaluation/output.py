@@ -19,14 +19,20 @@ from service.commands.model import name_of
 RULES = {"mean_of_negatives": "mean of true negatives", "full_precision": "best wrong match"}
 
 
-def show_figures(figures: Sequence[Evaluation], title: str) -> None:
-    """A row of accuracy for each encoder; matches of one class only get a word in place of AUC-PR."""
+def show_figures(figures: Sequence[Evaluation], title: str, verified: Sequence[str | None] | None = None) -> None:
+    """A row of accuracy for each encoder; matches of one class only get a word in place of AUC-PR.
+
+    Args:
+        verified: when each verified its matches, as of :func:`verify_of`; None: it is known of none.
+    """
     columns = ("#AUC-PR", "#AUC-ROC", *(f"#recall@{depth}" for depth in DEPTHS), "#recall at full precision")
-    shown = table("encoder", *columns, "#extended precision", "#right", title=title)
-    for row in figures:
+    names = ("encoder",) if verified is None else ("encoder", "verified")
+    shown = table(*names, *columns, "#extended precision", "#right", title=title)
+    for row, when in zip(figures, verified or [None] * len(figures), strict=True):
         values = [row.auc_roc, *(row.recall_at[str(depth)] for depth in DEPTHS)]
         shown.add_row(
             escape(name_of(row.encoder)),
+            *([] if verified is None else [when or "–"]),
             row.one_class or number(row.auc_pr),
             *map(number, values),
             number(row.recall_at_full_precision),
@@ -34,6 +40,11 @@ def show_figures(figures: Sequence[Evaluation], title: str) -> None:
             f"{row.right} of {row.queries}",
         )
     show(shown)
+
+
+def verify_of(run: Run) -> str | None:
+    """When a system verified the geometry of its matches: auto, always or never; None if others have computed it."""
+    return None if run.elsewhere else str(run.about.configuration.get("verification.verify", "never"))
 
 
 def show_costs(figures: Sequence[Evaluation]) -> None:
@@ -117,7 +128,7 @@ def show_trends(comparison: Comparison) -> None:
 def run_json(run: Run) -> dict[str, Any]:
     """The figures of a run and its system."""
     about = {"title": run.about.title, "paper": run.about.paper, "configuration": dict(run.about.configuration)}
-    marks = {"cached": run.cached, **({"elsewhere": True} if run.elsewhere else {})}
+    marks = {"verify": verify_of(run), "cached": run.cached, **({"elsewhere": True} if run.elsewhere else {})}
     return {**run.evaluation.model_dump(), **about, **marks}
 
 

@@ -135,9 +135,10 @@ def delete_map(
     data_dir: DataDir = None,
 ) -> None:
     """Delete a map and all its places."""
+    path = path_of("maps", map_id)
     if not yes:
         typer.confirm(f"Delete the map {map_id} and all its places?", abort=True)
-    ask(Target(url, data_dir), "DELETE", path_of("maps", map_id))
+    ask(Target(url, data_dir), "DELETE", path)
     remark(f"The map {map_id} is deleted.")
 
 

@@ -101,16 +101,30 @@ def edit_place(
 def delete_places(
     map_id: MapId,
     place_ids: Annotated[list[str], typer.Argument(metavar="PLACE…", help="Ids.", show_default=False)],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Delete places. This cannot be undone."""
+    """Delete places: all of them, or none if the map lacks one. This cannot be undone."""
+    for place_id in place_ids:
+        path_of(place_id)  # refuses what is no name before it is asked about
+    path = path_of("maps", map_id, "places") + ":delete"
 
     async def work() -> None:
         async with open_service(Target(url, data_dir)) as service:
-            for place_id in place_ids:
-                await service.request("DELETE", path_of("maps", map_id, "places", place_id))
-                remark(f"The place {place_id} is deleted.")
+
+            async def order(dry_run: bool) -> Any:
+                return (await service.request("POST", path, json={"ids": place_ids, "dry_run": dry_run})).json()
+
+            if missing := (await order(dry_run=True))["missing"]:
+                raise Failure(f"The map {map_id} has no place {', '.join(missing)}; nothing was deleted.")
+            if not yes:
+                typer.confirm(f"Delete from the map {map_id}: {', '.join(place_ids)}?", abort=True)
+            deleted = await order(dry_run=False)
+            if deleted["ids"]:
+                remark(f"Deleted: {', '.join(deleted['ids'])}.")
+            if deleted["missing"]:
+                raise Failure(f"Meanwhile somebody else deleted {', '.join(deleted['missing'])}.")
 
     run(work())
 
@@ -191,7 +205,8 @@ def delete_sequence(
     data_dir: DataDir = None,
 ) -> None:
     """Delete all places of a traverse. This cannot be undone."""
+    path = path_of("maps", map_id, "sequences", sequence)
     if not yes:
         typer.confirm(f"Delete all places of the sequence {sequence} of the map {map_id}?", abort=True)
-    deleted = ask(Target(url, data_dir), "DELETE", path_of("maps", map_id, "sequences", sequence)).json()
+    deleted = ask(Target(url, data_dir), "DELETE", path).json()
     remark(f"The sequence {sequence} is deleted: {deleted['places']} places.")

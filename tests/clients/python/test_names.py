@@ -10,6 +10,7 @@ import asyncio
 import inspect
 import re
 from collections.abc import Callable, Iterator
+from copy import copy
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -213,6 +214,29 @@ def test_the_old_words_name_the_new_one(client: Client, lab: Map) -> None:
         with pytest.raises(Renamed, match=rf"^{type(thing).__name__}\.{old} .*: use {new}\.$"):
             getattr(thing, old)("p")
         assert not hasattr(thing, old) and callable(getattr(thing, new))
-    for thing, word in ((lab.places, "revoked"), (session, "forget_many")):
-        with pytest.raises(AttributeError, match=f"has no attribute '{word}'"):
+    for thing, word in ((lab.places, "revoked"), (session, "forget_many"), (lab.places, "revoke"), (lab, "forget")):
+        with pytest.raises(AttributeError, match=f"has no attribute '{word}'$"):
             getattr(thing, word)
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_what_one_of_a_collection_does_is_looked_for_at_it(half: Any, url: str) -> None:
+    client = half(url)
+    sessions = client.maps["lab"].sessions
+    for thing, word, where in (
+        (client.maps, "delete", r"maps[id].delete"),
+        (client.maps, "forget", r"maps[id].delete"),
+        (client.maps, "query", r"maps[id].query"),
+        (client.jobs, "cancel", r"jobs[id].cancel"),
+        (sessions, "send", r"sessions[id].send"),
+        (sessions, "end", r"sessions[id].delete"),
+    ):
+        with pytest.raises(
+            AttributeError, match=rf"has no attribute '{word}'; one of them has it: {re.escape(where)}$"
+        ):
+            getattr(thing, word)
+        assert not hasattr(thing, word)
+    for thing, word in ((client.maps, "nothing"), (client.jobs, "delete"), (client.maps, "_path")):
+        with pytest.raises(AttributeError, match=f"has no attribute '{word}'$"):
+            getattr(thing, word)
+    assert copy(client.maps)["lab"].id == "lab"

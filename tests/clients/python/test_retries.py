@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import re
 import socket
 import time
 from collections.abc import Callable
@@ -129,6 +130,36 @@ def test_another_service_is_told_apart() -> None:
     with pytest.raises(UnexpectedAnswer, match=r"answered 404\. Is it a placerec service") as answered:
         ask(handle)
     assert answered.value.status == 404
+
+
+def test_a_url_with_a_path_too_many_is_told(url: str, lab: Map) -> None:
+    hint = rf"{re.escape(url)}/v1 may not be the URL of a service: give {re.escape(url)}, without /v1\.$"
+    with Client(f"{url}/v1/") as client:
+        there = client.maps[lab.id]
+        calls: list[Callable[[], object]] = [
+            client.liveness,
+            there.read,
+            lambda: list(client.maps),
+            lambda: list(there.events()),
+        ]
+        for call in calls:
+            with pytest.raises(UnexpectedAnswer, match=hint) as answered:
+                call()
+            assert answered.value.status == 404
+        with pytest.raises(UnexpectedAnswer, match=hint):
+            there.query(b"frame")
+    with Client(f"{url}/console") as client, pytest.raises(UnexpectedAnswer, match="is given without the path of an"):
+        client.liveness()
+
+
+@pytest.mark.parametrize("path", ["/robots/placerec", "/robots/v1"])
+def test_a_service_behind_a_prefix_is_itself(path: str) -> None:
+    handle, asked = in_turn(httpx.Response(200, json={"status": "ok"}), problem(404, "unknown-map"))
+    with Client(f"http://robot{path}", transport=httpx.MockTransport(handle), retry=Retry(0)) as client:
+        client.liveness()
+        with pytest.raises(problems.UnknownMap):
+            client.maps["lab"].read()
+    assert [one.url.path for one in asked] == [f"{path}/livez", f"{path}/v1/maps/lab"]
 
 
 @pytest.mark.parametrize(

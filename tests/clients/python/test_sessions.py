@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from placerec_client import (
@@ -16,6 +20,7 @@ from placerec_client import (
     Client,
     ConnectionFailed,
     DeadlineExceeded,
+    InvalidOdometry,
     Map,
     Odometry,
     PlacerecError,
@@ -26,8 +31,15 @@ from placerec_client import (
 )
 from placerec_client.parameters import SendFrame
 from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.service.refusing import Seen, refusing_server
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+
+
+@pytest.fixture(scope="module")
+def refusing() -> Iterator[tuple[str, Seen]]:
+    with refusing_server() as server:
+        yield server
 
 
 @pytest.fixture
@@ -115,6 +127,69 @@ def test_a_stream_that_is_cut_counts_odometry_once(server: Server, walk: Map) ->
                 assert [one.place.id for one in told.candidates] == [one.place.id for one in true.candidates]
                 assert told.unknown == pytest.approx(true.unknown, abs=1e-5)
         assert way.happened["cut-stream"] > 1
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_a_motion_that_is_none_is_refused_before_it_is_sent(refusing: tuple[str, Seen], half: Any) -> None:
+    url, seen = refusing
+
+    async def refused(**options: Any) -> str:
+        session = half(url, retry=Retry(0)).maps["lab"].sessions["s"]
+        for send in (session.send, session.stream().send):
+            with pytest.raises(InvalidOdometry) as told:
+                if inspect.isawaitable(sent := send(jpeg(1, 64, 48), frame=1, **options)):
+                    await sent
+        return str(told.value)
+
+    for pose in ((1, 2, 3), [1, 2, 3], {"x": 1}, 4):
+        said = asyncio.run(refused(odometry=pose))
+        assert said.startswith(f"odometry has to be an Odometry, not a {type(pose).__name__}: give Odometry(x, y, head")
+    for name in ("forward", "left", "turn"):
+        for value in ((1, 2), "1", True, float("nan"), float("-inf"), 1e6, np.array([1.0])):
+            assert f"{name} has to be a finite number of " in asyncio.run(refused(**{name: value}))
+    assert seen == []
+
+
+def test_odometry_is_what_the_service_takes() -> None:
+    whole: dict[str, Any] = {"x": 1.0, "y": 2.0, "heading": 450.0}
+    square = [0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.01]
+    for name in whole:
+        for value in (None, "1", True, (1,), float("nan"), float("inf"), 1e9, np.array([1.0])):
+            with pytest.raises(
+                InvalidOdometry, match=f"^{name} has to be a finite number of (metres|degrees), at most 1"
+            ):
+                Odometry(**{**whole, name: value})
+    for wrong in ([1.0], "123456789", 3.0, [*square[:8], float("nan")], [*square[:8], -1.0], [0.1, 5.0, *square[2:]]):
+        with pytest.raises(InvalidOdometry, match=r"^covariance has to be "):
+            Odometry(**whole, covariance=wrong)  # type: ignore[arg-type]
+    for origin in (7, "x" * 129):
+        with pytest.raises(InvalidOdometry, match=r"^origin has to be "):
+            Odometry(**whole, origin=origin)  # type: ignore[arg-type]
+
+
+def test_numbers_of_numpy_and_any_turn_are_taken(walk: Map) -> None:
+    pose = Odometry(np.float32(1.5), np.array(2.0), np.int64(-720), np.eye(3).ravel())  # type: ignore[arg-type]
+    with walk.sessions.begin() as session, session.stream() as stream:
+        assert session.send(jpeg(0, 64, 48), odometry=pose).frames == 1
+        assert stream.send(jpeg(1, 64, 48), odometry=replace(pose, heading=370.0)).motion == "odometry"
+
+
+def test_a_session_that_has_not_begun_says_how_it_begins(lab: Map) -> None:
+    session = lab.sessions.begin()
+    uses: list[Callable[[], object]] = [
+        lambda: session.send(jpeg(1, 64, 48)),
+        session.read,
+        session.delete,
+        session.stream,
+    ]
+    for use in uses:
+        with pytest.raises(
+            PlacerecError, match=r"has not begun: .*`with lab\.sessions\.begin\(\) as session:`, or by sess"
+        ):
+            use()
+    session.begin()
+    assert session.send(jpeg(1, 64, 48)).frames == 1
+    session.delete()
 
 
 def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:

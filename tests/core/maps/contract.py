@@ -272,12 +272,13 @@ class StoreContract(RuleBasedStateMachine):
     def keep_for_review(self, picture: str, most: int) -> None:
         """The oldest frame without a label goes first; a label is found again."""
         review, data = self.map.review, picture.encode()
-        numbers = [frame.number for frame in review.page(None, 10)]
-        known = next((frame for frame in review.page(None, 10) if frame.digest == sha256(data).digest()), None)
+        numbers = [frame.number for frame in review.page(None, 10).frames]
+        known = next((frame for frame in review.page(None, 10).frames if frame.digest == sha256(data).digest()), None)
         setting = ReviewSetting(most_frames=most)
         assert review.keep(data, {"verdict": "unknown"}, setting) == (known is None)
         review.shrink(setting)
-        kept = self.map.review.page(None, 10)
+        page = self.map.review.page(None, 10)
+        kept = page.frames
         assert len(kept) == min(most, len(numbers) + (known is None))
         unlabelled = [frame.number for frame in kept if frame.label is None]
         assert unlabelled == sorted(unlabelled, reverse=True)
@@ -285,7 +286,7 @@ class StoreContract(RuleBasedStateMachine):
         assert review.label(latest.number, {"place": "p1"}).label == {"place": "p1"}
         assert latest.number in [frame.number for frame in self.map.review.labelled()]
         assert sha256(self.map.review.picture(latest.number)).digest() == latest.digest
-        assert review.size() == (len(kept), sum(frame.size for frame in kept))
+        assert (page.count, page.size) == (len(kept), sum(frame.size for frame in kept))
         if len(kept) == 3:
             review.discard(latest.number)
             with pytest.raises(errors.UnknownFrame):

@@ -22,6 +22,7 @@ from core.milvus.pictures.kept import StoredObject
 from core.milvus.pictures.objects import Objects
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
+from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.milvus.object_server import PORTS, object_store, reading_only
 from tests.core.milvus.servers import Server, Servers, fixed_ports
 from tests.core.milvus.test_moves import ID, imported
@@ -121,7 +122,7 @@ def test_frames_for_review(store: MilvusStore, lab: MilvusMap, objects: Objects,
     store.sweep_objects()
     before = names_in(objects, store)
     assert [lab.review.keep(image_of(name), {}, setting) for name in "aabc"] == [True, False, True, True]
-    kept = lab.review.page(None, 10)
+    kept = lab.review.page(None, 10).frames
     assert [lab.review.picture(one.number) for one in kept] == [image_of("c"), image_of("b")]
     store.sweep_objects()
     assert len(names_in(objects, store) - before) == 2
@@ -129,6 +130,10 @@ def test_frames_for_review(store: MilvusStore, lab: MilvusMap, objects: Objects,
     objects.delete(sorted(names_in(objects, store) - before))
     with pytest.raises(StorageFailure, match="damaged"):
         lab.review.picture(kept[1].number)
+
+
+def test_a_page_for_review_is_of_one_moment(store: MilvusStore, lab: MilvusMap) -> None:
+    check_pages_are_of_one_moment(lab.review, store.get("lab").review)
 
 
 def test_what_is_lost_or_damaged_is_told(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:

@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 from core.errors import StorageFailure, UnknownFrame, UnknownMap
 from core.maps import MapSettings, ReviewSetting
+from core.maps.review import ReviewPage
 from core.storage import Atlas
 from core.storage.review import FILE, ReviewFrames
+from tests.core.maps.review import check_pages_are_of_one_moment
 
 ENCODER = "some@" + "0" * 64
 SETTING = ReviewSetting(most_frames=5, most_bytes=1 << 16)
@@ -25,20 +27,26 @@ def frames_at(folder: Path) -> ReviewFrames:
 
 def test_a_frame_is_kept_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
-    assert review.page(None, 10) == [] and review.size() == (0, 0) and not (tmp_path / FILE).exists()
+    assert review.page(None, 10) == ReviewPage([], 0, 0) and not (tmp_path / FILE).exists()
     assert review.keep(b"one", ANSWER, SETTING) and review.keep(b"two", {"verdict": "ambiguous"}, SETTING)
     assert not review.keep(b"one", ANSWER, SETTING), "the same file is kept once"
     review.label(1, {"label": {"place": "p7"}})
     review.close()
     again = frames_at(tmp_path)
-    second, first = again.page(None, 10)
+    second, first = again.page(None, 10).frames
     assert (first.number, second.number) == (1, 2) and first.answer == ANSWER and first.size == 3
     assert first.label == {"label": {"place": "p7"}} and second.label is None
     assert [again.picture(one.number) for one in (first, second)] == [b"one", b"two"]
-    assert again.page(2, 10) == [first] and again.page(None, 1) == [second]
-    assert again.page(None, 10, labelled=True) == again.labelled() == [first]
-    assert again.page(None, 10, labelled=False) == [second]
+    assert again.page(2, 10) == ReviewPage([first], 2, 6) and again.page(None, 1) == ReviewPage([second], 2, 6)
+    assert again.page(None, 10, labelled=True).frames == again.labelled() == [first]
+    assert again.page(None, 10, labelled=False).frames == [second]
     again.close()
+
+
+def test_a_page_is_of_one_moment(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    check_pages_are_of_one_moment(review, review)
+    review.close()
 
 
 def test_a_frame_that_is_not_kept_is_named(tmp_path: Path) -> None:
@@ -69,8 +77,9 @@ def test_the_oldest_go_first_and_those_with_a_label_last(
         if labelled and expected and expected[-1][0] == number:
             review.label(number, {"label": {"stranger": True}})
             expected[-1] = (number, 2 * size, True)
-    kept = [(one.number, one.size, one.label is not None) for one in reversed(review.page(None, 100))]
-    assert kept == expected and review.size() == (len(expected), sum(size for _, size, _ in expected))
+    page = review.page(None, 100)
+    kept = [(one.number, one.size, one.label is not None) for one in reversed(page.frames)]
+    assert kept == expected and (page.count, page.size) == (len(expected), sum(size for _, size, _ in expected))
     review.close()
 
 
@@ -78,7 +87,7 @@ def test_a_frame_larger_than_all_may_be_is_not_kept(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
     review.keep(b"one", ANSWER, SETTING)
     assert not review.keep(bytes(SETTING.most_bytes + 1), ANSWER, SETTING)
-    assert review.size() == (1, 3)
+    assert (review.page(None, 0).count, review.page(None, 0).size) == (1, 3)
     review.close()
 
 
@@ -88,7 +97,7 @@ def test_lower_limits_give_back_the_room(tmp_path: Path) -> None:
     for number in range(20):
         review.keep(bytes([number]) * 100_000, ANSWER, wide)
     review.shrink(ReviewSetting(most_frames=2, most_bytes=1 << 24))
-    assert [one.number for one in review.page(None, 10)] == [20, 19]
+    assert [one.number for one in review.page(None, 10).frames] == [20, 19]
     review.close()
     assert (tmp_path / FILE).stat().st_size < 500_000
 
@@ -99,9 +108,9 @@ def test_a_frame_that_is_held_is_not_dropped_for_newer_ones(tmp_path: Path) -> N
     for number in range(4):
         with review.held(1):
             review.keep(bytes([number]), ANSWER, setting)
-    assert [one.number for one in review.page(None, 10)] == [4, 1]
+    assert [one.number for one in review.page(None, 10).frames] == [4, 1]
     review.keep(b"next", ANSWER, setting)
-    assert [one.number for one in review.page(None, 10)] == [5, 4]
+    assert [one.number for one in review.page(None, 10).frames] == [5, 4]
     review.close()
 
 
@@ -120,7 +129,7 @@ def test_what_does_not_match_its_checksum_is_not_shown(tmp_path: Path) -> None:
     edit(tmp_path / FILE, "UPDATE frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
     edit(tmp_path / FILE, "UPDATE pictures SET bytes = x'FF' WHERE frame = 2")
     review = frames_at(tmp_path)
-    assert [one.number for one in review.page(None, 10)] == [3, 2]
+    assert [one.number for one in review.page(None, 10).frames] == [3, 2]
     with pytest.raises(StorageFailure, match="damaged"):
         review.picture(2)
     assert review.picture(3) == b"\x02"
@@ -130,7 +139,7 @@ def test_what_does_not_match_its_checksum_is_not_shown(tmp_path: Path) -> None:
 def test_a_damaged_file_is_put_aside_and_the_map_goes_on(tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(b"no database at all" * 100)
     review = frames_at(tmp_path)
-    assert review.page(None, 10) == [] and review.keep(b"one", ANSWER, SETTING)
+    assert review.page(None, 10).frames == [] and review.keep(b"one", ANSWER, SETTING)
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
     review.close()
 
@@ -146,7 +155,7 @@ def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
     with pytest.raises(UnknownMap):
         map_.review.keep(b"two", ANSWER, SETTING)
     made = atlas.create("lab", ENCODER, 8)
-    assert made.review.page(None, 10) == [] and made.record.review is None
+    assert made.review.page(None, 10).frames == [] and made.record.review is None
     atlas.close()
 
 

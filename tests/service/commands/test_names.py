@@ -108,8 +108,18 @@ def test_old_words_name_the_new_one(placerec: Placerec, group: str, old: str) ->
     assert f" {old} " not in placerec(*group.split(), "--help").stdout
 
 
+@pytest.mark.parametrize("words", [("maps",), ("maps", "places", "lab"), ("maps", "sequences", "lab")])
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_name_is_refused_before_a_question(placerec: Placerec, words: tuple[str, ...], name: str) -> None:
+    group, within = [one for one in words if one != "lab"], [one for one in words if one == "lab"]
+    result = placerec(*group, "delete", *within, "--", name, status=1, stdin="y\n")
+    assert "is no name" in result.stderr and "[y/N]" not in result.output
+
+
 def test_other_words_are_unknown(placerec: Placerec) -> None:
-    for words in (("maps", "places", "revoked"), ("jobs", "forget"), ("forget",)):
+    never = [("maps", old) for old in ("forget", "revoke", "end")]
+    never += [("keys", "forget"), ("maps", "places", "revoke"), ("maps", "sequences", "revoke")]
+    for words in (*never, ("maps", "places", "revoked"), ("jobs", "forget"), ("forget",)):
         assert "No such command" in placerec(*words, status=2).stderr
 
 

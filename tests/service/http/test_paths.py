@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.clients.python.models import operations
 from tests.service.scenes import jpeg
-from tests.service.server import Server
+from tests.service.server import Server, assert_problem
 from tests.service.wire import answer, opened
 
 SPELLINGS = (
@@ -79,20 +80,27 @@ def test_no_spelling_of_a_name_reaches_another_operation(server: Server, lab: st
     assert there(server, lab) == before
 
 
+def assert_told(response: httpx.Response) -> None:
+    """A name is refused in words."""
+    detail = assert_problem(response, 422, "invalid-request")["detail"]
+    assert re.search(r"cannot name a \w+: a name has 1 to \d+ characters[^\[]+\.$", detail), detail
+
+
 def test_a_name_is_refused_where_it_is_given(server: Server, lab: str) -> None:
     for name in (".", "..", "\n", "\x85", "\u202e", "a/b", "\u2066x"):
-        response = server.enrol(lab, "q", jpeg(2), sequence=name)
-        assert response.status_code == 422 and response.json()["type"].endswith("invalid-request"), response.text
-        changed = server.client.patch(f"/v1/maps/{lab}/places/p", json={"sequence": name})
-        assert changed.status_code == 422
-        batch = server.client.post(f"/v1/maps/{lab}/places", params={"batch": name}, content=b"")
-        assert batch.status_code == 422
+        assert_told(server.enrol(lab, "q", jpeg(2), sequence=name))
+        assert_told(server.enrol(lab, "q", jpeg(2), camera=name))
+        assert_told(server.client.patch(f"/v1/maps/{lab}/places/p", json={"sequence": name}))
+        form = {"q": ("q", jpeg(2), "image/jpeg")}
+        assert_told(server.client.post(f"/v1/maps/{lab}/places", params={"batch": name}, files=form))
         for path, body in (
             ("align", {"sequence": name}),
             ("prune", {"sequence": name}),
+            ("merge", {"from": "other", "prefix": name}),
             ("sessions", {"sequences": [name]}),
+            ("sessions", {"camera": name}),
         ):
-            assert server.client.post(f"/v1/maps/{lab}/{path}", json=body).status_code == 422, (path, name)
+            assert_told(server.client.post(f"/v1/maps/{lab}/{path}", json=body))
     assert list(server.places(lab)) == ["p"]
 
 

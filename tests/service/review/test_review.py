@@ -292,7 +292,7 @@ def test_more_frames_than_can_be_written_are_dropped(tmp_path: Path, monkeypatch
     assert 9 <= keeper.dropped <= 10, "one is being written, so many wait"
     gate.set()
     keeper.close()
-    assert map_.review.size()[0] == MOST_WAITING + 10 - keeper.dropped, "what waits at the end is written"
+    assert map_.review.page(None, 0).count == MOST_WAITING + 10 - keeper.dropped, "what waits at the end is written"
     before = keeper.dropped
     keeper.offer(map_, b"late", {"verdict": "unknown"})
     assert keeper.dropped == before + 1

@@ -13,6 +13,7 @@ from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.following import follow
 from placerec_client.answers import parsed, problem_of
 from placerec_client.errors import DeadlineExceeded, JobCancelled
+from placerec_client.renamed import Subscripted
 from placerec_client.requests import path_of
 
 OPEN = ("queued", "running")
@@ -24,7 +25,7 @@ PROGRESS_SECONDS = 1.0
 Progress = Callable[[models.JobView], object]
 
 
-class AsyncJobs:
+class AsyncJobs(Subscripted):
     """The jobs of a service; iterated, the newest first."""
 
     def __init__(self, connection: AsyncConnection) -> None:

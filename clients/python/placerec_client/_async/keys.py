@@ -12,7 +12,7 @@ from placerec_client.requests import path_of
 from placerec_client.retry import Retry
 
 
-class AsyncKeys(OldNames):
+class AsyncKeys(OldNames, revoke="delete"):
     """The keys of a service; iterated, all that were ever created, without their secrets. They need the role admin."""
 
     def __init__(self, connection: AsyncConnection) -> None:

@@ -21,7 +21,7 @@ from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
 from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.renamed import OldNames
+from placerec_client.renamed import OldNames, Subscripted
 from placerec_client.requests import Part, dumps, fields, form, path_of
 
 TRANSFER_PATIENCE = 3600.0
@@ -29,7 +29,7 @@ TRANSFER_PATIENCE = 3600.0
 a map, which for 100 000 places takes minutes; if the client has any patience."""
 
 
-class AsyncMaps:
+class AsyncMaps(Subscripted):
     """The maps of a service; iterated, their settings in the order of their ids."""
 
     def __init__(self, connection: AsyncConnection) -> None:
@@ -468,7 +468,7 @@ class AsyncMap:
         return await AsyncJob.submit(self.connection, path, **options)
 
 
-class AsyncSequences(OldNames):
+class AsyncSequences(OldNames, forget="delete"):
     """The traverses of a map."""
 
     def __init__(self, connection: AsyncConnection, path: str) -> None:
@@ -494,7 +494,7 @@ class AsyncSequences(OldNames):
             return models.DeletedSequence(name=name, places=0)
 
 
-class AsyncCameras(OldNames):
+class AsyncCameras(OldNames, forget="delete"):
     """The cameras of a map."""
 
     def __init__(self, connection: AsyncConnection, path: str) -> None:

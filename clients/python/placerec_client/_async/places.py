@@ -12,7 +12,7 @@ from placerec_client.renamed import OldNames
 from placerec_client.requests import fields, path_of
 
 
-class AsyncPlaces(OldNames):
+class AsyncPlaces(OldNames, forget="delete", forget_many="delete_many"):
     """The places of a map; iterated, in the order of their enrolment."""
 
     def __init__(self, connection: AsyncConnection, path: str) -> None:

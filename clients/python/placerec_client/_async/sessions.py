@@ -14,8 +14,8 @@ from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.numbering import AsyncNumbering
 from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.odometry import Odometry
-from placerec_client.renamed import OldNames
+from placerec_client.odometry import Odometry, with_motion
+from placerec_client.renamed import OldNames, Subscripted
 from placerec_client.requests import path_of
 from placerec_client.retry import Retry
 
@@ -29,7 +29,7 @@ LEAVE_SECONDS = 1.0
 log = getLogger("placerec_client")
 
 
-class AsyncSessions:
+class AsyncSessions(Subscripted):
     """The sessions of a map that have not ended; iterated, in the order of their ids."""
 
     def __init__(self, connection: AsyncConnection, path: str) -> None:
@@ -64,7 +64,7 @@ class AsyncSessions:
         return AsyncSession(self._connection, self._path, options)
 
 
-class AsyncSession(OldNames):
+class AsyncSession(OldNames, end="delete"):
     """One session of one robot. Its frames are sent one after the other, also by ``asyncio.gather`` or several threads.
 
     Attributes:
@@ -139,17 +139,19 @@ class AsyncSession(OldNames):
             options: such as ``frame`` (the robot's own number of the frame, growing; counted here if left out),
                 ``timestamp``; and, instead of ``odometry``, ``forward``, ``left``, ``turn`` since the last frame that
                 the service took in: the session's ``last_frame``.
+
+        Raises:
+            InvalidOdometry: ``odometry`` is no ``Odometry``, or a motion is no finite number. Nothing was sent.
         """
+        moved = with_motion(options, odometry)
         data = frame_bytes(image)
-        if odometry is not None:
-            options = {**options, **odometry.fields()}
         numbering = self._numbers()
         async with numbering.turn(deadline) as left:
             return await self._connection.ask(
                 models.SessionAnswer,
                 "POST",
                 self.path + "/frames",
-                params=await numbering.number(options),
+                params=await numbering.number(moved),
                 content=data,
                 media_type=media_type(data),
                 deadline=left,
@@ -172,7 +174,10 @@ class AsyncSession(OldNames):
 
     def _numbers(self) -> AsyncNumbering:
         if self._numbering is None:
-            raise PlacerecError("The session has not begun: enter it, or call begin().")
+            raise PlacerecError(
+                "The session has not begun: sessions.begin() only describes it. It begins when it is entered, as in "
+                "`async with lab.sessions.begin() as session:`, or by session.begin()."
+            )
         return self._numbering
 
     @property

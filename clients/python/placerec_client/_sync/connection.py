@@ -15,8 +15,16 @@ from placerec_client._http import httpx
 from placerec_client._sync.concurrency import sleep
 from placerec_client._sync.lanes import Lanes
 from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
-from placerec_client.errors import ClientClosed, ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
+from placerec_client.errors import (
+    ClientClosed,
+    ConnectionFailed,
+    DeadlineExceeded,
+    PlacerecError,
+    Problem,
+    UnexpectedAnswer,
+)
 from placerec_client.model import Model
+from placerec_client.problems import UnknownPath
 from placerec_client.requests import dumps, query_string
 from placerec_client.retry import Clock, Retry
 from placerec_client.version import VERSION
@@ -160,7 +168,7 @@ class Connection:
                 if outcome.is_success or outcome.status_code in accepted:
                     outcome.extensions["after_loss"] = clock.lost
                     return outcome
-                failure: PlacerecError = refusal(outcome, clock.lost)
+                failure: PlacerecError = self._refusal(outcome, clock.lost)
                 if not is_passing(outcome) or (isinstance(failure, Problem) and failure.slug in final):
                     raise failure
                 clock.lost = clock.lost or outcome.status_code in UNKNOWN_OUTCOME
@@ -213,6 +221,18 @@ class Connection:
         failure.__cause__ = error
         return failure
 
+    def _refusal(self, response: httpx.Response, after_loss: bool = False) -> PlacerecError:
+        """The error for an unsuccessful answer; where there is nothing at all, the URL may have a path too many."""
+        failure = refusal(response, after_loss)
+        is_lost = isinstance(failure, UnknownPath | UnexpectedAnswer) and response.status_code == 404
+        if not is_lost or httpx.URL(self.url).path == "/":
+            return failure
+        right = self.url.removesuffix("/v1")
+        hint = f"give {right}, without /v1" if right != self.url else "it is given without the path of an operation"
+        return UnexpectedAnswer(
+            f"{response.request.url} answered 404; {self.url} may not be the URL of a service: {hint}.", 404
+        )
+
     def _given_up(self, clock: Clock, failure: PlacerecError) -> PlacerecError:
         """The error after the last attempt: that of the attempt, or that the deadline is over."""
         if clock.deadline is None or isinstance(failure, DeadlineExceeded):
@@ -263,7 +283,7 @@ class Connection:
             try:
                 if not response.is_success:
                     response.read()
-                    raise refusal(response)
+                    raise self._refusal(response)
                 yield response
             finally:
                 response.close()

@@ -14,6 +14,7 @@ from placerec_client._sync.connection import Connection
 from placerec_client._sync.following import follow
 from placerec_client.answers import parsed, problem_of
 from placerec_client.errors import DeadlineExceeded, JobCancelled
+from placerec_client.renamed import Subscripted
 from placerec_client.requests import path_of
 
 OPEN = ("queued", "running")
@@ -25,7 +26,7 @@ PROGRESS_SECONDS = 1.0
 Progress = Callable[[models.JobView], object]
 
 
-class Jobs:
+class Jobs(Subscripted):
     """The jobs of a service; iterated, the newest first."""
 
     def __init__(self, connection: Connection) -> None:

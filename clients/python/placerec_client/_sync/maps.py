@@ -22,7 +22,7 @@ from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
 from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.renamed import OldNames
+from placerec_client.renamed import OldNames, Subscripted
 from placerec_client.requests import Part, dumps, fields, form, path_of
 
 TRANSFER_PATIENCE = 3600.0
@@ -30,7 +30,7 @@ TRANSFER_PATIENCE = 3600.0
 a map, which for 100 000 places takes minutes; if the client has any patience."""
 
 
-class Maps:
+class Maps(Subscripted):
     """The maps of a service; iterated, their settings in the order of their ids."""
 
     def __init__(self, connection: Connection) -> None:
@@ -463,7 +463,7 @@ class Map:
         return Job.submit(self.connection, path, **options)
 
 
-class Sequences(OldNames):
+class Sequences(OldNames, forget="delete"):
     """The traverses of a map."""
 
     def __init__(self, connection: Connection, path: str) -> None:
@@ -489,7 +489,7 @@ class Sequences(OldNames):
             return models.DeletedSequence(name=name, places=0)
 
 
-class Cameras(OldNames):
+class Cameras(OldNames, forget="delete"):
     """The cameras of a map."""
 
     def __init__(self, connection: Connection, path: str) -> None:

@@ -13,7 +13,7 @@ from placerec_client.renamed import OldNames
 from placerec_client.requests import fields, path_of
 
 
-class Places(OldNames):
+class Places(OldNames, forget="delete", forget_many="delete_many"):
     """The places of a map; iterated, in the order of their enrolment."""
 
     def __init__(self, connection: Connection, path: str) -> None:

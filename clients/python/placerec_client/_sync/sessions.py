@@ -15,8 +15,8 @@ from placerec_client._sync.connection import Connection
 from placerec_client._sync.numbering import Numbering
 from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.odometry import Odometry
-from placerec_client.renamed import OldNames
+from placerec_client.odometry import Odometry, with_motion
+from placerec_client.renamed import OldNames, Subscripted
 from placerec_client.requests import path_of
 from placerec_client.retry import Retry
 
@@ -30,7 +30,7 @@ LEAVE_SECONDS = 1.0
 log = getLogger("placerec_client")
 
 
-class Sessions:
+class Sessions(Subscripted):
     """The sessions of a map that have not ended; iterated, in the order of their ids."""
 
     def __init__(self, connection: Connection, path: str) -> None:
@@ -65,7 +65,7 @@ class Sessions:
         return Session(self._connection, self._path, options)
 
 
-class Session(OldNames):
+class Session(OldNames, end="delete"):
     """One session of one robot. Its frames are sent one after the other, also by ``asyncio.gather`` or several threads.
 
     Attributes:
@@ -140,17 +140,19 @@ class Session(OldNames):
             options: such as ``frame`` (the robot's own number of the frame, growing; counted here if left out),
                 ``timestamp``; and, instead of ``odometry``, ``forward``, ``left``, ``turn`` since the last frame that
                 the service took in: the session's ``last_frame``.
+
+        Raises:
+            InvalidOdometry: ``odometry`` is no ``Odometry``, or a motion is no finite number. Nothing was sent.
         """
+        moved = with_motion(options, odometry)
         data = frame_bytes(image)
-        if odometry is not None:
-            options = {**options, **odometry.fields()}
         numbering = self._numbers()
         with numbering.turn(deadline) as left:
             return self._connection.ask(
                 models.SessionAnswer,
                 "POST",
                 self.path + "/frames",
-                params=numbering.number(options),
+                params=numbering.number(moved),
                 content=data,
                 media_type=media_type(data),
                 deadline=left,
@@ -173,7 +175,10 @@ class Session(OldNames):
 
     def _numbers(self) -> Numbering:
         if self._numbering is None:
-            raise PlacerecError("The session has not begun: enter it, or call begin().")
+            raise PlacerecError(
+                "The session has not begun: sessions.begin() only describes it. It begins when it is entered, as in "
+                "`with lab.sessions.begin() as session:`, or by session.begin()."
+            )
         return self._numbering
 
     @property

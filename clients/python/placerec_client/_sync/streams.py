@@ -19,7 +19,7 @@ from placerec_client._sync.numbering import Numbering
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
-from placerec_client.odometry import Odometry
+from placerec_client.odometry import Odometry, with_motion
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
@@ -70,14 +70,14 @@ class Stream:
             options: as of ``session.send``.
 
         Raises:
+            InvalidOdometry: as of ``session.send``.
             Problem: the frame was refused and does not count; the session goes on unless it is ``SessionExpired`` or
                 ``UnknownSession``.
         """
+        moved = with_motion(options, odometry)
         data = frame_bytes(image)
-        if odometry is not None:
-            options = {**options, **odometry.fields()}
         with self._numbering.turn(deadline) as left:
-            numbered = self._numbering.number(options)
+            numbered = self._numbering.number(moved)
             head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
             return self._answer(head, data, Clock(left, self._connection.retry))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -127,12 +128,17 @@ def test_the_default_is_judged_as_the_service_answers(
         plain, beside = figures["encoders"]
         assert plain["encoder"].startswith("m-region-vlad@") and beside["encoder"].startswith("m-region-vlad.two-")
         assert plain["configuration"].get("verification.verify", "never") == verify
+        assert (plain["verify"], beside["verify"]) == (verify, "never")
         assert plain["cached"] is False, "what another way of verifying gave is not taken"
         found[verify] = {retrieved: score for _, retrieved, score, _ in rows}
         with (tmp_path / "out.m-region-vlad.two-stages.csv").open() as file:
             stages = {int(row["retrieved"]): float(row["score"]) for row in csv.DictReader(file)}
         assert (found[verify] == stages) == (verify == "never")
     assert all(found["always"][place] > score for place, score in found["never"].items())
+    told = placerec("evaluate", "--reference", traverses[0], "--query", traverses[1], *two).stdout
+    assert re.search(r"^encoder +verified +AUC-PR", told, re.MULTILINE)
+    assert re.search(r"^m-region-vlad +auto ", told, re.MULTILINE)
+    assert re.search(r"^m-region-vlad.two-stages +never ", told, re.MULTILINE)
     placerec("evaluate", "--reference", traverses[0], "--query", traverses[1], *two, "--verify", "often", status=2)
 
 

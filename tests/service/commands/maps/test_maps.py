@@ -79,7 +79,13 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     shown = placerec("maps", "places", "show", name, "9", *where).stdout
     assert "monday" in shown
 
-    placerec("maps", "places", "delete", name, "1", "2", *where)
+    delete = ("maps", "places", "delete", name, "1", "2")
+    told = placerec(*delete, "11", "12", "--yes", *where, status=1).stderr
+    assert f"The map {name} has no place 11, 12; nothing was deleted." in told
+    asked = placerec(*delete, *where, status=1, stdin="n\n")
+    assert f"Delete from the map {name}: 1, 2?" in asked.output
+    assert len(json.loads(placerec("maps", "places", "list", name, "--json", *where).stdout)) == 4
+    assert "Deleted: 1, 2." in placerec(*delete, "1", *where, stdin="y\n").stderr
     listed = json.loads(placerec("maps", "places", "list", name, "--sequence", "monday", "--json", *where).stdout)
     assert [place["id"] for place in listed] == ["9", "10"]
     forgotten = placerec("maps", "sequences", "delete", name, "monday", "--yes", *where)

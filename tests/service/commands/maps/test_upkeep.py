@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -57,10 +58,14 @@ def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, 
 
     pruned = placerec("maps", "prune", lab, "--similarity", 2, "--yes", "--json", *where)
     assert json.loads(pruned.stdout)["result"]["removed"] == 0, "nothing is so alike"
+    told = placerec("maps", "prune", lab, *where).stdout
+    assert re.search(r"recall_before +[01]\.\d{3} \(0\.\d{3} to [01]\.\d{3}; \d of \d\)", told)
+    assert re.search(r"^similarity +removed +recall *$", told, re.MULTILINE), "what was tried is a table"
+    assert not re.search(r"[{}\['\]]|None|True|False", told), told
     assert "sequence" in placerec("maps", "prune", lab, "--sequence", "none", *where, status=1).stderr
 
     listed = json.loads(placerec("jobs", "list", "--map", lab, "--json", *where).stdout)
-    assert [job["kind"] for job in listed] == ["prune", "re-encode", "merge", "merge"]
+    assert [job["kind"] for job in listed] == ["prune", "prune", "re-encode", "merge", "merge"]
     assert "re-encode" in placerec("jobs", "list", "--map", lab, "--state", "succeeded", *where).stdout
     shown = placerec("jobs", "show", listed[0]["id"], "--json", *where)
     assert json.loads(shown.stdout) == listed[0]
