@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from core.judgement.background import GUARD_FACTOR
 from core.judgement.verdict import Calibration
-from core.places import Neighborhood, Whereabouts
+from core.places import NO_SEQUENCE, Neighborhood, Whereabouts
 
 LISTED = 100
 """Without a second stage, this many places are listed; every index returns as many."""
@@ -89,7 +89,8 @@ def evidence(
         examined: bool [n], which of them the encoder's second stage has examined; None, or none of them: it has no
             second stage.
         verified: float64 [n], what geometric verification found of them (``core.geometry.verification``), -ln of the
-            number of false alarms; NaN where a place was not verified.  None: none was.
+            number of false alarms; NaN where a place was not verified, of which other frames of its view may tell.
+            None: none was.
     """
     if len(rows) == 0:
         return NOTHING
@@ -103,13 +104,22 @@ def evidence(
     shares = (values - ordinary) / (believable - ordinary)
     ratios = STRENGTH * shares
     if verified is not None:
-        found = np.log1p(verified[listed]) - np.log1p(VERIFIED)
+        found = np.log1p(_of_views(verified[listed], whereabouts.take(listed))) - np.log1p(VERIFIED)
         ratios += np.nan_to_num(0.5 * np.clip(found, LEAST_VERIFIED, MOST_VERIFIED))
     gains = np.minimum(ratios, STRONGEST).astype(np.float32)
     gaining = gains > 0
     beside = others[listed] & gaining
     ordinarily = 1 + float((np.exp(gains[beside]) - 1).sum()) / max(int(others.sum()), 1)
     return Evidence(rows[listed][gaining], gains[gaining], UNKNOWN + float(np.log(ordinarily)))
+
+
+def _of_views(verified: NDArray[np.float64], where: Whereabouts) -> NDArray[np.float64]:
+    """What verification found of n places, or most of other frames of the same view; NaN where neither is known."""
+    positions = np.stack([where.sequence, where.ordinal])
+    _, view = np.unique(positions, axis=1, return_inverse=True)
+    most = np.full(len(verified), np.nan)
+    np.fmax.at(most, view.ravel(), verified)
+    return np.where(np.isnan(verified) & (where.sequence != NO_SEQUENCE), most[view.ravel()], verified)
 
 
 def believable_score(

@@ -173,12 +173,10 @@ def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
 def observed_by_speed(belief: Belief, seen: Evidence, graph: PlaceGraph, weights: Masses) -> Belief:
     """The belief after a frame that counts by how fast the robot goes: at each speed with a weight, float32 [S]."""
     overall = float(belief.speeds.overall(belief.given) @ weights)
-    places = graph.places_at(seen.rows)
-    there = places >= 0
-    likelihoods = np.exp(seen.gains[there, np.newaxis] * weights)
-    speeds, factors = belief.speeds.weighed(places[there], likelihoods)
+    places, gains = graph.evidence_at(seen)
+    speeds, factors = belief.speeds.weighed(places, np.exp(gains[:, np.newaxis] * weights))
     with np.errstate(divide="ignore"):
-        told = Evidence(seen.rows[there], np.log(factors), seen.unknown * overall)
+        told = Evidence(graph.rows[places], np.log(factors), seen.unknown * overall)
     return observed(replace(belief, speeds=speeds), told, graph)
 
 
@@ -240,16 +238,16 @@ class Smoother:
 def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
     """Carry a belief over, row by row, to a graph in which places were added, removed or moved.
 
-    New places start with the least probability of the others.  The probability of removed places is added to
-    ``unknown``: the robot is where the map no longer has a place.
+    New places start with the least probability of the others.  The probability of places of which no frame is left is
+    added to ``unknown``: the robot is where the map no longer has a place.
     """
     n = len(new)
     if not len(old) or not n:
         return uninformed(n)
-    given = np.full(n, max(float(belief.given.min()), VANISHING), np.float32)
-    places = new.places_at(old.rows)
-    kept = places >= 0
-    given[places[kept]] = belief.given[kept]
-    lost = min(1.0, float(belief.given[~kept].sum(dtype=np.float64)))
+    places, shares = old.counterparts(new)
+    lost = min(1.0, float(np.delete(belief.given, places[:, 0]).sum(dtype=np.float64)))
+    least = max(float(belief.given.min()), VANISHING)
+    given = np.bincount(places[:, 1], belief.given[places[:, 0]] * shares, n).astype(np.float32)
+    given[given == 0] = least
     given /= np.float32(given.sum(dtype=np.float64))
-    return Belief(given, belief.unknown + (1 - belief.unknown) * lost, speeds=belief.speeds.carried(old, new))
+    return Belief(given, belief.unknown + (1 - belief.unknown) * lost, speeds=belief.speeds.carried(places))

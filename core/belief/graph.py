@@ -99,6 +99,21 @@ class PlaceGraph:
         found[inside] = self.index[rows[inside]]
         return found
 
+    def counterparts(self, new: PlaceGraph) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Which places of another graph of the map have frames of which places of this one.
+
+        Returns:
+            int64 [m, 2], a place of this graph and one of the other; and float64 [m], the share of the former's frames
+            that the latter has, of those that are left.
+        """
+        rows = np.flatnonzero(self.index >= 0)
+        there = new.places_at(rows)
+        left = there >= 0
+        keys = self.index[rows[left]].astype(np.int64) * max(len(new), 1) + there[left]
+        pairs, frames = np.unique(keys, return_counts=True)
+        old_places, new_places = np.divmod(pairs, max(len(new), 1))
+        return np.stack([old_places, new_places], axis=1), frames / np.bincount(old_places, frames)[old_places]
+
     def evidence_at(self, seen: Evidence) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """The places that a frame speaks for, int32 [k], each once, and how much, float32 [k]."""
         places = self.places_at(seen.rows)

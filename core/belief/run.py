@@ -169,8 +169,8 @@ class Run:
         """Update the belief with one frame.
 
         A frame that shows hardly anything tells nothing.  One that shows the same as the last one that counted is no
-        second witness, and without odometry the robot is taken to stand.  A frame that shows partly the same counts in
-        part.
+        second witness, and the robot is taken to stand, unless odometry or a speed limit tells how it has moved among
+        the poses of the map.  A frame that shows partly the same counts in part.
 
         Args:
             seen: the evidence of the frame.
@@ -190,7 +190,7 @@ class Run:
         else:
             self.sight, self.blind, share = None, 0, change
             self._view = view or self._view
-        stands = self.sight == "constant" and step.odometry is None
+        stands = self.sight == "constant" and (step.odometry is None or not by_poses(self.graph, step))
         self._filter(seen, step, share, stands)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose

@@ -125,11 +125,11 @@ class Speeds:
             shares[found[own]] = joint[own] / factors[own, np.newaxis]
         return Speeds(self.places, shares, self.elsewhere), factors
 
-    def carried(self, old: PlaceGraph, new: PlaceGraph) -> Speeds:
-        """The same on another graph of the map; places that it does not have are left out."""
-        places = new.places_at(old.rows[self.places])
-        kept = places >= 0
-        return Speeds(places[kept], self.shares[kept], self.elsewhere)
+    def carried(self, places: NDArray[np.int64]) -> Speeds:
+        """The same on another graph of the map, of whose places int64 [m, 2] tells the old number and the new one."""
+        _, own, at = np.intersect1d(self.places, places[:, 0], return_indices=True)
+        new, first = np.unique(places[at, 1], return_index=True)
+        return Speeds(new.astype(np.int32), self.shares[own[first]], self.elsewhere)
 
 
 UNKNOWN = Speeds(np.empty(0, np.int32), np.empty((0, len(SPEEDS)), np.float32), PRIOR)

@@ -9,6 +9,9 @@ F = [e]x H fits, whatever the epipole e (Hartley and Zisserman, Multiple View Ge
 which throws such samples away as degenerate, may find nothing then, in a frame and itself too.  So a homography is
 estimated beside it, and those are the inliers of which there are more.
 
+Matches that lie on one line in a picture, as lamps at night may, fit F = l' l^T whatever the other picture shows: all
+points of the one line go with all points of the other picture.  Such a matrix says nothing and has no inliers.
+
 A few inliers come by chance, the more the more matches there are.  How surprising k inliers of m matches are is said by
 the number of false alarms of Moisan and Stival ("A probabilistic criterion to detect rigid point matches between two
 images and estimate the fundamental matrix", IJCV 2004),
@@ -133,12 +136,32 @@ def fitting(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArr
 
 
 def fitting_scene(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which matches fit a fundamental matrix, for eight matches or more; arguments and answer as of :func:`fitting`."""
-    inliers = None
+    """Which matches fit a fundamental matrix, for eight matches or more; arguments and answer as of :func:`fitting`.
+
+    None does if half of them fit it only because they are on one line.
+    """
+    matrix = inliers = None
     with suppress(cv2.error):  # of some degenerate matches
         # Its random numbers start with the same seed at each call.
-        _, inliers = cv2.findFundamentalMat(query, candidate, cv2.USAC_MAGSAC, THRESHOLD, CONFIDENCE, ITERATIONS)
-    return _flags(inliers, len(query))
+        matrix, inliers = cv2.findFundamentalMat(query, candidate, cv2.USAC_MAGSAC, THRESHOLD, CONFIDENCE, ITERATIONS)
+    flags = _flags(inliers, len(query))
+    if (
+        matrix is not None
+        and 2 * _on_lines(np.asarray(matrix, np.float64), query, candidate)[flags].sum() > flags.sum()
+    ):
+        return np.zeros(len(query), np.bool_)
+    return flags
+
+
+def _on_lines(
+    matrix: NDArray[np.float64], query: NDArray[np.float64], candidate: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Which matches lie near one of the two lines of which the nearest matrix of rank 1 is made; bool [m]."""
+    left, _, right = np.linalg.svd(matrix)
+    near = np.zeros(len(query), np.bool_)
+    for line, points in ((right[0], query), (left[:, 0], candidate)):
+        near |= np.abs(points @ line[:2] + line[2]) <= 2 * THRESHOLD * np.hypot(line[0], line[1])
+    return near
 
 
 def fitting_plane(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import pytest
 
 from core.belief.evidence import LISTED, STRENGTH, STRONGEST, UNKNOWN, evidence
 from core.judgement.verdict import Calibration, judge
-from core.places import Neighborhood
+from core.places import Neighborhood, Whereabouts
 from tests.core.belief.maps import walk
 
 CALIBRATION = Calibration(
@@ -66,3 +66,14 @@ def test_what_verification_found_raises_and_lowers_a_places_evidence() -> None:
     before, after = (dict(zip(seen.rows.tolist(), seen.gains.tolist(), strict=True)) for seen in (plain, changed))
     assert after[0] > before[0] + 0.5 and after[1] < before[1] - 0.5
     assert after[2] == before[2], "it was not verified"
+
+
+def test_what_verification_found_of_a_view_counts_for_all_its_frames() -> None:
+    scores = np.array([0.16, 0.159, 0.158, 0.15, *np.linspace(0.08, 0.06, 60)], np.float32)
+    rows, where = np.arange(len(scores)), Whereabouts.along_sequence([0, 0, 0, *range(1, 62)])
+    one_looked_at, all_looked_at = np.full((2, len(scores)), np.nan)
+    one_looked_at[0], all_looked_at[:3] = 0, 0
+    some, every = (
+        evidence(rows, scores, where, CALIBRATION, APART, None, found) for found in (one_looked_at, all_looked_at)
+    )
+    assert some.gains == pytest.approx(every.gains) and some.rows.tolist() == every.rows.tolist()

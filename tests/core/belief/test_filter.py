@@ -21,11 +21,14 @@ from core.belief.filter import (
     Belief,
     Smoother,
     observed,
+    observed_by_speed,
     predicted,
+    predicted_by_speed,
     reindexed,
     uninformed,
 )
 from core.belief.motion import Pending, Transition, transition
+from core.belief.speeds import SPEEDS
 from core.places import Neighborhood, Whereabouts
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
@@ -155,6 +158,30 @@ def test_places_that_come_and_go_are_taken_over_by_row() -> None:
     assert grown.given[[1, 4]] == pytest.approx(after.given.min() / (1 + 2 * after.given.min()), rel=1e-3)
     assert reindexed(belief, old, _living(where, [])).unknown == 1
     assert reindexed(uninformed(0), graph_of(walk()), old).unknown == START_UNKNOWN
+
+
+def test_a_view_stays_where_the_robot_is_as_long_as_one_of_its_frames_is_left() -> None:
+    where = Whereabouts.along_sequence([0, 1, *[2] * 10, 3])
+    old, belief = _living(where, list(range(13))), Belief(np.array([0.05, 0.05, 0.85, 0.05], np.float32), 0.02)
+    pruned = reindexed(belief, old, _living(where, [0, 1, 7, 12]))
+    assert pruned.unknown == pytest.approx(0.02) and pruned.given == pytest.approx(belief.given)
+    taken_out = reindexed(belief, old, _living(where, [0, 1, 12]))
+    assert taken_out.unknown == pytest.approx(0.02 + 0.98 * 0.85)
+    split = np.where(np.arange(13) >= 7, where.ordinal + 10, where.ordinal)
+    apart = reindexed(belief, old, _living(Whereabouts.along_sequence(split), list(range(13))))
+    assert apart.given == pytest.approx([0.05, 0.05, 0.425, 0.425, 0.05]), "each half has five of its frames"
+
+
+def test_the_best_frame_of_a_view_tells_the_speed() -> None:
+    graph = graph_of(Whereabouts.along_sequence([*range(10), 10, 10, 10, *range(11, 20)]))
+    ahead = predicted_by_speed(observed(uninformed(len(graph)), shows(9), graph), graph)
+    weights = np.linspace(0.1, 1, len(SPEEDS), dtype=np.float32)
+    rows, gains = np.array([10, 11, 12]), np.array([6, 3, 0.1], np.float32)
+    best = observed_by_speed(ahead, Evidence(rows[:1], gains[:1], 0.5), graph, weights)
+    for order in ([0, 1, 2], [2, 0, 1]):
+        told = observed_by_speed(ahead, Evidence(rows[order], gains[order], 0.5), graph, weights)
+        assert told.given == pytest.approx(best.given)
+        assert told.speeds.at(np.array([10])) == pytest.approx(best.speeds.at(np.array([10])))
 
 
 def _living(where: Whereabouts, rows: list[int]) -> PlaceGraph:

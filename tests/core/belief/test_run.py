@@ -226,6 +226,18 @@ def test_a_robot_that_stands_becomes_no_surer(odometry: Odometry | None) -> None
     np.testing.assert_allclose(standing.belief.given, once.belief.given, atol=1e-2 if odometry is None else 1e-3)
 
 
+@pytest.mark.parametrize("stride", [None, Stride()])
+def test_a_robot_with_odometry_stands_in_a_map_without_poses(stride: Stride | None) -> None:
+    random, graph = np.random.default_rng(9), graph_of(walk(200), Neighborhood(5, 3))
+    run = Run(RunOptions(stride), graph)
+    for row in range(60):
+        run.advance(seen_at(row, 200, random), Step(odometry=Odometry(1.0)), view(row))
+    for _ in range(40):
+        run.advance(seen_at(59, 200, random), Step(odometry=Odometry(0.0)), view(59))
+        told = run.estimate(1, alive(graph))
+        assert told.verdict == "recognized" and abs(told.candidates[0].row - 59) <= 1
+
+
 @pytest.mark.parametrize(
     ("seen", "shown", "sight"),
     [

@@ -147,6 +147,18 @@ def test_degenerate_matches_end_in_an_answer(ours: Points, theirs: Points) -> No
         assert not inliers.any()
 
 
+@pytest.mark.parametrize("matches", [30, 100])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_points_of_one_line_say_nothing_of_unrelated_pictures(matches: int, swapped: bool) -> None:
+    """As a row of lamps at night: every point of the line fits every point of the other picture."""
+    random = np.random.default_rng(4)
+    for _ in range(5):
+        anywhere = random.uniform((0, 0), (640, 480), (matches, 2))
+        lamps = np.stack([random.uniform(0, 640, matches), 200 + random.normal(0, 1, matches)], axis=1)
+        ours, theirs = (lamps, anywhere) if swapped else (anywhere, lamps)
+        assert evidence(matches, int(fitting(ours, theirs).sum()), 0.008) < 10
+
+
 def test_evidence_is_that_of_the_formula() -> None:
     expected = -log(3 * (40 - 7) * comb(40, 20) * comb(20, 7) * 0.01**13)
     assert evidence(40, 20, 0.01) == pytest.approx(expected)
