@@ -2,7 +2,8 @@
 
 Names stand in paths, which clients, proxies and browsers put in order before a request is sent: a segment ``..`` goes,
 and takes the one before it along.  They also stand in tables and logs, where an invisible character makes two names
-look the same, or turns the line around.  So no name is ``.`` or ``..``, and none has a slash or such a character.
+look the same, or turns the line around.  So no name is ``.`` or ``..``, also where a path is written with ``%2e``, and
+none has a slash, a backslash, which browsers take for one, or such a character.
 
 A name is either a *text* in any script, or a *word* of ASCII that begins with a letter or a digit, which no text can
 look like.  Both are patterns without anchors and without assertions, which JSON Schema and Rust can read as well.
@@ -19,11 +20,17 @@ from pydantic_core import CoreSchema, core_schema
 
 from core.errors import InvalidIdentifier
 
-UNSEEN = r"\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
-"""The inside of a character class: controls (C0, DEL, C1), ends of lines and paragraphs, and marks of direction."""
+UNSEEN = r"\x00-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+"""The inside of a character class: controls (C0, DEL, C1), ends of lines and paragraphs, marks of direction, and what
+takes no room.  The two joiners (U+200C, U+200D) are allowed, for they change how letters of some scripts look."""
 
-TEXT = rf"(\.{{0,2}}[^./{UNSEEN}]|\.{{3}})[^/{UNSEEN}]*"
-"""Any text that has neither a slash nor an unseen character, and is not ``.`` or ``..``."""
+_NONE_OF = rf"/\\{UNSEEN}"
+
+TEXT = rf"(\.{{0,2}}[^.{_NONE_OF}]|\.{{3}})[^{_NONE_OF}]*"
+"""Any text that has neither a slash, nor a backslash, nor an unseen character, and is not ``.`` or ``..``."""
+
+_NO_NAME = re.compile(r"(\.|%2e){1,2}|.*[\ud800-\udfff\U000e0001\U000e0020-\U000e007f].*", re.IGNORECASE | re.DOTALL)
+"""What is a text by the pattern and no name: the dots of a path, what UTF-8 has not, and tags, which nobody sees."""
 
 LONGEST = 128
 """Characters of the longest name."""
@@ -60,7 +67,7 @@ class Names:
             InvalidIdentifier: it cannot.
         """
         too_long = self.most is not None and len(text) > self.most
-        if too_long or text == self.but or not re.fullmatch(self.pattern, text):
+        if too_long or text == self.but or _NO_NAME.fullmatch(text) or not re.fullmatch(self.pattern, text):
             raise InvalidIdentifier(f"{text[:140]!a} cannot name {self.what}: a name {self.rule}.")
         return text
 
@@ -81,8 +88,8 @@ class Names:
 def texts(what: str) -> Names:
     """Names that are texts, of 1 to ``LONGEST`` characters."""
     rule = (
-        f"has 1 to {LONGEST} characters, no slash, no control characters and no marks of direction, "
-        "and is not '.' or '..'"
+        f"has 1 to {LONGEST} characters, no slash or backslash, no characters that cannot be seen, "
+        "and is not '.' or '..', however they are written"
     )
     return Names(what, TEXT, rule, LONGEST)
 
