@@ -392,8 +392,12 @@ class SearchScope:
     def search_elsewhere(
         self, descriptor: Descriptor, ranking: Ranking, best: int, neighborhood: Neighborhood
     ) -> Ranking:
-        """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are."""
-        elsewhere = self.snapshot.alive & ~self.snapshot.whereabouts.near(best, neighborhood)
+        """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are.
+
+        Nor further frames of a view that the ranking has.
+        """
+        where = self.snapshot.whereabouts
+        elsewhere = self.snapshot.alive & ~where.near(best, neighborhood) & ~where.of_views(ranking[0])
         elsewhere[ranking[0]] = False
         if self.allowed is not None:
             elsewhere &= self.allowed
