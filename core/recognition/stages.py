@@ -160,8 +160,10 @@ def agree(
     if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates):
         return candidates
     best, listed = int(candidates.rows[0]), ranking
+    # Looks at the best view may hide its neighbours, too, which a session follows.
+    around = None if _crowded(candidates.whereabouts) else neighborhood
     for _ in range(SEARCHES):
-        more = scope.search_elsewhere(descriptor, listed, best, neighborhood)
+        more = scope.search_elsewhere(descriptor, listed, best, around)
         if not len(more[0]):  # the ranking has all places
             break
         listed = merged(listed, more)
@@ -241,11 +243,16 @@ def _is_enough(candidates: Candidates, neighborhood: Neighborhood, examined: int
         examined: how many places the second stage examines; 0: there is none.
     """
     others, places = candidates.whereabouts.others(0, neighborhood), candidates.whereabouts
-    crowded = bool(places.repeats(np.arange(len(places))).any())
+    crowded = _crowded(places)
     wanted = max(TOP_PLACES, examined // 2) if crowded else TOP_PLACES
     if crowded and int(others.sum()) < FULL:
         return False
     return int((others & candidates.examined if examined else others).sum()) >= wanted
+
+
+def _crowded(places: Whereabouts) -> bool:
+    """Whether several of the places show one view."""
+    return bool(places.repeats(np.arange(len(places))).any())
 
 
 @dataclass(frozen=True)
