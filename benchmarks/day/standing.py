@@ -9,8 +9,8 @@ further looks at the five spots, the frames of the other traverse that show them
 rounded to ten metres.  ``walk`` is the same walk at 25 times the rate, frames between two references made by optical
 flow: a thousand frames of a walk of forty seconds.
 
-Three kinds of sessions go over the same answers: one of all frames of the other traverse that pass; one that begins at
-each spot, of a robot that stands there; and one of the frames of the other traverse that pass each spot.  A spot is
+Three kinds of sessions go over the same answers: of all frames of the other traverse that pass; one that begins at each
+spot, of a robot that stands there; and one of the frames of the other traverse that pass each spot.  A spot is
 *held* if the last frame of its session is recognized and right.
 """
 
@@ -80,13 +80,15 @@ class Questions:
 
     fresh: FRESH further looks at each spot, spot by spot.
     run: the frames of the other traverse that pass the map, in their order.
-    passing: for each spot the positions in ``run`` of the frames that pass it.
+    stretches: the positions in ``run`` of frames that followed one another; the other traverse may pass the map twice.
+    passing: the same of the frames that pass each spot, for each time that they do.
     """
 
     fresh: list[Shot]
     other: list[Shot]
     strangers: list[Shot]
     run: list[Shot]
+    stretches: list[list[int]]
     passing: list[list[int]]
 
 
@@ -214,11 +216,11 @@ def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Ses
     return session
 
 
-def at_spots(
-    map_: Map, shots: Sequence[Shot], answers: Sequence[Answer], spots: Sequence[Sequence[int]]
+def each_of(
+    map_: Map, shots: Sequence[Shot], answers: Sequence[Answer], parts: Sequence[Sequence[int]]
 ) -> list[Session]:
-    """A session of its own for each spot, of the frames at some positions."""
-    return [followed(map_, [shots[at] for at in own], [answers[at] for at in own]) for own in spots if own]
+    """A session of its own for each part of the frames, by their positions."""
+    return [followed(map_, [shots[at] for at in own], [answers[at] for at in own]) for own in parts if own]
 
 
 def held(sessions: Sequence[Session]) -> str:
@@ -251,8 +253,21 @@ def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: Traverse
     passing = [int(query) for query in np.flatnonzero(task.truth[:, window].any(axis=1))]
     run = [camera.shot(task.queries[query], shown[query]) for query in passing]
     at_spot = task.truth[np.ix_(passing, window)]
-    stretches = [np.flatnonzero(at_spot[:, spot - NEAR : spot + NEAR + 1].any(axis=1)).tolist() for spot in SPOTS]
-    return Questions(fresh, other, [camera.shot(picture) for picture in pictures], run, stretches)
+    spots = [at_spot[:, spot - NEAR : spot + NEAR + 1].any(axis=1) for spot in SPOTS]
+    return Questions(
+        fresh,
+        other,
+        [camera.shot(picture) for picture in pictures],
+        run,
+        stretches(passing, range(len(passing))),
+        [one for spot in spots for one in stretches(passing, np.flatnonzero(spot).tolist())],
+    )
+
+
+def stretches(numbers: Sequence[int], positions: Sequence[int]) -> list[list[int]]:
+    """Positions, ascending, cut where more than NEAR frames are missing between their numbers."""
+    ends = np.flatnonzero(np.diff(np.asarray(numbers)[list(positions)]) > NEAR) + 1
+    return [part.tolist() for part in np.split(np.asarray(positions, np.int64), ends)]
 
 
 def maps_of(
@@ -286,16 +301,16 @@ def measured(encoder: Encoder, map_: Map, ask: Questions, verify: Verify) -> tup
     fresh, other, strangers, run = (
         asked(map_, encoder, some, verify) for some in (ask.fresh, ask.other, ask.strangers, ask.run)
     )
-    session = followed(map_, ask.run, run)
+    sessions = each_of(map_, ask.run, run, ask.stretches)
     standing = [range(at, at + FRESH) for at in range(0, len(fresh), FRESH)]
     return (
         len(np.unique(map_.snapshot().whereabouts.ordinal)),
         f"{recognized(ask.fresh, fresh)} of {len(fresh)}",
         f"{recognized(ask.other, other)} of {len(other)}",
         f"{recognized(ask.run, run)} of {len(run)}",
-        f"{sum(session.right)}, {sum(session.wrong)}",
-        held(at_spots(map_, ask.fresh, fresh, standing)),
-        held(at_spots(map_, ask.run, run, ask.passing)),
+        f"{sum(sum(one.right) for one in sessions)}, {sum(sum(one.wrong) for one in sessions)}",
+        held(each_of(map_, ask.fresh, fresh, standing)),
+        held(each_of(map_, ask.run, run, ask.passing)),
         f"{sum(one.place is not None for one in strangers)} of {len(strangers)}",
     )
 
