@@ -252,7 +252,7 @@ def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: Traverse
     pictures += elsewhere.queries[:: len(elsewhere.queries) // STRANGERS][:STRANGERS]
     passing = [int(query) for query in np.flatnonzero(task.truth[:, window].any(axis=1))]
     run = [camera.shot(task.queries[query], shown[query]) for query in passing]
-    at_spot = task.truth[np.ix_(passing, window)]
+    at_spot = task.truth[np.ix_(np.array(passing, np.int64), window)]
     spots = [at_spot[:, spot - NEAR : spot + NEAR + 1].any(axis=1) for spot in SPOTS]
     return Questions(
         fresh,
