@@ -285,10 +285,19 @@ class Whereabouts:
         """Which of the places ``order``, int64 [n], show a view that an earlier one of them shows; bool [n]."""
         return _repeated(self.sequence[order], self.ordinal[order])
 
+    def of_views(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the places show a view that one of ``rows``, int64 [k], shows; bool [n]."""
+        keys = _view_keys(self.sequence, self.ordinal)
+        return (self.sequence != NO_SEQUENCE) & np.isin(keys, keys[rows])
+
+
+def _view_keys(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.int64]:
+    return (sequence.astype(np.int64) << _SEQUENCE) + ordinal
+
 
 def _repeated(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which of n positions in sequences are those of an earlier one; bool [n].  Without a sequence none is."""
-    keys = (sequence.astype(np.int64) << _SEQUENCE) + ordinal
+    keys = _view_keys(sequence, ordinal)
     repeated = np.zeros(len(keys), np.bool_)
     ordered = np.sort(keys)
     if (ordered[1:] == ordered[:-1]).any():

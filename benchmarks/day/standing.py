@@ -8,12 +8,17 @@ further looks at the five spots, the frames of the other traverse that show them
 (farther than ``FAR`` frames) and of the other environment.  Places have no poses, poses a few decimetres off, or poses
 rounded to ten metres.  ``walk`` is the same walk at 25 times the rate, frames between two references made by optical
 flow: a thousand frames of a walk of forty seconds.
+
+Three kinds of sessions go over the same answers: of all frames of the other traverse that pass; one that begins at each
+spot, of a robot that stands there; and one of the frames of the other traverse that pass each spot.  A spot is
+*held* if the last frame of its session is recognized and right.
 """
 
 from __future__ import annotations
 
 import hashlib
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -43,13 +48,15 @@ from training.map_sizes import corridor_and_lip6
 from training.validation import TraverseTask
 
 Poses = Literal["none", "radius", "coarse"]
+Environment = Literal["corridor", "lip6"]
 
 LOOKS = (1, 2, 5, 10, 20, 50, 100, 200)
+KINDS = (*map(str, LOOKS), "walk")
 PLACES, SPOTS = 40, (5, 12, 20, 27, 34)
 FROM = {"corridor": 30, "lip6": 120}
 """The first reference of each map."""
 
-FRESH, OTHER, STRANGERS = 3, 3, 30
+FRESH, OTHER, STRANGERS = 5, 3, 30
 """Further looks at a spot, frames of the other traverse that show it, and strangers of either kind, at most."""
 
 FAR, NEAR = 8, 3
@@ -69,12 +76,20 @@ class Shot:
 
 @dataclass(frozen=True)
 class Questions:
-    """What maps of one traverse are asked."""
+    """What maps of one traverse are asked.
+
+    fresh: FRESH further looks at each spot, spot by spot.
+    run: the frames of the other traverse that pass the map, in their order.
+    stretches: the positions in ``run`` of frames that followed one another; the other traverse may pass the map twice.
+    passing: the same of the frames that pass each spot, for each time that they do.
+    """
 
     fresh: list[Shot]
     other: list[Shot]
     strangers: list[Shot]
     run: list[Shot]
+    stretches: list[list[int]]
+    passing: list[list[int]]
 
 
 class Camera:
@@ -148,6 +163,8 @@ def fill(atlas: Atlas, name: str, encoder: Encoder, shots: Sequence[tuple[int, S
     ]
     for start in range(0, len(items), 64):
         made.enrol(items[start : start + 64])
+    while made.index_status().state == "building":
+        time.sleep(0.05)
     return made
 
 
@@ -170,22 +187,46 @@ def recognized(shots: Sequence[Shot], answers: Sequence[Answer]) -> int:
     return sum(one.place is not None and right(shot, one.place.id) for shot, one in zip(shots, answers, strict=True))
 
 
-def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> tuple[int, int]:
-    """How many frames of a session over the answers are recognized and right, and how many recognized and wrong."""
+@dataclass(frozen=True)
+class Session:
+    """What became of a session's frames: ``right`` and ``wrong`` tell of each whether it was recognized and so."""
+
+    right: list[bool]
+    wrong: list[bool]
+
+
+def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Session:
+    """A session over the answers to frames."""
     snapshot, neighborhood = map_.snapshot(), neighborhood_of(map_)
     graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood)
-    run, good, bad = Run(RunOptions(), graph), 0, 0
+    run, session = Run(RunOptions(), graph), Session([], [])
     for shot, answer in zip(shots, answers, strict=True):
         seen = answer.candidates
         verified = None if seen.geometry is None else seen.geometry.evidence
         known = (answer.calibration, neighborhood, seen.examined, verified)
         run.advance(evidence(seen.rows, seen.scores, seen.whereabouts, *known), Step(), shot.view)
         found = run.estimate(1, snapshot.alive)
+        told = None
         if found.verdict == "recognized":
             (place,) = map_.places_at([found.candidates[0].row])
             assert place is not None
-            good, bad = (good + 1, bad) if right(shot, place.id) else (good, bad + 1)
-    return good, bad
+            told = right(shot, place.id)
+        session.right.append(told is True)
+        session.wrong.append(told is False)
+    return session
+
+
+def each_of(
+    map_: Map, shots: Sequence[Shot], answers: Sequence[Answer], parts: Sequence[Sequence[int]]
+) -> list[Session]:
+    """A session of its own for each part of the frames, by their positions."""
+    return [followed(map_, [shots[at] for at in own], [answers[at] for at in own]) for own in parts if own]
+
+
+def held(sessions: Sequence[Session]) -> str:
+    """How many spots are held, of how many, and how many frames of their sessions are wrong."""
+    wrong = sum(sum(one.wrong) for one in sessions)
+    return f"{sum(one.right[-1] for one in sessions)} of {len(sessions)}, {wrong}"
 
 
 def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: TraverseTask) -> Questions:
@@ -211,62 +252,107 @@ def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: Traverse
     pictures += elsewhere.queries[:: len(elsewhere.queries) // STRANGERS][:STRANGERS]
     passing = [int(query) for query in np.flatnonzero(task.truth[:, window].any(axis=1))]
     run = [camera.shot(task.queries[query], shown[query]) for query in passing]
-    return Questions(fresh, other, [camera.shot(picture) for picture in pictures], run)
+    at_spot = task.truth[np.ix_(np.array(passing, np.int64), window)]
+    spots = [at_spot[:, spot - NEAR : spot + NEAR + 1].any(axis=1) for spot in SPOTS]
+    return Questions(
+        fresh,
+        other,
+        [camera.shot(picture) for picture in pictures],
+        run,
+        stretches(passing, range(len(passing))),
+        [one for spot in spots for one in stretches(passing, np.flatnonzero(spot).tolist())],
+    )
 
 
-def main(
-    datasets: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets"),
-    encoder: str = DEFAULT_ENCODER,
-    only: Annotated[list[str] | None, typer.Option(help="Of: never, auto, always; none, radius, coarse.")] = None,
-) -> None:
-    """One table: what is recognized and right, by environment, poses, mode and looks at a spot."""
-    share_cores(cores())
-    camera = Camera(EncoderCatalogue().get(encoder))
-    tasks = dict(corridor_and_lip6(datasets))
-    rows: list[tuple[object, ...]] = []
-    figures: dict[str, Any] = {"encoder": camera.encoder.identity, "rows": rows}
-    for name, task in tasks.items():
-        random, first = np.random.default_rng(5), FROM[name]
-        references = task.references[first : first + PLACES + 1]
-        shots = [camera.shot(pixels) for pixels in references[:PLACES]]
-        looks = {spot: [camera.shot(noisy(references[spot], random)) for _ in range(max(LOOKS))] for spot in SPOTS}
-        maps: dict[str, list[tuple[int, Shot]]] = {
-            str(k): [(at, shot) for at, own in enumerate(shots) for shot in (looks[at][:k] if at in looks else [own])]
-            for k in LOOKS
-        }
+def stretches(numbers: Sequence[int], positions: Sequence[int]) -> list[list[int]]:
+    """Positions, ascending, cut where more than NEAR frames are missing between their numbers."""
+    ends = np.flatnonzero(np.diff(np.asarray(numbers)[list(positions)]) > NEAR) + 1
+    return [part.tolist() for part in np.split(np.asarray(positions, np.int64), ends)]
+
+
+def maps_of(
+    camera: Camera, name: Environment, task: TraverseTask, kinds: Sequence[str]
+) -> dict[str, list[tuple[int, Shot]]]:
+    """The frames of each kind of map, and the reference that each shows."""
+    random, first = np.random.default_rng(5), FROM[name]
+    references = task.references[first : first + PLACES + 1]
+    shots = [camera.shot(pixels) for pixels in references[:PLACES]]
+    looks = {spot: [camera.shot(noisy(references[spot], random)) for _ in range(_most(kinds))] for spot in SPOTS}
+    maps = {
+        kind: [(at, one) for at, own in enumerate(shots) for one in (looks[at][: int(kind)] if at in looks else [own])]
+        for kind in kinds
+        if kind != "walk"
+    }
+    if "walk" in kinds:
         maps["walk"] = [
             (at, camera.shot(noisy(pixels, random)))
             for at in range(PLACES)
             for pixels in between(references[at], references[at + 1], RATE)
         ]
+    return maps
+
+
+def _most(kinds: Sequence[str]) -> int:
+    return max((int(kind) for kind in kinds if kind != "walk"), default=0)
+
+
+def measured(encoder: Encoder, map_: Map, ask: Questions, verify: Verify) -> tuple[object, ...]:
+    """A row of the table."""
+    fresh, other, strangers, run = (
+        asked(map_, encoder, some, verify) for some in (ask.fresh, ask.other, ask.strangers, ask.run)
+    )
+    sessions = each_of(map_, ask.run, run, ask.stretches)
+    standing = [range(at, at + FRESH) for at in range(0, len(fresh), FRESH)]
+    return (
+        len(np.unique(map_.snapshot().whereabouts.ordinal)),
+        f"{recognized(ask.fresh, fresh)} of {len(fresh)}",
+        f"{recognized(ask.other, other)} of {len(other)}",
+        f"{recognized(ask.run, run)} of {len(run)}",
+        f"{sum(sum(one.right) for one in sessions)}, {sum(sum(one.wrong) for one in sessions)}",
+        held(each_of(map_, ask.fresh, fresh, standing)),
+        held(each_of(map_, ask.run, run, ask.passing)),
+        f"{sum(one.place is not None for one in strangers)} of {len(strangers)}",
+    )
+
+
+def chosen(all_: Sequence[Any], some: Sequence[str] | None) -> list[Any]:
+    """All, or those that are named."""
+    return [one for one in all_ if not some or one in some]
+
+
+COLUMNS = ("map", "views", "looks", "other", "pass", "session, wrong", "stand", "pass a spot", "strangers")
+
+
+def main(
+    datasets: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets"),
+    encoder: str = DEFAULT_ENCODER,
+    environment: Annotated[list[str] | None, typer.Option(help="Of: corridor, lip6.")] = None,
+    poses: Annotated[list[str] | None, typer.Option(help="Of: none, radius, coarse.")] = None,
+    verify: Annotated[list[str] | None, typer.Option(help="Of: never, auto, always.")] = None,
+    looks: Annotated[list[str] | None, typer.Option(help="Looks at a spot: 1 to 200, or walk.")] = None,
+) -> None:
+    """One table: what is recognized and right, by environment, poses, mode and looks at a spot; of all, or of some."""
+    kinds = chosen(KINDS, looks)
+    share_cores(cores())
+    camera = Camera(EncoderCatalogue().get(encoder))
+    tasks = dict(corridor_and_lip6(datasets))
+    rows: list[tuple[object, ...]] = []
+    figures: dict[str, Any] = {"encoder": camera.encoder.identity, "columns": COLUMNS, "rows": rows}
+    for name in chosen(get_args(Environment), environment):
+        task = tasks[name]
+        maps = maps_of(camera, name, task, kinds)
         ask = questions(camera, name, task, next(one for other, one in tasks.items() if other != name))
-        for poses in [one for one in get_args(Poses) if only is None or one in only]:
+        for how in chosen(get_args(Poses), poses):
             for kind, frames in maps.items():
                 with tempfile.TemporaryDirectory() as folder:
                     atlas = Atlas(Path(folder))
-                    map_ = fill(atlas, "stood", camera.encoder, frames, poses)
-                    views = len(np.unique(map_.snapshot().whereabouts.ordinal))
-                    for verify in [one for one in ("never", "auto", "always") if only is None or one in only]:
-                        fresh, other, strangers, run = (
-                            asked(map_, camera.encoder, some, verify)
-                            for some in (ask.fresh, ask.other, ask.strangers, ask.run)
-                        )
-                        good, bad = followed(map_, ask.run, run)
-                        standing = followed(map_, ask.fresh, fresh)
-                        row = (
-                            f"{name}, {poses}, {verify}, {kind}",
-                            views,
-                            f"{recognized(ask.fresh, fresh)} / {len(fresh)}",
-                            f"{recognized(ask.other, other)} / {len(other)}",
-                            f"{good}, {bad} / {len(run)}",
-                            f"{standing[0]}, {standing[1]} / {len(fresh)}",
-                            f"{sum(one.place is not None for one in strangers)} / {len(strangers)}",
-                        )
+                    map_ = fill(atlas, "stood", camera.encoder, frames, how)
+                    for mode in chosen(get_args(Verify), verify):
+                        row = (f"{name}, {how}, {mode}, {kind}", *measured(camera.encoder, map_, ask, mode))
                         rows.append(row)
-                        print(*row, flush=True)
+                        print(*row, sep=" | ", flush=True)
                     atlas.close()
-    columns = ["map", "views", "further looks", "other traverse", "session", "session of looks", "strangers"]
-    report("standing", "recognized and right; of sessions also recognized and wrong", columns, rows, figures)
+    report("standing", "recognized and right; of spots held", COLUMNS, rows, figures)
 
 
 if __name__ == "__main__":

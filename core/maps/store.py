@@ -75,17 +75,18 @@ class Scope(Protocol):
         """
 
     def search_elsewhere(
-        self, descriptor: NDArray[np.float32], ranking: Ranking, best: int, neighborhood: Neighborhood
+        self, descriptor: NDArray[np.float32], ranking: Ranking, best: int, neighborhood: Neighborhood | None
     ) -> Ranking:
         """The best places of the scope that are not in a ranking and not the same place as the row ``best``.
 
         Args:
             descriptor: of the query, float32 [D].
             ranking: what :meth:`search` returned for it.
-            neighborhood: which places are the same place.
+            neighborhood: which places are the same place; None: also the best places that are, unless the ranking has
+                them.
 
         Returns:
-            No rows if there are no such places.
+            No rows if there are no such places.  Further frames of views that the ranking has may be left out.
         """
 
     def weights_at(self, rows: Rows) -> NDArray[np.float64] | None:

@@ -185,19 +185,21 @@ class MilvusScope:
         return [merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
 
     def search_elsewhere(
-        self, descriptor: NDArray[np.float32], ranking: Ranking, best: int, neighborhood: Neighborhood
+        self, descriptor: NDArray[np.float32], ranking: Ranking, best: int, neighborhood: Neighborhood | None
     ) -> Ranking:
         """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are."""
         (there,) = self.snapshot.entries_at(np.array([best]))
         listed = set(ranking[0].tolist())
 
         def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
-            near = whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
-            return self.keep(entries) & ~near & np.array([entry.row not in listed for entry in entries], np.bool_)
+            kept = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
+            if neighborhood is None:
+                return kept
+            return kept & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
 
         expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
         where = there.whereabouts()
-        if where.kind[0] != NO_POSE:  # within the cube in the ball of its neighbours
+        if neighborhood is not None and where.kind[0] != NO_POSE:  # within the cube in the ball of its neighbours
             side = neighborhood.radius / 2
             inside = [
                 f"{axis} >= {at - side!r} and {axis} <= {at + side!r}"

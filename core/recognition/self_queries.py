@@ -52,6 +52,12 @@ class SelfQueries:
     def __len__(self) -> int:
         return len(self.places)
 
+    def members(self, positions: Positions) -> NDArray[np.bool_]:
+        """Which of all places are at some positions, int64 [k]; bool [places]."""
+        found = np.zeros(len(self), np.bool_)
+        found[positions] = True
+        return found
+
     def near(self, position: int, others: Positions, times: float = 1) -> NDArray[np.bool_]:
         """Which of the places at ``others``, int64 [n], are the same place as the one at ``position``; bool [n].
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownPlace
 from core.geometry.verification import Verification
+from core.judgement.background import FULL
 from core.judgement.geometry import Geometry, final_values
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
@@ -39,6 +40,10 @@ ROUNDS = 3
 
 HEAD = 500
 """How many places of a ranking the second stage and the judgement see, unless too few are other than the best place."""
+
+
+SEARCHES = 8
+"""So many times a map is searched for other places at most, where many frames show few views."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +140,8 @@ def agree(
 ) -> Candidates:
     """The second stage: apply the prior, then compare the best places of a ranking with the query cell by cell.
 
-    The best place's own neighbours may fill the shortlist of a map with codes.  Then the map is searched once more,
-    without them, for the other places that a verdict needs.
+    The best place's own neighbours may fill the shortlist of a map with codes, and frames of a few views.  Then the map
+    is searched again, without them, for the other places that a verdict needs.
 
     Args:
         scope: the places that the query may find.
@@ -154,10 +159,18 @@ def agree(
     candidates = _examined(map_, encoder, scope, local, ranking)
     if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates):
         return candidates
-    more = scope.search_elsewhere(descriptor, ranking, int(candidates.rows[0]), neighborhood)
-    if not len(more[0]):  # the ranking has all places
-        return candidates
-    return _examined(map_, encoder, scope, local, merged(ranking, more))
+    best, listed = int(candidates.rows[0]), ranking
+    # Looks at the best view may hide its neighbours, too, which a session follows.
+    around = None if _crowded(candidates.whereabouts) else neighborhood
+    for _ in range(SEARCHES):
+        more = scope.search_elsewhere(descriptor, listed, best, around)
+        if not len(more[0]):  # the ranking has all places
+            break
+        listed = merged(listed, more)
+        places = scope.snapshot.whereabouts_at(np.append(best, listed[0]))
+        if int(places.others(0, neighborhood).sum()) >= FULL:
+            break
+    return candidates if listed is ranking else _examined(map_, encoder, scope, local, listed)
 
 
 def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: Ranking) -> Candidates:
@@ -223,15 +236,23 @@ def likeness_of_first(encoder: Encoder, descriptors: Array, local: Cells) -> Arr
 def _is_enough(candidates: Candidates, neighborhood: Neighborhood, examined: int) -> bool:
     """Whether the candidates have as many places other than the best place as a verdict considers.
 
-    Among many frames of few views there are to be half as many as the second stage examines elsewhere.
+    Among many frames of few views there are to be half as many as the second stage examines elsewhere, and so many that
+    no place has to be imagined that the map has.
 
     Args:
         examined: how many places the second stage examines; 0: there is none.
     """
     others, places = candidates.whereabouts.others(0, neighborhood), candidates.whereabouts
-    crowded = bool(places.repeats(np.arange(len(places))).any())
+    crowded = _crowded(places)
     wanted = max(TOP_PLACES, examined // 2) if crowded else TOP_PLACES
+    if crowded and int(others.sum()) < FULL:
+        return False
     return int((others & candidates.examined if examined else others).sum()) >= wanted
+
+
+def _crowded(places: Whereabouts) -> bool:
+    """Whether several of the places show one view."""
+    return bool(places.repeats(np.arange(len(places))).any())
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,18 @@ def stops(where: Whereabouts) -> list[Stop]:
     return sorted(map(Stop, views), key=lambda stop: (-len(stop.places), int(stop.places[0])))
 
 
+def first_looks(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
+    """For each frame of a stop the first frame there, and each other frame for itself; int64 [n].
+
+    A frame that its pose puts too far from the first one for the same place stands for itself.
+    """
+    first = np.arange(len(where))
+    for stop in stops(where):
+        same = where.take(stop.places).near(0, neighborhood)
+        first[stop.places[same]] = stop.places[0]
+    return first
+
+
 def _along(
     where: Whereabouts, sequence: NDArray[np.int32], ordinal: NDArray[np.int64], frames: int, steps: int
 ) -> list[NDArray[np.int64]]:

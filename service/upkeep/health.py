@@ -1,7 +1,7 @@
 """The health report of a map.
 
 It counts the map's answers by week, searches for the map's own frames in the map to find places that look alike, and
-follows each sequence to find gaps.
+follows each sequence to find gaps.  The frames of a stop count once: the first of them stands for all.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
 from core.upkeep.drift import Trend, score_trend, unknown_trend
 from core.upkeep.hubness import Alias
-from core.upkeep.redundancy import stops
+from core.upkeep.redundancy import first_looks, stops
 from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
 from service.queries.statistics import Statistics
 from service.upkeep.schemas import (
@@ -58,9 +58,15 @@ class _Walk:
 
 @dataclass(frozen=True)
 class _Aliasing:
-    """Places that look like other places; ``counts`` and ``hubs`` are as in :mod:`core.upkeep.hubness`."""
+    """Places that look like other places.
+
+    views: int64 [v], positions of places, of those of a stop the first alone.
+    counts: int64 [v], of these, as of :func:`core.upkeep.hubness.occurrences`.
+    hubs: positions of places.
+    """
 
     examined: int
+    views: NDArray[np.int64]
     neighbours: int
     counts: NDArray[np.int64]
     hubs: NDArray[np.int64]
@@ -81,9 +87,11 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
     """
     began = time.monotonic()
     own = SelfQueries(map_, encoder)
-    aliasing = _aliasing(own, began + ALIASING_SHARE * seconds)
-    walks, all_compared = _walks(own, began + seconds)
-    silent = [i for i, place in enumerate(own.places) if place.id not in statistics.places]
+    first = first_looks(own.where, own.neighborhood)
+    aliasing = _aliasing(own, first, began + ALIASING_SHARE * seconds)
+    walks, all_compared = _walks(own, first, began + seconds)
+    seen = [i for i, place in enumerate(own.places) if place.id in statistics.places]
+    silent = np.flatnonzero(~np.isin(first, first[seen])).tolist()
     names = [place.id for place in own.places]
     gaps = [
         GapView(
@@ -108,10 +116,10 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
     return MapHealth(
         map=map_.record.id,
         places=len(own),
-        complete=all_compared and aliasing.examined == len(own),
+        complete=all_compared and aliasing.examined == len(aliasing.views),
         answers=_answers(statistics),
-        never_matched=_never_matched(own, statistics, silent, limit),
-        aliasing=_aliasing_view(own, aliasing, statistics, limit),
+        never_matched=_never_matched(own, aliasing.views, statistics, silent, limit),
+        aliasing=_aliasing_view(own, first, aliasing, statistics, limit),
         gaps=gaps[:limit],
         gap_count=len(gaps),
         stops=standing[:limit],
@@ -153,56 +161,65 @@ def _trend_view(found: Trend | None) -> TrendView | None:
     return None if found is None else TrendView(**asdict(found), significant=found.significant)
 
 
-def _never_matched(own: SelfQueries, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
+def _never_matched(
+    own: SelfQueries, views: NDArray[np.int64], statistics: Statistics, silent: list[int], limit: int
+) -> SilentPlaces | None:
     asked = sum(week.compared for week in statistics.weeks)
-    if not asked or not len(own):
+    if not asked or not len(views):
         return None
-    ordered = sorted(silent, key=lambda i: own.places[i].number)
+    places = [own.places[i] for i in np.intersect1d(views, silent).tolist()]
     # Poisson: how many places no query would match if each query matched a place drawn at random.
-    by_chance = len(own) * math.exp(-asked / len(own))
-    return SilentPlaces(count=len(silent), by_chance=by_chance, places=[own.places[i].id for i in ordered[:limit]])
+    by_chance = len(views) * math.exp(-asked / len(views))
+    ids = [place.id for place in sorted(places, key=lambda place: place.number)[:limit]]
+    return SilentPlaces(count=len(places), by_chance=by_chance, places=ids)
 
 
-def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
+def _aliasing(own: SelfQueries, first: NDArray[np.int64], until: float) -> _Aliasing:
     """Find places that are neighbours of many others, and places that look more like another place than their own."""
-    k = min(hubness.NEIGHBOURS, max(1, len(own) // 10))
-    order = spread_order(len(own)).tolist()
+    views = np.flatnonzero(first == np.arange(len(own)))
+    k = min(hubness.NEIGHBOURS, max(1, len(views) // 10))
+    order = views[spread_order(len(views))].tolist()
+    searched = own.members(views)
     lists: list[NDArray[np.int64]] = [np.empty((0, k), np.int64)]
     aliases: list[Alias] = []
-    everything = np.arange(len(own))
     done = 0
     while done < len(order) and (not done or time.monotonic() < until):
         some = order[done : done + TOGETHER]
-        for position, others, scores in own.search(some):
+        for position, others, scores in own.search(some, searched):
             same = own.near(position, others)
             best, found = hubness.nearest_others(scores, own.near(position, others, GUARD_FACTOR), k)
             lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is -1 and picks the appended NONE
             mine = float(scores[same].max()) if same.any() else None
-            has_own = same.any() or own.near(position, everything[everything != position]).any()
+            has_own = same.any() or own.near(position, views[views != position]).any()
             if best[0] != hubness.NONE and has_own and (mine is None or found[0] > mine):
                 aliases.append(Alias(position, int(others[best[0]]), float(found[0]), mine))
         done += len(some)
-    counts = hubness.occurrences(np.concatenate(lists), len(own))
+    counts = hubness.occurrences(np.concatenate(lists), len(own))[views]
     aliases.sort(key=lambda alias: -alias.score)
-    return _Aliasing(done, k, counts, hubness.hubs(counts), aliases)
+    return _Aliasing(done, views, k, counts, views[hubness.hubs(counts)], aliases)
 
 
-def _aliasing_view(own: SelfQueries, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
+def _aliasing_view(
+    own: SelfQueries, first: NDArray[np.int64], found: _Aliasing, statistics: Statistics, limit: int
+) -> AliasingView:
     names = [place.id for place in own.places]
     counted = [statistics.places.get(name) for name in names]
-    unsure = np.array([0 if count is None else count.best - count.recognized for count in counted], np.int64)
+    single = np.array([0 if count is None else count.best - count.recognized for count in counted], np.int64)
+    unsure = np.zeros(len(own), np.int64)
+    np.add.at(unsure, first, single)
+    named = [names[view] for view in found.views.tolist()]
     return AliasingView(
         examined=found.examined,
-        of=len(own),
+        of=len(found.views),
         neighbours=found.neighbours,
         skewness=hubness.skewness(found.counts),
-        hubs=_hubs(names, found.counts, limit),
+        hubs=_hubs(named, found.counts, limit),
         aliases=[
             AliasView(place=names[one.place], other=names[one.other], score=one.score, own=one.own)
             for one in found.aliases[:limit]
         ],
         alias_count=len(found.aliases),
-        unsure=_hubs(names, unsure, limit),
+        unsure=_hubs(named, unsure[found.views], limit),
     )
 
 
@@ -213,8 +230,11 @@ def _hubs(names: list[str], counts: NDArray[np.int64], limit: int) -> list[HubVi
     ]
 
 
-def _walks(own: SelfQueries, until: float) -> tuple[list[_Walk], bool]:
-    """Every sequence with its gaps; False if the time was up before the frames of all were compared."""
+def _walks(own: SelfQueries, first: NDArray[np.int64], until: float) -> tuple[list[_Walk], bool]:
+    """Every sequence with its gaps; False if the time was up before the frames of all were compared.
+
+    From one frame of a stop to the next is no step.
+    """
     by_name: dict[str | None, list[int]] = {}
     for position, place in enumerate(own.places):
         by_name.setdefault(place.sequence, []).append(position)
@@ -224,10 +244,11 @@ def _walks(own: SelfQueries, until: float) -> tuple[list[_Walk], bool]:
             continue
         ordered = np.array(sorted(members, key=lambda i: own.places[i].ordinal), np.int64)
         where = own.where.take(ordered)
-        gaps = coverage.long_steps(coverage.distances(where), "distance")
-        gaps += coverage.long_steps(coverage.durations(where), "time")
+        stood = first[ordered[1:]] == first[ordered[:-1]]
+        gaps = coverage.long_steps(np.where(stood, np.nan, coverage.distances(where)), "distance")
+        gaps += coverage.long_steps(np.where(stood, np.nan, coverage.durations(where)), "time")
         similarities, all_seen = _similarities(own, ordered, until)
-        gaps += coverage.unlike_steps(similarities)
+        gaps += coverage.unlike_steps(np.where(stood, np.nan, similarities))
         complete = complete and all_seen
         walks.append(_Walk(name, ordered, gaps))
     return walks, complete

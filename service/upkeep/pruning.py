@@ -1,4 +1,8 @@
-"""The job that prunes a map: it removes places whose neighbours can stand in for them, and measures what is lost."""
+"""The job that prunes a map: it removes places whose neighbours can stand in for them, and measures what is lost.
+
+Where the robot stood, the first frame stands for the others and always stays.  What is lost is counted without the
+others, for the many frames of a stop would outvote all other places.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from core.errors import UnknownSequence
 from core.judgement.reliability import wilson
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.upkeep.hubness import NONE
-from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
+from core.upkeep.redundancy import Thinning, Trial, best_thinning, first_looks, neighbour_pairs, steps, thinned
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
 from service.jobs.context import JobContext, yield_to_requests
@@ -72,12 +76,20 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         references = ~queries
     else:
         queries = references = np.ones(len(own), np.bool_)
-    trial = _search(engine, context, own, queries, references, options["sample"])
-    pairs = neighbour_pairs(own.where, own.neighborhood)
+    first = first_looks(own.where, own.neighborhood)
+    further = np.flatnonzero(first != np.arange(len(own)))
+    views = ~own.members(further)
+    trial = _search(engine, context, own, queries & views, references & views, options["sample"])
+    looks = np.stack([first[further], further], axis=1)
+    pairs = np.flatnonzero(views)[neighbour_pairs(own.where.take(views), own.neighborhood)]
+    looks, pairs = (some[references[some].all(axis=1)] for some in (looks, pairs))
+    pairs = np.concatenate([looks, pairs])
     removable = references & _members(names, options["sequence"]) if options["sequence"] is not None else references
-    pairs = pairs[references[pairs].all(axis=1)]
+    removable = removable & ~own.members(looks[:, 0])
     similarity = _similarities(engine, context, own, pairs)
-    choices = steps(similarity, STEPS) if options["similarity"] is None else [options["similarity"]]
+    choices = [options["similarity"]]
+    if options["similarity"] is None:
+        choices = steps(_by_stop(similarity, looks), STEPS)
     before = trial.found(references)
     tried: list[Thinning] = []
     for least in choices:
@@ -107,6 +119,13 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         "named": list(going)[:MOST_LISTED],
     }  # fmt: skip
     return report, going
+
+
+def _by_stop(similarity: NDArray[np.float32], looks: NDArray[np.int64]) -> NDArray[np.float32]:
+    """The scores of pairs, of which the first are ``looks``, int64 [m, 2]: of those of one stop the least alone."""
+    order = np.lexsort((similarity[: len(looks)], looks[:, 0]))
+    least = order[np.diff(looks[order, 0], prepend=-1) > 0]
+    return np.concatenate([similarity[least], similarity[len(looks) :]])
 
 
 def _members(names: NDArray[np.str_], sequence: str) -> NDArray[np.bool_]:

@@ -181,8 +181,8 @@ class AliasView(BaseModel):
 class AliasingView(BaseModel):
     """Places that look like other places."""
 
-    examined: int = Field(description="How many places were compared with the map.")
-    of: int = Field(description="How many places the map has.")
+    examined: int = Field(description="How many places were compared with the map; the frames of a stop count once.")
+    of: int = Field(description="How many places the map has; the frames of a stop count once.")
     neighbours: int = Field(description="How many of the most alike other places were counted for each place.")
     skewness: float = Field(
         description="Skewness of the counts: 0 if all are alike; over 2 if a few are neighbours of most."

@@ -390,10 +390,13 @@ class SearchScope:
         return [merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
 
     def search_elsewhere(
-        self, descriptor: Descriptor, ranking: Ranking, best: int, neighborhood: Neighborhood
+        self, descriptor: Descriptor, ranking: Ranking, best: int, neighborhood: Neighborhood | None
     ) -> Ranking:
         """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are."""
-        elsewhere = self.snapshot.alive & ~self.snapshot.whereabouts.near(best, neighborhood)
+        where = self.snapshot.whereabouts
+        elsewhere = self.snapshot.alive & ~where.of_views(ranking[0])
+        if neighborhood is not None:
+            elsewhere &= ~where.near(best, neighborhood)
         elsewhere[ranking[0]] = False
         if self.allowed is not None:
             elsewhere &= self.allowed

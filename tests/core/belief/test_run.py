@@ -264,6 +264,22 @@ def test_a_covered_camera_is_unknown_and_says_so(seen: Evidence, shown: View, si
         assert told.verdict == "recognized" and abs(told.candidates[0].row - 130) <= 3, "the place was not forgotten"
 
 
+def test_single_frames_that_do_not_fit_do_not_unsettle_a_robot_that_stands() -> None:
+    random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
+    run = Run(DEFAULT, graph)
+    for row in range(100, 130):
+        run.advance(seen_at(row, 300, random), Step(), view(row))
+        assert row < 110 or run.estimate(1, alive(graph)).verdict == "recognized"
+    for number in range(20):
+        run.advance(shows(129, gain=0.2, unknown=NOWHERE) if number % 2 else shows(129), Step(), view(129))
+        assert run.sight == "constant" and run.estimate(1, alive(graph)).verdict == "recognized"
+    verdicts = []
+    for _ in range(4):
+        run.advance(shows(129, gain=0.2, unknown=NOWHERE), Step(), view(129))
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    assert verdicts[0] == "recognized" and verdicts[-1] == "unknown"
+
+
 def test_a_slow_robot_advances_while_its_view_seems_the_same() -> None:
     graph = graph_of(walk(40))
     slow = Run(RunOptions(stride=Stride(0.1)), graph)

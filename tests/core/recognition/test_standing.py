@@ -21,6 +21,7 @@ from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas, Map
 from core.upkeep.redundancy import neighbour_pairs, stops
+from tests.core.storage.search.test_indexing import settled
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import scene
 
@@ -116,6 +117,22 @@ def test_a_stop_is_recognized_however_long_it_was(
     assert place_of(answer) == str(SPOT)
     for place in (0, SPOT - 4, SPOT + 4):
         assert place_of(ask(map_, encoder, walk[place])) == str(place)
+
+
+def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Encoder, walk: list[Encoding]) -> None:
+    """Their looks are more than a compact search finds; a verdict needs the others, and a session the neighbours."""
+    spots = (1, 5, 9, 10, 11)
+    looks = {spot: [walk[spot]] * LOOKS for spot in spots}
+    frames = [
+        (f"{place}.{number}", shown)
+        for place, one in enumerate(walk)
+        for number, shown in enumerate(looks.get(place, [one]))
+    ]
+    map_ = enrolled(atlas, encoder, frames)
+    assert settled(map_).tier == "compact"
+    answer = ask(map_, encoder, encoder.encode(noisy(scene(SPOT), 1000)))
+    assert place_of(answer) == str(SPOT)
+    assert set(answer.candidates.whereabouts.ordinal.tolist()) == set(range(PLACES))
 
 
 def test_a_stop_is_one_place_of_a_session(

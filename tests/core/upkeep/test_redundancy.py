@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
-from core.upkeep.redundancy import MOST_NEIGHBOURS, Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
+from core.upkeep.redundancy import (
+    FEWEST_STANDING,
+    MOST_NEIGHBOURS,
+    Thinning,
+    Trial,
+    best_thinning,
+    first_looks,
+    neighbour_pairs,
+    steps,
+    thinned,
+)
 
 
 def where(kinds: list[int], x: list[float], sequences: list[int] | None = None) -> Whereabouts:
@@ -51,6 +61,17 @@ def test_pairs_are_those_that_the_verdict_takes_for_one_place(
 def test_where_a_robot_stood_still_pairs_are_bounded() -> None:
     there = where([METRIC] * 500, [0.0] * 500)
     assert len(neighbour_pairs(there, Neighborhood(5.0, 3))) <= 500 * MOST_NEIGHBOURS
+
+
+def test_the_first_frame_of_a_stop_stands_for_the_others() -> None:
+    frames = [0, 1, *[2] * FEWEST_STANDING, 3, *[4] * (FEWEST_STANDING - 1)]
+    there = Whereabouts.along_sequence(frames)
+    expected = [0, 1, *[2] * FEWEST_STANDING, *range(2 + FEWEST_STANDING, len(frames))]
+    assert first_looks(there, Neighborhood(5.0, 3)).tolist() == expected, "fewer frames are no stop"
+    there.kind[:] = METRIC
+    there.position[5, 0] = 1000.0
+    expected[5] = 5
+    assert first_looks(there, Neighborhood(5.0, 3)).tolist() == expected, "poses say that it is elsewhere"
 
 
 Graph = tuple[int, NDArray[np.int64], NDArray[np.float32], float]

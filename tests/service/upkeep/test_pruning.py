@@ -66,6 +66,24 @@ def test_only_places_of_the_given_sequence_are_removed(server: Server) -> None:
     assert set(places(server, "partly")) == {f"a{n}" for n in range(12)}
 
 
+def test_of_a_stop_further_looks_go_and_the_first_stays(server: Server) -> None:
+    server.create_map("stood", encoder=COARSE, same_place_frames=1)
+    way = walk_frames(24)
+    frames = [*way[:12], *(way[12] + bytes(look) for look in range(40)), *way[13:]]
+    for number, frame in enumerate(frames):
+        assert server.enrol("stood", f"p{number}", frame, sequence="monday").status_code == 201
+    health = server.client.get("/v1/maps/stood/health").json()
+    (stop,) = health["stops"]
+    assert health["complete"] and health["aliasing"]["of"] == len(frames) - stop["frames"] + 1
+    dry = finished(server, asked(server, "stood", "prune", max_recall_loss=0))["result"]
+    assert dry["queries"] <= 24, "the looks do not outvote the other places"
+    assert dry["recall_before"]["value"] == dry["recall_after"]["value"]
+    bold = finished(server, asked(server, "stood", "prune", similarity=-1.0, dry_run=False))["result"]
+    left = places(server, "stood")
+    assert stop["place"] in left and bold["removed"] >= stop["frames"] - 1
+    assert not {f"p{n}" for n in range(13, 52)} & set(left)
+
+
 def test_pruning_what_cannot_be_pruned(server: Server) -> None:
     server.create_map("sparse", encoder=COARSE, same_place_radius=0.5)
     enrol_frames(server, "sparse", [jpeg(n) for n in range(3)], sequence="monday")
