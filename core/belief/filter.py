@@ -170,6 +170,17 @@ def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
     return Belief(likely / np.float32(inside), outside / (known + outside), floor, belief.speeds)
 
 
+def contradicted(belief: Belief, factors: Masses) -> Belief:
+    """The belief after something that is as likely at each speed as ``factors`` say, float32 [S], wherever it is."""
+    if not len(belief.given):
+        return belief
+    speeds, own, rest = belief.speeds.contradicted(factors)
+    given = belief.given * np.float32(rest)
+    given[speeds.places] = belief.given[speeds.places] * own
+    total = float(given.sum(dtype=np.float64))
+    return Belief(given / np.float32(total), belief.unknown, belief.floor * rest / total, speeds)
+
+
 def observed_by_speed(belief: Belief, seen: Evidence, graph: PlaceGraph, weights: Masses) -> Belief:
     """The belief after a frame that counts by how fast the robot goes: at each speed with a weight, float32 [S]."""
     overall = float(belief.speeds.overall(belief.given) @ weights)

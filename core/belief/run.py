@@ -13,6 +13,7 @@ from core.belief.evidence import NOTHING, Evidence
 from core.belief.filter import (
     Belief,
     Smoother,
+    contradicted,
     fits,
     observed,
     observed_by_speed,
@@ -35,7 +36,7 @@ from core.belief.motion import (
     transition,
 )
 from core.belief.odometry import FASTEST, OdometryPose, motion_between
-from core.belief.speeds import PRIOR, SPEEDS, TRACKED, UNKNOWN, Speeds, mixture, news
+from core.belief.speeds import PRIOR, SPEEDS, TRACKED, UNKNOWN, Speeds, mixture, news, plausible
 from core.belief.view import HEIGHT, WIDTH, View, novelty
 
 Sight = Literal["covered", "constant"]
@@ -178,26 +179,27 @@ class Run:
             view: what the frame shows; None: it is not known, and taken to be new.
             pose: where odometry says that the robot is, from which the motion to the next frame is told.
         """
-        change = 1.0 if view is None or self._view is None else novelty(view.change(self._view))
+        change = None if view is None or self._view is None else view.change(self._view)
+        new = 1.0 if change is None else novelty(change)
         fitting = fits(self.belief, seen, self.graph)
         shows_nothing = seen is NOTHING and len(self.graph) > 0
         if shows_nothing or (view is not None and view.uniform and not fitting):
-            self.sight, seen, share = "covered", NOTHING, 1.0
+            self.sight, seen, share, change = "covered", NOTHING, 1.0, None
             self.blind += 1
-        elif not change:
+        elif not new:
             self.sight, seen, share = "constant", NOTHING, 0.0
             self.blind = 0 if fitting else self.blind + 1
         else:
-            self.sight, self.blind, share = None, 0, change
+            self.sight, self.blind, share = None, 0, new
             self._view = view or self._view
         stands = self.sight == "constant" and (step.odometry is None or not by_poses(self.graph, step))
-        self._filter(seen, step, share, stands)
+        self._filter(seen, step, share, stands, change)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
         self.frames += 1
 
-    def _filter(self, seen: Evidence, step: Step, share: float, stands: bool) -> None:
-        """Move the belief and weigh it by what was seen."""
+    def _filter(self, seen: Evidence, step: Step, share: float, stands: bool, change: float | None) -> None:
+        """Move the belief and weigh it by what was seen, and by how much the view has changed, if that is known."""
         share = min(share, self._freshness(step))
         seen = seen.tempered(share * self._independence(step))
         moved, ahead = Transition(()), self.belief
@@ -215,6 +217,8 @@ class Run:
             self._pending_reach = 0.0
             ahead = predicted(self.belief, moved, share)
         if self.frames and share and self._by_speed(step):
+            if change is not None:
+                ahead = contradicted(ahead, plausible(change, step.frames, self.constant))
             new = np.minimum(1, news(step.frames, self.constant) / np.float32(share))
             self.belief = observed_by_speed(ahead, seen, self.graph, new)
         else:

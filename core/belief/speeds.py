@@ -5,7 +5,7 @@ traverse, 0.1 for a camera with ten times the frame rate, 0 for a robot that sta
 chain of places (``filter``) is one of places and speeds here: the mass of a place is shared out among SPEEDS, each
 share goes along the sequence by its own speed, and a few robots change their speed at each look.  A frame's evidence is
 of places alone, but speeds that lead past what the frames show lose their mass, so that after some frames the right one
-has most.
+has most.  A view that has changed much speaks against slow ones by itself.
 
 Only the likeliest places have shares of their own; all others have PRIOR, so that time and memory hardly grow with the
 map.
@@ -54,6 +54,19 @@ CREEPING = 0.25
 
 LEAST_NEWS = 0.1
 """One that stands counts as if it went on by so much, as people pass and light changes."""
+
+UNLIKE = 0.4
+"""How far below 1 the correlation of two views is taken to be that are a frame of the map apart; nearer ones differ by
+the root of it.  The medians are 0.06 on corridor and 0.4 in the winter of nordland_tiny.  Of 0.3, 0.4 and 0.5 the first
+follows slow robots through sparse maps worse, and the last gains less at paces of 0.5 and 0.7; lip6_outdoor had that
+say in it."""
+
+STILL_SPREAD, SPREAD = 0.06, 0.15
+"""Standard deviation of the correlation where the robot stands, and a frame of the map apart."""
+
+HIDDEN, ANY = 0.5, 0.03
+"""How probable it is that something hides a part of the view, so that any lower correlation is as likely as another;
+and the likelihood that no speed goes below."""
 
 LASTING = 0.9
 """Probability that a robot that is elsewhere than believed has the speed that is believed."""
@@ -125,6 +138,17 @@ class Speeds:
             shares[found[own]] = joint[own] / factors[own, np.newaxis]
         return Speeds(self.places, shares, self.elsewhere), factors
 
+    def contradicted(self, factors: Masses) -> tuple[Speeds, Masses, float]:
+        """The speeds after something that is as likely at each speed as ``factors`` say, float32 [S], wherever it is.
+
+        Returns:
+            Also how likely it is at the places that have shares of their own, float32 [m], and at all others.
+        """
+        shares, elsewhere = self.shares * factors, self.elsewhere * factors
+        own: Masses = shares.sum(axis=1)
+        rest = float(elsewhere.sum())
+        return Speeds(self.places, shares / own[:, np.newaxis], elsewhere / np.float32(rest)), own, rest
+
     def carried(self, places: NDArray[np.int64]) -> Speeds:
         """The same on another graph of the map, of whose places int64 [m, 2] tells the old number and the new one."""
         _, own, at = np.intersect1d(self.places, places[:, 0], return_indices=True)
@@ -173,6 +197,25 @@ def news(frames: int, constant: int) -> Masses:
     """
     gone = np.abs([displacement_of(speed, frames, constant) for speed in SPEEDS]).astype(np.float32)
     return np.where(gone < CREEPING, np.sqrt(np.maximum(gone, LEAST_NEWS)), np.float32(1))
+
+
+def plausible(change: float, frames: int, constant: int) -> Masses:
+    """How likely a change of the view is at each speed against the pace of the map, float32 [S], at most 1.
+
+    Only what is too much for a slow robot counts.  A view that has hardly changed speaks for none, as frames of the map
+    may be as alike.
+
+    Args:
+        change: of ``view.View.change``.
+        frames, constant: as of :func:`displacement_of`.
+    """
+    gone = np.abs([displacement_of(speed, frames, constant) for speed in (*SPEEDS, 1.0)])
+    share = np.sqrt(np.minimum(gone, 1))
+    expected, spread = 1 - UNLIKE * share, STILL_SPREAD + (SPREAD - STILL_SPREAD) * share
+    off = 1 - change**2 / 2 - expected
+    density = np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(2 * math.pi) * spread)
+    likely = (1 - HIDDEN) * density + HIDDEN * (off < 0) + ANY
+    return np.minimum(1, likely[:-1] / likely[-1]).astype(np.float32)
 
 
 @lru_cache(maxsize=64)

@@ -214,9 +214,9 @@ def test_the_old_words_name_the_new_one(client: Client, lab: Map) -> None:
         with pytest.raises(Renamed, match=rf"^{type(thing).__name__}\.{old} .*: use {new}\.$"):
             getattr(thing, old)("p")
         assert not hasattr(thing, old) and callable(getattr(thing, new))
-    for thing, word in ((lab.places, "revoked"), (session, "forget_many"), (lab.places, "revoke"), (lab, "forget")):
+    for other, word in ((lab.places, "revoked"), (session, "forget_many"), (lab.places, "revoke"), (lab, "forget")):
         with pytest.raises(AttributeError, match=f"has no attribute '{word}'$"):
-            getattr(thing, word)
+            getattr(other, word)
 
 
 @pytest.mark.parametrize("half", [Client, AsyncClient])

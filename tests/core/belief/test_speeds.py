@@ -6,8 +6,20 @@ import numpy as np
 import pytest
 
 from core.belief import Evidence, PlaceGraph, Run, RunOptions, Step, from_bytes, to_bytes
-from core.belief.filter import predicted_by_speed, uninformed
-from core.belief.speeds import KEEPING, PRIOR, SPEEDS, UNKNOWN, Speeds, displacement_of, forward, kernel_of, mixture
+from core.belief.filter import Belief, contradicted, predicted_by_speed, uninformed
+from core.belief.speeds import (
+    KEEPING,
+    PRIOR,
+    SPEEDS,
+    UNKNOWN,
+    Speeds,
+    displacement_of,
+    forward,
+    kernel_of,
+    mixture,
+    plausible,
+)
+from core.belief.view import HEIGHT, WIDTH, View
 from core.places import Neighborhood
 from tests.core.belief.maps import graph_of, walk
 from tests.core.belief.test_run import alive, view
@@ -117,6 +129,50 @@ def test_the_speeds_of_places_that_stay_are_kept_when_others_come_or_go() -> Non
         run.advance(seen_at(row, random), Step())
     run.place_on(graph_of(walk(PLACES + 10), Neighborhood(5, 3)))
     assert SPEEDS[int(run.belief.speeds.overall(run.belief.given).argmax())] == -1
+
+
+def test_a_view_that_has_changed_much_speaks_against_slow_speeds_alone() -> None:
+    speeds = np.abs(SPEEDS)
+    order = np.argsort(speeds)
+    for change in (0.12, 0.3, 0.6, 1.0, 1.4, 2.0):
+        found = plausible(change, 1, 0)
+        assert (found[speeds >= 1] == 1).all() and (found > 0.2).all() and (np.diff(found[order]) >= 0).all()
+    assert (plausible(0.12, 1, 0) == 1).all() and plausible(1.0, 1, 0)[SPEEDS.index(0.3)] < 0.5
+    assert plausible(1.0, 20, 0)[SPEEDS.index(0.1)] == 1, "twenty frames at a tenth of the pace"
+
+
+def test_what_speaks_against_a_speed_speaks_against_the_places_where_the_robot_would_have_it() -> None:
+    random = np.random.default_rng(8)
+    given = random.dirichlet(np.ones(30)).astype(np.float32)
+    places = random.choice(30, 12, replace=False).astype(np.int32)
+    speeds = Speeds(places, random.dirichlet(np.ones(len(SPEEDS)), 12).astype(np.float32), PRIOR)
+    factors = random.uniform(0.3, 1, len(SPEEDS)).astype(np.float32)
+    joint = given[:, np.newaxis] * speeds.at(np.arange(30)) * factors
+    joint /= joint.sum()
+    found = contradicted(Belief(given, 0.2, 0.01, speeds), factors)
+    np.testing.assert_allclose(found.given, joint.sum(axis=1), atol=1e-6)
+    np.testing.assert_allclose(found.given[:, np.newaxis] * found.speeds.at(np.arange(30)), joint, atol=1e-6)
+    assert found.unknown == 0.2
+
+
+def test_a_place_that_resembles_every_frame_is_not_taken_for_one_where_a_moving_robot_stands() -> None:
+    random, graph = np.random.default_rng(9), graph_of(walk(PLACES), Neighborhood(5, 3))
+    grey, views = random.normal(0, 1, WIDTH * HEIGHT), []
+    for _ in range(40):  # each has a correlation of 0.6 with the last
+        grey = 0.6 * grey + 0.8 * random.normal(0, 1, WIDTH * HEIGHT)
+        views.append(View(np.clip(128 + 40 * grey, 0, 255).astype(np.uint8)))
+    believed = []
+    for shown in (views, [None] * 40):
+        run = Run(DEFAULT, graph)
+        for number, view_shown in enumerate(shown):
+            gains = {300: 1.5} | ({100 + number: 3.0} if number % 3 == 0 else {})
+            seen = Evidence(np.array([*gains]), np.array([*gains.values()], np.float32), 1.1)
+            run.advance(seen, Step(), view_shown)
+        slow = float(run.belief.speeds.overall(run.belief.given)[np.abs(SPEEDS) < 1].sum())
+        believed.append((slow, float(run.belief.given[300]), float(run.belief.given[139])))
+    slow, there, here = believed[0]
+    assert slow < 0.1 and here > 0.8 > 0.1 > there
+    assert believed[1][0] > 0.9, "or the views would not matter"
 
 
 def test_constant_frames_let_a_slow_robot_advance_but_not_beyond_the_next_place() -> None:

@@ -117,7 +117,7 @@ def test_what_is_no_name_is_refused_before_a_question(placerec: Placerec, words:
 
 
 def test_other_words_are_unknown(placerec: Placerec) -> None:
-    never = [("maps", old) for old in ("forget", "revoke", "end")]
+    never: list[tuple[str, ...]] = [("maps", old) for old in ("forget", "revoke", "end")]
     never += [("keys", "forget"), ("maps", "places", "revoke"), ("maps", "sequences", "revoke")]
     for words in (*never, ("maps", "places", "revoked"), ("jobs", "forget"), ("forget",)):
         assert "No such command" in placerec(*words, status=2).stderr
