@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
 
+    from placerec_client._http import httpx
+
 Result = TypeVar("Result")
 
 
@@ -30,6 +32,14 @@ async def within(seconds: float, work: Callable[[], Awaitable[Result]]) -> Resul
     """
     async with asyncio.timeout(seconds):
         return await work()
+
+
+def interruptible(transport: httpx.AsyncHTTPTransport) -> httpx.AsyncHTTPTransport:
+    """A transport that is waited for no longer when it is broken off, not even while it looks a name up."""
+    from placerec_client._lookup import Backend  # with httpcore, which httpx imports no sooner either
+
+    transport._pool._network_backend = Backend()  # httpx has no parameter for it
+    return transport
 
 
 class Task(Generic[Result]):
