@@ -7,8 +7,8 @@ import time
 from dataclasses import dataclass
 
 SHORTEST_PAUSE = 0.05
-"""Seconds between two attempts at least, unless the rule begins with less; no attempt begins later than that before the
-end of the time."""
+"""Seconds between two attempts at least, unless the rule has shorter pauses; no attempt begins later than that before
+the end of the time."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,9 @@ class Clock:
             asked: seconds that the service asks to wait, which are never shortened.
         """
         left = self._last - time.monotonic()
-        pause = min(self._retry.pause(self.attempts), left / 2)
-        if pause < min(self._retry.first_pause / 2, SHORTEST_PAUSE):
+        retry = self._retry
+        pause = min(retry.pause(self.attempts), left / 2)
+        if pause < min(retry.first_pause / 2, retry.longest_pause / 2, SHORTEST_PAUSE):
             return None
         pause = max(pause, asked or 0.0)
         return pause if pause < left else None

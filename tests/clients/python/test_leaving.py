@@ -5,18 +5,63 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Iterator
+import threading
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from threading import Event
+from typing import Any, TypeVar
 
+import httpx
 import pytest
 
 from placerec_client import AsyncClient, Client, ConnectionFailed, Map, Retry, problems
+from placerec_client._async import concurrency as async_concurrency
 from placerec_client._async import sessions as async_sessions
-from placerec_client._sync import sessions
+from placerec_client._sync import concurrency, sessions
 from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.service.refusing import refusing_server
 from tests.service.scenes import jpeg
 from tests.service.server import Server, free_port
+
+Result = TypeVar("Result")
+
+SECONDS = 3600.0
+"""How long leaving waits here, where nothing may depend on the speed of the machine."""
+
+USUAL_SECONDS = sessions.LEAVE_SECONDS, async_sessions.LEAVE_SECONDS
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "LEAVE_SECONDS", SECONDS)
+    monkeypatch.setattr(async_sessions, "LEAVE_SECONDS", SECONDS)
+
+
+def over_at(event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the time of leaving be over when something has happened, or cannot happen any more."""
+
+    def within(seconds: float, work: Callable[[], Result]) -> Result:
+        assert seconds == SECONDS
+
+        def run() -> Result:
+            try:
+                return work()
+            finally:
+                event.set()
+
+        task = concurrency.Task(run)
+        event.wait()
+        return task.result(0)
+
+    async def within_async(seconds: float, work: Callable[[], Awaitable[Result]]) -> Result:
+        assert seconds == SECONDS
+        task = asyncio.ensure_future(work())
+        task.add_done_callback(lambda _: event.set())
+        await asyncio.to_thread(event.wait)
+        return await asyncio.wait_for(task, 0)
+
+    monkeypatch.setattr(sessions, "within", within)
+    monkeypatch.setattr(async_sessions, "within", within_async)
 
 
 class Heads:
@@ -25,11 +70,13 @@ class Heads:
     def __init__(self, fault: Fault) -> None:
         self._fault = fault
         self.seen: list[bytes] = []
+        self.came = Event()
 
     def __call__(self, head: bytes) -> Fault:
         if not head.startswith(b"DELETE "):
             return "none"
         self.seen.append(head)
+        self.came.set()
         return self._fault
 
 
@@ -39,13 +86,6 @@ def failing(server: Server, fault: Fault) -> Iterator[tuple[str, Heads]]:
     heads = Heads(fault)
     with FaultProxy(server.port, choose=heads) as way:
         yield way.url, heads
-
-
-@pytest.fixture
-def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaving waits for whatever comes of it, however slow the machine is."""
-    for half in (sessions, async_sessions):
-        monkeypatch.setattr(half, "LEAVE_SECONDS", 120.0)
 
 
 def left_after(head: bytes) -> float:
@@ -58,65 +98,93 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
     return [one for one in caplog.records if (one.name, one.levelno) == ("placerec_client", logging.WARNING)]
 
 
-@pytest.mark.usefixtures("unhurried")
-@pytest.mark.parametrize(("fault", "on_its_way"), [("cut-before", ValueError), ("lose-answer", KeyboardInterrupt)])
+@pytest.mark.parametrize(
+    ("fault", "on_its_way"),
+    [("silence", KeyboardInterrupt), ("silence", None), ("cut-before", ValueError), ("lose-answer", KeyboardInterrupt)],
+)
 def test_a_session_is_left_by_one_attempt(
-    server: Server, lab: Map, fault: Fault, on_its_way: type[BaseException], caplog: pytest.LogCaptureFixture
+    server: Server,
+    lab: Map,
+    fault: Fault,
+    on_its_way: type[BaseException] | None,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with (
-        failing(server, fault) as (url, heads),
-        Client(url, retry=Retry(60)) as client,
-        pytest.raises(on_its_way),
-        client.maps[lab.id].sessions.begin() as session,
-    ):
-        raise on_its_way
-    assert len(heads.seen) == 1 and 0 < left_after(heads.seen[0]) <= sessions.LEAVE_SECONDS
-    (told,) = warnings(caplog)
-    assert session.id in told.getMessage() and "did not end it now: " in told.getMessage()
-
-
-@pytest.mark.parametrize("on_its_way", [KeyboardInterrupt, None])
-def test_a_session_is_left_in_a_second_if_nobody_answers(
-    server: Server, lab: Map, on_its_way: type[BaseException] | None, caplog: pytest.LogCaptureFixture
-) -> None:
-    """On a slow machine the second may be over before the request is on its way."""
-    with failing(server, "silence") as (url, heads), Client(url, retry=Retry(60)) as client:
+    with failing(server, fault) as (url, heads), Client(url, retry=Retry(60)) as client:
+        if fault == "silence":
+            over_at(heads.came, monkeypatch)
         if on_its_way is None:
             with client.maps[lab.id].sessions.begin() as session:
                 session.send(jpeg(0, 64, 48))
         else:
             with pytest.raises(on_its_way), client.maps[lab.id].sessions.begin() as session:
                 raise on_its_way
-    assert len(heads.seen) <= 1 and all(0 < left_after(one) <= 1.0 for one in heads.seen)
-    assert sessions.LEAVE_SECONDS == async_sessions.LEAVE_SECONDS == 1.0
+    assert len(heads.seen) == 1 and 0 < left_after(heads.seen[0]) <= SECONDS
     (told,) = warnings(caplog)
     assert session.id in told.getMessage() and "did not end it now: " in told.getMessage()
 
 
-async def cancelled_within(url: str, map_id: str) -> None:
-    async with AsyncClient(url, retry=Retry(60)) as client, client.maps[map_id].sessions.begin():
-        task = asyncio.current_task()
-        assert task is not None
-        task.cancel()  # as Ctrl-C does in asyncio.run
-        await asyncio.Event().wait()
+@pytest.mark.parametrize("fault", ["silence", "cut-before"])
+def test_a_session_is_left_asynchronously(
+    server: Server, lab: Map, fault: Fault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work(url: str) -> None:
+        async with AsyncClient(url, retry=Retry(60)) as client, client.maps[lab.id].sessions.begin():
+            task = asyncio.current_task()
+            assert task is not None
+            task.cancel()  # as Ctrl-C does in asyncio.run
+            await asyncio.Event().wait()
 
-
-@pytest.mark.usefixtures("unhurried")
-def test_a_session_is_left_asynchronously(server: Server, lab: Map) -> None:
-    with failing(server, "cut-before") as (url, heads):
+    with failing(server, fault) as (url, heads):
+        if fault == "silence":
+            over_at(heads.came, monkeypatch)
         with pytest.raises(asyncio.CancelledError):
-            asyncio.run(cancelled_within(url, lab.id))
-        assert len(heads.seen) == 1
+            asyncio.run(work(url))
+        assert len(heads.seen) == 1 and left_after(heads.seen[0]) <= SECONDS
 
 
-def test_a_session_is_left_asynchronously_if_nobody_answers(server: Server, lab: Map) -> None:
-    with failing(server, "silence") as (url, heads):
-        with pytest.raises(asyncio.CancelledError):
-            asyncio.run(cancelled_within(url, lab.id))
-        assert len(heads.seen) <= 1 and all(0 < left_after(one) <= 1.0 for one in heads.seen)
+def test_work_that_does_not_end_is_left() -> None:
+    assert USUAL_SECONDS == (1.0, 1.0)
+    ended = Event()
+    with pytest.raises(TimeoutError):
+        concurrency.within(0.01, ended.wait)
+    ended.set()
+
+    async def work() -> None:
+        with pytest.raises(TimeoutError):
+            await async_concurrency.within(0.01, asyncio.Event().wait)
+
+    asyncio.run(work())
 
 
-@pytest.mark.usefixtures("unhurried")
+def broken(_: httpx.Request) -> httpx.Response:
+    raise RuntimeError("a transport of another kind")
+
+
+def test_whatever_goes_wrong_then_is_only_told(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work() -> None:
+        client = AsyncClient("robot", transport=httpx.MockTransport(broken))
+        async with client, client.maps["lab"].sessions["of-before"]:
+            raise KeyError("on its way")
+
+    with pytest.raises(KeyError):
+        asyncio.run(work())
+    with Client("robot", transport=httpx.MockTransport(broken)) as client:
+        with pytest.raises(KeyError), client.maps["lab"].sessions["of-before"]:
+            raise KeyError("on its way")
+
+        def start(_: threading.Thread) -> None:
+            raise RuntimeError("can't start new thread")
+
+        monkeypatch.setattr(threading.Thread, "start", start)
+        with pytest.raises(KeyError), client.maps["lab"].sessions["of-before"]:
+            raise KeyError("on its way")
+    told = [one.getMessage().partition("now: ")[2] for one in warnings(caplog)]
+    assert told == [*["a transport of another kind"] * 2, "can't start new thread"]
+
+
 def test_the_service_is_gone(server: Server, lab: Map, caplog: pytest.LogCaptureFixture) -> None:
     gone = f"http://127.0.0.1:{free_port()}"
     with pytest.raises(KeyboardInterrupt), Client(gone) as client, client.maps[lab.id].sessions["of-before"]:
@@ -126,27 +194,75 @@ def test_the_service_is_gone(server: Server, lab: Map, caplog: pytest.LogCapture
         client.maps[lab.id].sessions["of-before"].delete()  # who asks for it is told
 
 
-def test_a_name_that_nobody_looks_up_keeps_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking up a name has no time limit: it is waited for no longer than for an answer."""
-    asked, answered = Event(), Event()
+NAME = "robot.invalid"
 
-    def look_up(*_: object, **__: object) -> None:
+
+def name_server(monkeypatch: pytest.MonkeyPatch, look_up: Callable[[], list[str]]) -> None:
+    """Let the addresses of a name be found by a function; other names have those that they have."""
+    usual = socket.getaddrinfo
+
+    def getaddrinfo(host: Any, port: Any, *rest: Any, **options: Any) -> Any:
+        if host not in (NAME, NAME.encode()):
+            return usual(host, port, *rest, **options)
+        return [one for address in look_up() for one in usual(address, port, *rest, **options)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    monkeypatch.setenv("no_proxy", "*")
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_a_name_that_nobody_looks_up_keeps_nobody(half: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking up a name has no time limit: neither leaving nor the end of a loop or of the process waits for it."""
+    asked, answered, looking = Event(), Event(), list[threading.Thread]()
+
+    def look_up() -> list[str]:
+        looking.append(threading.current_thread())
         asked.set()
-        answered.wait()
+        if threading.current_thread().daemon:  # the end of a loop or of the process waits for others
+            answered.wait()
         raise OSError("no name server")
 
-    monkeypatch.setattr(socket, "create_connection", look_up)
-    patience = 0.1
-    while not asked.is_set():  # on a slow machine the time may be over before the look-up begins
-        monkeypatch.setattr(sessions, "LEAVE_SECONDS", patience)
-        with pytest.raises(KeyError), Client("http://robot.invalid").maps["lab"].sessions["of-before"]:
+    async def work() -> None:
+        async with AsyncClient(NAME).maps["lab"].sessions["of-before"]:
             raise KeyError("on its way")
-        patience *= 2
-    assert not answered.is_set()
+
+    name_server(monkeypatch, look_up)
+    over_at(asked, monkeypatch)
+    if half is AsyncClient:
+        with pytest.raises(KeyError):
+            asyncio.run(work())
+    else:
+        with pytest.raises(KeyError), Client(NAME).maps["lab"].sessions["of-before"]:
+            raise KeyError("on its way")
+    (thread,) = looking
+    assert thread.daemon and thread.is_alive()
     answered.set()
+    thread.join()
 
 
-@pytest.mark.usefixtures("unhurried")
+def test_every_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def asks(port: str) -> None:
+        async with AsyncClient(f"{NAME}:{port}", retry=Retry(0)) as client:
+            await client.liveness()
+
+    with refusing_server() as (url, seen):
+        port = url.rpartition(":")[2]
+        name_server(monkeypatch, lambda: ["127.0.0.2", "127.0.0.1"])  # nobody listens at the first
+        with pytest.raises(problems.KeyRefused):
+            asyncio.run(asks(port))
+        assert seen == [("GET", "/livez")]
+        name_server(monkeypatch, lambda: ["127.0.0.2", "127.0.0.3"])
+        with pytest.raises(ConnectionFailed, match="cannot be reached"):
+            asyncio.run(asks(port))
+
+    def unknown() -> list[str]:
+        raise socket.gaierror("Name or service not known")
+
+    name_server(monkeypatch, unknown)
+    with pytest.raises(ConnectionFailed, match="Name or service not known"):
+        asyncio.run(asks(port))
+
+
 def test_a_map_that_was_deleted_took_its_session_along(lab: Map, caplog: pytest.LogCaptureFixture) -> None:
     with lab.sessions.begin():
         lab.delete()

@@ -28,10 +28,10 @@ from placerec_client import (
     problems,
     retry,
 )
-from placerec_client._sync import connection
 from placerec_client.answers import problem_of
 from placerec_client.requests import path_of
 from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.clients.python.moments import Moments
 from tests.service.scenes import jpeg
 from tests.service.server import Server, free_port
 
@@ -170,6 +170,8 @@ def test_a_service_behind_a_prefix_is_itself(path: str) -> None:
         ("robot.local:80/behind/a/proxy/", "robot.local"),
         ("[::1]:8000", "[::1]:8000"),
         ("https://robot/", "robot"),
+        ("my_robot-2.local.:65535", "my_robot-2.local.:65535"),
+        ("bücher.example", "xn--bcher-kva.example"),
     ],
 )
 def test_a_host_is_a_url(url: str, host: str) -> None:
@@ -182,7 +184,11 @@ def test_a_host_is_a_url(url: str, host: str) -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["ftp://robot", "unix:/run/placerec.sock", "robot:", "robot:x", "http://robot:x", "http://", "robot?key=1", ""],
+    [
+        *("ftp://robot", "unix:/run/placerec.sock", "robot:", "robot:x", "http://robot:x", "http://", "robot?key=1"),
+        *("", "robot:0", "robot:65536", "http://127.0.0.1:73747", "https://[::1]:65616"),
+        *("a\\b", "http://a\\b", "robot;x", "*", "a%41", "http://ro bot", "robot..local", ".", "r" * 64),
+    ],
 )
 def test_what_is_no_url_is_refused_at_once(url: str) -> None:
     with pytest.raises(ConnectionFailed, match="is not a URL"):
@@ -298,21 +304,6 @@ def trickle(listening: socket.socket, pieces: int, pause: float) -> int:
     return pieces
 
 
-class Moments:
-    """A clock that only goes on while the client pauses; the client's own waits for it."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 0.0
-        monkeypatch.setattr(retry, "time", self)
-        monkeypatch.setattr(connection, "sleep", self.sleep)
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("seconds", "deadline"), [(0.7, True), (20.0, True), (30.0, False)])
 def test_attempts_go_on_to_the_end(seconds: float, deadline: bool, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,6 +321,24 @@ def test_attempts_go_on_to_the_end(seconds: float, deadline: bool, seed: int, mo
     assert seconds - 0.1 <= asked[-1] < seconds and len(asked) < 20
     pauses = [after - before for before, after in itertools.pairwise(asked)]
     assert min(pauses) > 0.999 * retry.SHORTEST_PAUSE
+
+
+@pytest.mark.parametrize(("first", "longest"), [(0.1, 0.02), (1.0, 0.01)])
+def test_attempts_go_on_after_the_longest_pause(first: float, longest: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    moments, asked = Moments(monkeypatch), list[float]()
+
+    def refuse(_: httpx.Request) -> httpx.Response:
+        asked.append(moments.now)
+        raise httpx.ConnectError("refused")
+
+    transport = httpx.MockTransport(refuse)
+    with (
+        Client("robot", retry=Retry(1, first, longest), transport=transport) as client,
+        pytest.raises(ConnectionFailed),
+    ):
+        client.liveness()
+    pauses = [after - before for before, after in itertools.pairwise(asked)]
+    assert asked[-1] > 0.9 and max(pauses) < 1.501 * longest
 
 
 @pytest.mark.parametrize("back", [1.0, 5.0, 8.0, 9.0])
@@ -379,8 +388,9 @@ def refuse(listening: socket.socket) -> bytes:
         return head
 
 
-def test_a_proxy_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("http_proxy", "gopher://127.0.0.1:70")
+@pytest.mark.parametrize("proxy", ["gopher://127.0.0.1:70", "127.0.0.1:65536"])
+def test_a_proxy_that_is_none_is_told(proxy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", proxy)
     with pytest.raises(ConnectionFailed, match="a proxy that is none"):
         Client("http://robot.invalid")
 

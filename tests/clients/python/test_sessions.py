@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import math
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +32,7 @@ from placerec_client import (
 )
 from placerec_client.parameters import SendFrame
 from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.clients.python.moments import Moments
 from tests.service.refusing import Seen, refusing_server
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -249,6 +251,53 @@ def test_a_frame_whose_turn_does_not_come_in_time() -> None:
 
     asyncio.run(work())
     assert [request.url.params["frame"] for request in asked] == ["0", "1"]
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_the_last_number_is_asked_for_within_the_deadline(streamed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    moments = Moments(monkeypatch)
+
+    def refuse(_: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("refused")
+
+    with Client("robot", transport=httpx.MockTransport(refuse)) as client:
+        session = client.maps["lab"].sessions["of-before"]
+        with pytest.raises(DeadlineExceeded):
+            (session.stream() if streamed else session).send(b"frame", deadline=0.3)
+    assert moments.now < 0.3
+
+
+def test_the_frame_has_what_its_number_left_of_the_deadline(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    with lab.sessions.begin() as begun:
+        report = begun.read().model_dump_json()
+    moments, asked = Moments(monkeypatch), list[tuple[str, float]]()
+
+    def slow(request: httpx.Request) -> httpx.Response:
+        asked.append((request.method, float(request.headers["X-Request-Timeout"])))
+        moments.now += 0.125
+        return httpx.Response(200 if request.method == "GET" else 418, content=report)
+
+    with Client("robot", transport=httpx.MockTransport(slow)) as client, pytest.raises(UnexpectedAnswer):
+        client.maps["lab"].sessions["of-before"].send(b"frame", deadline=0.5)
+    assert asked == [("GET", 0.5), ("POST", 0.375)]
+
+
+@pytest.mark.parametrize("deadline", [math.inf, 1e10])
+def test_a_deadline_may_be_as_late_as_one_likes(url: str, lab: Map, deadline: float) -> None:
+    with lab.sessions.begin() as session, session.stream() as stream:
+        assert session.send(jpeg(0, 64, 48), deadline=deadline).frames == 1
+        assert stream.send(jpeg(1, 64, 48), deadline=deadline).frames == 2
+
+    async def work() -> None:
+        async with (
+            AsyncClient(url) as client,
+            client.maps[lab.id].sessions.begin() as session,
+            session.stream() as stream,
+        ):
+            assert (await session.send(jpeg(0, 64, 48), deadline=deadline)).frames == 1
+            assert (await stream.send(jpeg(1, 64, 48), deadline=deadline)).frames == 2
+
+    asyncio.run(work())
 
 
 def test_what_ends(walk: Map) -> None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from placerec_client._async.concurrency import sleep
-from placerec_client._async.lanes import AsyncLanes
+from placerec_client._async.lanes import AsyncLanes, check_address
 from placerec_client._http import httpx
 from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
 from placerec_client.errors import (
@@ -303,11 +303,11 @@ def service_url(url: str) -> str:
         )
     try:
         parsed_url = httpx.URL(full)
+        check_address(parsed_url)
     except (httpx.InvalidURL, ValueError) as error:
         raise ConnectionFailed(f"{url!r} is not a URL: {error}.") from error
-    if not parsed_url.host or parsed_url.query or parsed_url.fragment:
-        reason = "names no host" if not parsed_url.host else "has a query string or a fragment"
-        raise ConnectionFailed(f"{url!r} is not a URL of a service: it {reason}.")
+    if parsed_url.query or parsed_url.fragment:
+        raise ConnectionFailed(f"{url!r} is not a URL of a service: it has a query string or a fragment.")
     return full.rstrip("/")
 
 
@@ -321,7 +321,8 @@ class AsyncTimely(httpx.AsyncByteStream):
         self._stream, self._clock, self._times = stream, clock, times
 
     async def __aiter__(self) -> AsyncIterator[bytes]:
-        self._times["read"] = max(self._left(), LEAST_SECONDS)  # httpx looks at it once, when the body begins
+        limit = min(self._times["read"], self._left())
+        self._times["read"] = max(limit, LEAST_SECONDS)  # httpx looks at it once, when the body begins
         async for chunk in self._stream:
             yield chunk
             if self._left() <= 0:

@@ -7,11 +7,16 @@ lent to the next request afterwards.
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator
 from urllib.request import getproxies, proxy_bypass
 
+from placerec_client._async.concurrency import interruptible
 from placerec_client._http import httpx
 from placerec_client.errors import ConnectionFailed
+
+HOST_NAME = re.compile(r"([A-Za-z0-9_-]{1,63}\.)*[A-Za-z0-9_-]{1,63}\.?")
+"""The name of a host, or its IPv4 address, as they are sent; those of other alphabets are written in this one."""
 
 
 class AsyncLanes(httpx.AsyncBaseTransport):
@@ -45,7 +50,7 @@ class AsyncLanes(httpx.AsyncBaseTransport):
         try:
             return self._free.pop()
         except IndexError:
-            made = httpx.AsyncHTTPTransport(verify=self._verify, limits=self._limits, proxy=self._proxy)
+            made = interruptible(httpx.AsyncHTTPTransport(verify=self._verify, limits=self._limits, proxy=self._proxy))
             self._all.append(made)
             return made
 
@@ -78,6 +83,15 @@ class AsyncLent(httpx.AsyncByteStream):
                 self._free.append(self._lane)
 
 
+def check_address(url: httpx.URL) -> None:
+    """Raise ValueError, which says why, if nothing is at the host and the port of a URL."""
+    if url.port is not None and not 1 <= url.port <= 65535:  # a socket would take it modulo 65536
+        raise ValueError(f"its port {url.port} is not one from 1 to 65535")
+    host = url.raw_host.decode()
+    if ":" not in host and not HOST_NAME.fullmatch(host):  # httpx has checked IPv6
+        raise ValueError(f"its host {url.host!r} is no name of one" if host else "it names no host")
+
+
 def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     """The proxy that the environment names for a service, by the rules of httpx; None for none.
 
@@ -89,6 +103,8 @@ def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     if not found or proxy_bypass(url.host):
         return None
     try:
-        return httpx.Proxy(found if "://" in found else f"http://{found}")
+        proxy = httpx.Proxy(found if "://" in found else f"http://{found}")
+        check_address(proxy.url)
+        return proxy
     except (ValueError, httpx.InvalidURL) as error:
         raise ConnectionFailed(f"The environment names a proxy that is none: {error}.") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from placerec_client import models, parameters
@@ -26,8 +26,8 @@ class AsyncNumbering:
         self._lock = Lock()
 
     @asynccontextmanager
-    async def turn(self, deadline: float | None) -> AsyncIterator[float | None]:
-        """Wait for the frames before; yield the seconds that are left until the deadline, None without one.
+    async def turn(self, deadline: float | None) -> AsyncIterator[Callable[[], float | None]]:
+        """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
 
         Raises:
             DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
@@ -38,16 +38,21 @@ class AsyncNumbering:
         except TimeoutError as error:
             raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
         try:
-            yield None if deadline is None else deadline - round(time.monotonic() - began, 3)
+            yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
         finally:
             self._lock.release()
 
-    async def number(self, options: parameters.SendFrame) -> parameters.SendFrame:
-        """Return the options of a frame with its number: the caller's own, or the next one."""
+    async def number(self, options: parameters.SendFrame, left: float | None) -> parameters.SendFrame:
+        """Return the options of a frame with its number: the caller's own, or the next one.
+
+        Raises:
+            DeadlineExceeded: the service did not tell its last number within the seconds that were left.
+        """
         given = options.get("frame")
         if given is None:
             if self._next is None:
-                last = (await self._connection.ask(models.SessionReport, "GET", self._path)).last_frame
+                report = await self._connection.ask(models.SessionReport, "GET", self._path, deadline=left)
+                last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next
         self._next = given + 1

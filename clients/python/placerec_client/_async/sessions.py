@@ -93,8 +93,9 @@ class AsyncSession(OldNames, end="delete"):
     ) -> None:
         try:
             await within(LEAVE_SECONDS, self._leave)
-        except (PlacerecError, TimeoutError) as failure:
-            reason = str(failure) or f"no answer came within {LEAVE_SECONDS:g} s."
+        except Exception as failure:  # whatever it is, the one that is on its way counts more
+            silent = isinstance(failure, TimeoutError)
+            reason = str(failure) or (f"no answer came within {LEAVE_SECONDS:g} s." if silent else repr(failure))
             log.warning("The session %s was left, but the service did not end it now: %s", self.id, reason)
 
     async def _leave(self) -> None:
@@ -147,14 +148,15 @@ class AsyncSession(OldNames, end="delete"):
         data = frame_bytes(image)
         numbering = self._numbers()
         async with numbering.turn(deadline) as left:
+            numbered = await numbering.number(moved, left())
             return await self._connection.ask(
                 models.SessionAnswer,
                 "POST",
                 self.path + "/frames",
-                params=await numbering.number(moved),
+                params=numbered,
                 content=data,
                 media_type=media_type(data),
-                deadline=left,
+                deadline=left(),
                 request_id=request_id,
             )
 

@@ -76,9 +76,9 @@ class AsyncStream:
         moved = with_motion(options, odometry)
         data = frame_bytes(image)
         async with self._numbering.turn(deadline) as left:
-            numbered = await self._numbering.number(moved)
+            numbered = await self._numbering.number(moved, left())
             head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
-            return await self._answer(head, data, Clock(left, self._connection.retry))
+            return await self._answer(head, data, Clock(left(), self._connection.retry))
 
     async def _answer(self, head: str, data: bytes, clock: Clock) -> models.SessionAnswer:
         """The answer to a frame, which is sent again where that may help."""

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
+    from placerec_client._http import httpx
+
 Result = TypeVar("Result")
 
 END_SECONDS = 10.0
@@ -34,6 +36,11 @@ def within(seconds: float, work: Callable[[], Result]) -> Result:
         TimeoutError: there is none yet; the work goes on behind.
     """
     return Task(work).result(seconds)
+
+
+def interruptible(transport: httpx.HTTPTransport) -> httpx.HTTPTransport:
+    """A transport as it is: here ``within`` does not wait for it."""
+    return transport
 
 
 class Task(Generic[Result]):
@@ -69,7 +76,7 @@ def acquire(lock: threading.Lock, seconds: float | None) -> None:
     Raises:
         TimeoutError: it has not become free within so many seconds; None waits for any time.
     """
-    if not lock.acquire(timeout=-1 if seconds is None else max(seconds, 0.0)):
+    if not lock.acquire(timeout=-1 if seconds is None else min(max(seconds, 0.0), threading.TIMEOUT_MAX)):
         raise TimeoutError
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from placerec_client import models, parameters
@@ -27,8 +27,8 @@ class Numbering:
         self._lock = Lock()
 
     @contextmanager
-    def turn(self, deadline: float | None) -> Iterator[float | None]:
-        """Wait for the frames before; yield the seconds that are left until the deadline, None without one.
+    def turn(self, deadline: float | None) -> Iterator[Callable[[], float | None]]:
+        """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
 
         Raises:
             DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
@@ -39,16 +39,21 @@ class Numbering:
         except TimeoutError as error:
             raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
         try:
-            yield None if deadline is None else deadline - round(time.monotonic() - began, 3)
+            yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
         finally:
             self._lock.release()
 
-    def number(self, options: parameters.SendFrame) -> parameters.SendFrame:
-        """Return the options of a frame with its number: the caller's own, or the next one."""
+    def number(self, options: parameters.SendFrame, left: float | None) -> parameters.SendFrame:
+        """Return the options of a frame with its number: the caller's own, or the next one.
+
+        Raises:
+            DeadlineExceeded: the service did not tell its last number within the seconds that were left.
+        """
         given = options.get("frame")
         if given is None:
             if self._next is None:
-                last = (self._connection.ask(models.SessionReport, "GET", self._path)).last_frame
+                report = self._connection.ask(models.SessionReport, "GET", self._path, deadline=left)
+                last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next
         self._next = given + 1

@@ -77,9 +77,9 @@ class Stream:
         moved = with_motion(options, odometry)
         data = frame_bytes(image)
         with self._numbering.turn(deadline) as left:
-            numbered = self._numbering.number(moved)
+            numbered = self._numbering.number(moved, left())
             head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
-            return self._answer(head, data, Clock(left, self._connection.retry))
+            return self._answer(head, data, Clock(left(), self._connection.retry))
 
     def _answer(self, head: str, data: bytes, clock: Clock) -> models.SessionAnswer:
         """The answer to a frame, which is sent again where that may help."""
