@@ -171,7 +171,7 @@ class Write:
         else:
             self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
             self._let_go(stored, None)
-        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, ordinal)
+        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, max(ordinal, history.behind - 1))
 
     def set_counterpart(
         self, stored: PlaceEntry, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None

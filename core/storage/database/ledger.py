@@ -399,7 +399,8 @@ def set_history(connection: sqlite3.Connection, place_id: str, history: History)
     ordinal = stored.ordinal if history.ordinal is None else history.ordinal
     _set(connection, stored.number, ordinal=ordinal, **moments)
     connection.execute(
-        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?", (ordinal + 1, stored.sequence)
+        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?",
+        (max(ordinal + 1, history.behind), stored.sequence),
     )
     return expect(connection, place_id)
 

@@ -95,6 +95,8 @@ def _merge(world: World, operation: Operation) -> str:
     for place_id, place in source.places.items():
         if place_id not in target.places:
             target.adopt(place_id, place, ends.get(place.sequence, 0) + place.ordinal)
+            behind = ends.get(place.sequence, 0) + source.ends[place.sequence]
+            target.ends[place.sequence] = max(target.ends[place.sequence], behind)
     return "succeeded"
 
 
