@@ -119,14 +119,14 @@ class Write:
 
     def _looks(self, rows: list[int]) -> list[Look]:
         """What the frames in some rows show."""
-        columns = ("descriptor", self._form.descriptors), ("local", self._form.locals)
-        kept = [
-            (ledger.of_frames(self.connection, self.state.number, column, rows), unpacked)
-            for column, unpacked in columns
+        number = self.state.number
+        descriptors = ledger.of_frames(self.connection, number, "descriptor", rows)
+        local = ledger.of_frames(self.connection, number, "local", rows)
+        poses = {entry.row: entry.place.pose for entry in ledger.entries_by(self.connection, number, "row", rows)}
+        return [
+            Look(self._form.descriptors([descriptors[row]])[0], self._form.locals([local[row]])[0], poses[row])
+            for row in rows
         ]
-        entries = ledger.entries_by(self.connection, self.state.number, "row", rows)
-        poses = {entry.row: entry.place.pose for entry in entries}
-        return [Look(*(unpacked([found[row]])[0] for found, unpacked in kept), pose=poses[row]) for row in rows]
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""

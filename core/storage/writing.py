@@ -165,7 +165,7 @@ class Write:
         pending = zip(self._layout.descriptors_of(new), self._layout.locals_of(new), strict=True)
         shown = dict(zip(old.tolist(), kept, strict=True))
         shown |= dict(zip([row for row in rows if row >= before], pending, strict=True))
-        return [Look(*shown[row], poses[row]) for row in rows]
+        return [Look(shown[row][0], shown[row][1], poses[row]) for row in rows]
 
     def _with_fields(self, stored: StoredPlace, fields: PlaceFields, look: Look | None = None) -> StoredPlace:
         """Change the fields of a place.
