@@ -28,7 +28,10 @@ NO_SEQUENCE = -1
 """The code of the places that belong to no sequence."""
 
 SAME_VIEW = 3
-"""Consecutive frames of one view are the same place up to this many times the radius, where poses are coarse."""
+"""Frames at one position of a sequence, which show one view, are the same place up to this many times the radius.
+
+A frame is put there only if its pose is no farther from that of the first frame there.  It is more than 1 because the
+poses of one stop may be coarse."""
 
 NO_TIME = -(1 << 63)
 """The timestamp of a place without one."""
@@ -190,8 +193,9 @@ class Whereabouts:
     kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
     position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
     sequence: int32 [n], a code for the sequence's name; NO_SEQUENCE for places without one.
-    ordinal: int64 [n], order of enrolment within the sequence, in which consecutive frames that show the same view have
-        the same position (``core.maps.views``).
+    ordinal: int64 [n], the position in the sequence.  Positions count views, not frames: a new frame gets the position
+        of a frame shortly before it if both show the same view, else the next free position (``core.maps.views``).  So
+        positions need not grow from frame to frame, and some may be empty.  Without a sequence they say nothing.
     heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
     track, station: int32 [n] and int64 [n], the sequence and the ordinal at which another traverse shows the same, as
@@ -249,8 +253,7 @@ class Whereabouts:
 
         Two poses of one kind are compared by distance; other places must be of one sequence and few positions apart, or
         at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own.
-        Frames at one position of a sequence show one view and are the same place also if coarse poses are a little
-        farther apart.
+        Frames at one position of a sequence show one view.  They are the same place up to ``SAME_VIEW`` radii.
         """
         near = np.zeros(len(self), np.bool_)
         for sequence, ordinal in ((self.sequence, self.ordinal), (self.track, self.station)):
@@ -268,12 +271,13 @@ class Whereabouts:
         return near
 
     def others(self, row: int, neighborhood: Neighborhood, across: bool = True) -> NDArray[np.bool_]:
-        """Which of the places are other places than ``row``, of those at one station only the first; bool [n].
+        """Which of the places are other places than ``row``, each counted once; bool [n].
 
-        So a place that several aligned traverses show counts once, and one at which a robot stood.
+        Several frames may show one other place.  Only the first of them is named.
 
         Args:
-            across: whether frames of several traverses can be at one station; else frames of one view are.
+            across: frames at one station of a track show one place, also if they are of several traverses.  If false,
+                only frames at one position of one sequence do.
         """
         others = ~self.near(row, neighborhood)
         at = np.flatnonzero(others)
@@ -282,7 +286,7 @@ class Whereabouts:
         return others
 
     def repeats(self, order: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the places ``order``, int64 [n], show a view that an earlier one of them shows; bool [n]."""
+        """Which of the places ``order``, int64 [n], are at the position of an earlier one of them; bool [n]."""
         return _repeated(self.sequence[order], self.ordinal[order])
 
     def of_views(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:

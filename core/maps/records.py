@@ -173,12 +173,15 @@ class History:
 
     picture: what is kept of its frame.
     ordinal: its position in its sequence in the new map; None puts it at the end.
+    behind: frames that are enrolled into its sequence later are at this position or behind it; this keeps the positions
+        before it for frames that are copied later.
     """
 
     picture: Keep
     ordinal: int | None
     created_at: datetime
     updated_at: datetime
+    behind: int = 0
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,9 @@ it shows nearly the same as that one, and still about the same as the first fram
 moment, by somebody who passes: a frame that shows nearly the same as the first frame of one of the last few positions
 is there again.
 
+Poses decide before looks do: a frame whose pose is far from that of the first frame of a view does not show this view,
+however alike the two are.  So equal doors of a long corridor are several views.
+
 How alike two frames are is told by the cells of the second stage at the same spots of both: freed of what all cells of
 their frame have in common, the mean of their cosines.  Noise, compression and exposure change it hardly, a step of the
 robot does at once.  Encoders without a second stage have descriptors only, which noise changes more.
@@ -13,11 +16,14 @@ robot does at once.  Encoders without a second stage have descriptors only, whic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from core.places import SAME_VIEW, Pose
 
 SAME, ABOUT = 0.9, 0.8
 """Likenesses of cells from which two frames show nearly the same, and about the same.  Noise of 4 grey levels, JPEG and
@@ -36,10 +42,23 @@ MOST_HIDDEN = 8
 
 @dataclass(frozen=True)
 class Look:
-    """What one frame shows: its descriptor, float32 [D], and local descriptors, int8 [C, L]."""
+    """What one frame shows, and where: its descriptor, float32 [D], local descriptors, int8 [C, L], and pose."""
 
     descriptor: NDArray[np.float32]
     local: NDArray[np.int8]
+    pose: Pose | None = None
+
+
+def reach_of(radius: float) -> float:
+    """So many metres may a further look at a view be from the first one, in a map with a ``same_place_radius``."""
+    return SAME_VIEW * radius
+
+
+def are_apart(one: Pose | None, other: Pose | None, reach: float) -> bool:
+    """Whether two poses say that two frames do not show one view; poses of different kinds, or none, do not."""
+    if one is None or other is None or one.kind() != other.kind():
+        return False
+    return float(np.linalg.norm(one.position() - other.position())) > reach
 
 
 def shows_same(one: Look, other: Look, about: bool = False) -> bool:
@@ -79,21 +98,24 @@ class LatestViews:
         last: the position of the last frame, and what it shows; None: the sequence has no frames.
         first: what the first frame at each of the last positions shows.
         positions: so many positions may lie between two frames of one view.
+        reach: so many metres may lie between the poses of a frame and of the first frame of its view.
     """
 
-    def __init__(self, last: tuple[int, Look] | None, first: Mapping[int, Look], positions: int) -> None:
-        self._last, self._first, self._positions = last, dict(first), positions
+    def __init__(
+        self, last: tuple[int, Look] | None, first: Mapping[int, Look], positions: int, reach: float = math.inf
+    ) -> None:
+        self._last, self._first, self._positions, self._reach = last, dict(first), positions, reach
 
     def position_of(self, look: Look) -> int | None:
         """The position of a next frame if it shows a view that is there already, else None."""
         if self._last is None:
             return None
         before, shown = self._last
-        began = self._first.get(before)
-        if began is not None and shows_same(look, shown) and shows_same(look, began, about=True):
+        near = {at: first for at, first in self._first.items() if not are_apart(look.pose, first.pose, self._reach)}
+        if before in near and shows_same(look, shown) and shows_same(look, near[before], about=True):
             return before
-        for position in sorted(self._first, reverse=True):
-            if shows_same(look, self._first[position]):
+        for position in sorted(near, reverse=True):
+            if shows_same(look, near[position]):
                 return position
         return None
 
@@ -106,17 +128,41 @@ class LatestViews:
 
 
 def latest_views(
-    last: tuple[int, int] | None, first: Mapping[int, int], positions: int, looks: Callable[[list[int]], list[Look]]
+    last: tuple[int, int] | None,
+    first: Mapping[int, int],
+    positions: int,
+    reach: float,
+    looks: Callable[[list[int]], list[Look]],
 ) -> LatestViews:
     """The end of a sequence, whose frames are read by row.
 
     Args:
         last: position and row of the last frame; None: the sequence has no frames.
         first: the row of the first frame at each of the last positions.
-        positions: as of :class:`LatestViews`.
+        positions, reach: as of :class:`LatestViews`.
         looks: reads what the frames in some rows show.
     """
     if last is None:
-        return LatestViews(None, {}, positions)
+        return LatestViews(None, {}, positions, reach)
     shown = looks([last[1], *first.values()])
-    return LatestViews((last[0], shown[0]), dict(zip(first, shown[1:], strict=True)), positions)
+    return LatestViews((last[0], shown[0]), dict(zip(first, shown[1:], strict=True)), positions, reach)
+
+
+def leaves_view(pose: Pose | None, look: Look | None, first: Look, beside: Sequence[Look], reach: float) -> bool:
+    """Whether a frame that was changed does not belong to its position in its sequence any more.
+
+    It keeps its position, even if it shows something else now, so that a stop whose frames are enrolled again one after
+    another in other light stays one view.  It leaves if its pose is apart from that of the first frame there, or if a
+    frame before it has got another picture since, too, and shows something else.
+
+    Args:
+        pose: its pose now.
+        look: what it shows now; None: its picture stays.
+        first: the first frame there, which is before this one.
+        beside: the last frame before it there that has got another picture since this one had its last, and the frames
+            next before and after it there; empty if there is no such frame.
+        reach: as of :class:`LatestViews`.
+    """
+    if are_apart(pose, first.pose, reach):
+        return True
+    return look is not None and bool(beside) and not any(shows_same(look, other, about=True) for other in beside)

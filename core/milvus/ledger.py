@@ -424,19 +424,31 @@ def latest_in_sequence(
 
 
 def first_at(
-    connection: Connection[Any], map_number: int, code: int, ordinal: int, without: int | None = None
+    connection: Connection[Any], map_number: int, code: int, ordinal: int, before: int | None = None
 ) -> int | None:
     """The row of the first place at a position of a sequence; None if none is there.
 
     Args:
-        without: the number of a place that does not count.
+        before: only places with a smaller number count; None: all.
     """
     query = (
-        "SELECT row FROM places WHERE map = %s AND sequence = %s AND ordinal = %s AND number <> %s"
+        "SELECT row FROM places WHERE map = %s AND sequence = %s AND ordinal = %s AND number < %s"
         " ORDER BY number LIMIT 1"
     )
-    found = connection.execute(query, (map_number, code, ordinal, -1 if without is None else without)).fetchone()
+    found = connection.execute(query, (map_number, code, ordinal, 1 << 62 if before is None else before)).fetchone()
     return None if found is None else int(found[0])
+
+
+def beside(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> list[int]:
+    """Rows of places at the position of one that gets another picture: see :func:`core.maps.views.leaves_view`."""
+    there = "SELECT row FROM places WHERE map = %s AND sequence = %s AND ordinal = %s AND number"
+    at = (map_number, entry.sequence, entry.ordinal, entry.number)
+    found = [
+        connection.execute(f"{there} < %s AND row > %s ORDER BY number DESC LIMIT 1", (*at, entry.row)).fetchone(),
+        connection.execute(f"{there} < %s ORDER BY number DESC LIMIT 1", at).fetchone(),
+        connection.execute(f"{there} > %s ORDER BY number LIMIT 1", at).fetchone(),
+    ]
+    return [] if found[0] is None else list({int(row[0]) for row in found if row is not None})
 
 
 def next_in_sequence(
@@ -481,10 +493,10 @@ def handed_over(connection: Connection[Any], map_number: int) -> dict[int, str]:
 
 
 def oldest_of_last(connection: Connection[Any], map_number: int, code: int, frames: int) -> int | None:
-    """The smallest ordinal among the last ``frames`` places of a sequence; None if it has no places."""
+    """The smallest ordinal among the ``frames`` places of a sequence enrolled last; None: it has no places."""
     query = (
         "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE map = %s AND sequence = %s"
-        " ORDER BY ordinal DESC LIMIT %s) AS last"
+        " ORDER BY number DESC LIMIT %s) AS last"
     )
     ((ordinal,),) = connection.execute(query, (map_number, code, frames)).fetchall()
     return None if ordinal is None else int(ordinal)

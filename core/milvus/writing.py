@@ -15,7 +15,7 @@ from core.maps.enrolling import picture_of
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.maps.stored_fields import metadata_text, same_fields
-from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, shows_same
+from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
 from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
@@ -92,7 +92,7 @@ class Write:
             **dict(item.fields), id=item.id, regions=item.regions, picture=kept[0],
             created_at=self._now if stored is None else stored.place.created_at, updated_at=self._now,
         )  # fmt: skip
-        look = Look(item.descriptor, item.local)
+        look = Look(item.descriptor, item.local, item.fields.pose)
         if stored is None:
             at = self._position(place.sequence, look) if ordinal is None else ordinal
             code, at = ledger.next_in_sequence(self.connection, self.state.number, place.sequence, at)
@@ -114,17 +114,19 @@ class Write:
         if sequence not in self._latest:
             positions = min(self.state.record.same_place_frames, MOST_HIDDEN)
             last, first = ledger.latest_in_sequence(self.connection, self.state.number, sequence, positions)
-            self._latest[sequence] = latest_views(last, first, positions, self._looks)
+            self._latest[sequence] = latest_views(last, first, positions, self._reach, self._looks)
         return self._latest[sequence].position_of(look)
 
     def _looks(self, rows: list[int]) -> list[Look]:
         """What the frames in some rows show."""
-        columns = ("descriptor", self._form.descriptors), ("local", self._form.locals)
-        kept = [
-            (ledger.of_frames(self.connection, self.state.number, column, rows), unpacked)
-            for column, unpacked in columns
+        number = self.state.number
+        descriptors = ledger.of_frames(self.connection, number, "descriptor", rows)
+        local = ledger.of_frames(self.connection, number, "local", rows)
+        poses = {entry.row: entry.place.pose for entry in ledger.entries_by(self.connection, number, "row", rows)}
+        return [
+            Look(self._form.descriptors([descriptors[row]])[0], self._form.locals([local[row]])[0], poses[row])
+            for row in rows
         ]
-        return [Look(*(unpacked([found[row]])[0] for found, unpacked in kept)) for row in rows]
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
@@ -169,7 +171,7 @@ class Write:
         else:
             self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
             self._let_go(stored, None)
-        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, ordinal)
+        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, max(ordinal, history.behind - 1))
 
     def set_counterpart(
         self, stored: PlaceEntry, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
@@ -201,19 +203,30 @@ class Write:
         """A place with other fields, under a new key; its position in its sequence changes only with the sequence.
 
         Args:
-            look: what its new frame shows, which leaves the view of the others at its position if it shows another;
-                None: its frame stays.
+            look: what its new frame shows; None: its frame stays.
         """
-        number, code, ordinal = self.state.number, stored.sequence, stored.ordinal
-        if place.sequence != stored.place.sequence:
-            at = self._position(place.sequence, look or self._looks([stored.row])[0])
-            code, ordinal = ledger.next_in_sequence(self.connection, number, place.sequence, at)
-        elif look is not None and place.sequence is not None:
-            other = ledger.first_at(self.connection, number, code, ordinal, without=stored.number)
-            if other is not None and not shows_same(look, self._looks([other])[0], about=True):
-                code, ordinal = ledger.next_in_sequence(self.connection, number, place.sequence)
+        code, ordinal = stored.sequence, stored.ordinal
+        if place.sequence != stored.place.sequence or self._leaves(stored, place, look):
+            at = self._position(place.sequence, look or replace(self._looks([stored.row])[0], pose=place.pose))
+            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence, at)
         self._latest.clear()
         return replace(stored, key=self.new_key(), sequence=code, ordinal=ordinal, place=place)
+
+    def _leaves(self, stored: PlaceEntry, place: Place, look: Look | None) -> bool:
+        """Whether a place whose sequence stays does not belong to its position any more, because of a change."""
+        if place.sequence is None or (look is None and place.pose == stored.place.pose):
+            return False
+        number = self.state.number
+        first = ledger.first_at(self.connection, number, stored.sequence, stored.ordinal, before=stored.number)
+        if first is None:
+            return False
+        rows = [] if look is None else ledger.beside(self.connection, number, stored)
+        began, *others = self._looks([first, *rows])
+        return leaves_view(place.pose, look, began, others, self._reach)
+
+    @property
+    def _reach(self) -> float:
+        return reach_of(self.state.record.same_place_radius)
 
     def forget(self, stored: PlaceEntry) -> None:
         """Delete a place."""

@@ -45,8 +45,8 @@ class Attributes:
             return dict(connection.execute(query, (json.dumps(list(names)),)).fetchall())
 
     def oldest_of_last(self, sequence: int, frames: int) -> int | None:
-        """The smallest ordinal among the last ``frames`` places of a sequence; None if it has no places."""
-        query = "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE sequence = ? ORDER BY ordinal DESC LIMIT ?)"
+        """The smallest ordinal among the ``frames`` places of a sequence enrolled last; None if it has no places."""
+        query = "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE sequence = ? ORDER BY number DESC LIMIT ?)"
         with self._reading() as connection:
             (ordinal,) = connection.execute(query, (sequence, frames)).fetchone()
         return None if ordinal is None else int(ordinal)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+from dataclasses import replace
 from datetime import UTC, datetime
 from math import nan
 from pathlib import Path
@@ -15,7 +16,7 @@ from core.disk.files import Damage, primary_code
 from core.geometry.keypoints import Keypoints
 from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.maps.stored_fields import same_fields
-from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, shows_same
+from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, microseconds
 from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
@@ -124,7 +125,7 @@ class Write:
         record = self._records[self._appended]
         self._layout.pack(record, item.descriptor, item.local, row)
         checksum = int(record["checksum"])
-        keep, look = self.record.keep if keep is None else keep, Look(item.descriptor, item.local)
+        keep, look = self.record.keep if keep is None else keep, Look(item.descriptor, item.local, item.fields.pose)
         if stored is None:
             at = self._position(item.fields.sequence, look) if ordinal is None else ordinal
             now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now, at)
@@ -147,7 +148,7 @@ class Write:
         if sequence not in self._latest:
             positions = min(self.record.same_place_frames, MOST_HIDDEN)
             last, first = ledger.latest_in_sequence(self.connection, sequence, positions)
-            self._latest[sequence] = latest_views(last, first, positions, self._looks)
+            self._latest[sequence] = latest_views(last, first, positions, self._reach, self._looks)
         return self._latest[sequence].position_of(look)
 
     def _note_last(self, stored: StoredPlace, look: Look) -> None:
@@ -156,32 +157,45 @@ class Write:
 
     def _looks(self, rows: list[int]) -> list[Look]:
         """What the frames in some rows show, those of this write included."""
+        poses = {row: stored.place.pose for row, stored in ledger.stored_at(self.connection, rows).items()}
         before = self._snapshot.rows
         old = np.array([row for row in rows if row < before], np.int64)
         new = self._records[[row - before for row in rows if row >= before]]
-        kept = map(Look, self._snapshot.descriptors_at(old), self._snapshot.locals_at(old))
-        pending = map(Look, self._layout.descriptors_of(new), self._layout.locals_of(new))
+        kept = zip(self._snapshot.descriptors_at(old), self._snapshot.locals_at(old), strict=True)
+        pending = zip(self._layout.descriptors_of(new), self._layout.locals_of(new), strict=True)
         shown = dict(zip(old.tolist(), kept, strict=True))
         shown |= dict(zip([row for row in rows if row >= before], pending, strict=True))
-        return [shown[row] for row in rows]
+        return [Look(shown[row][0], shown[row][1], poses[row]) for row in rows]
 
     def _with_fields(self, stored: StoredPlace, fields: PlaceFields, look: Look | None = None) -> StoredPlace:
         """Change the fields of a place.
 
         Args:
-            look: what its new frame shows, which leaves the view of the others at its position if it shows another;
-                None: its frame stays.
+            look: what its new frame shows; None: its frame stays.
         """
         moves = fields.sequence != stored.place.sequence
-        at = self._position(fields.sequence, look or self._looks([stored.row])[0]) if moves else None
+        leaves = not moves and self._leaves(stored, fields, look)
+        at = None
+        if moves or leaves:
+            at = self._position(fields.sequence, look or replace(self._looks([stored.row])[0], pose=fields.pose))
         self._latest.clear()
         now_stored = ledger.set_fields(self.connection, stored, fields, self._now, at)
-        if look is not None and not moves and fields.sequence is not None:
-            other = ledger.first_at(self.connection, stored.sequence, stored.ordinal, without=stored.number)
-            if other is not None and not shows_same(look, self._looks([other])[0], about=True):
-                ledger.move_to_end(self.connection, stored)
-                now_stored = ledger.expect(self.connection, stored.place.id)
-        return now_stored
+        return ledger.move(self.connection, now_stored, at) if leaves else now_stored
+
+    def _leaves(self, stored: StoredPlace, fields: PlaceFields, look: Look | None) -> bool:
+        """Whether a place whose sequence stays does not belong to its position any more, because of a change."""
+        if fields.sequence is None or (look is None and fields.pose == stored.place.pose):
+            return False
+        first = ledger.first_at(self.connection, stored.sequence, stored.ordinal, before=stored.number)
+        if first is None:
+            return False
+        rows = [] if look is None else ledger.beside(self.connection, stored)
+        began, *others = self._looks([first, *rows])
+        return leaves_view(fields.pose, look, began, others, self._reach)
+
+    @property
+    def _reach(self) -> float:
+        return reach_of(self.record.same_place_radius)
 
     def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
         if self.record.verification:

@@ -200,11 +200,10 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
             return report
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
-        ends = {name or "": end for name, end in map_.transfer.sequence_ends().items()}
         after = max((place.number for place in outline), default=0)
         coming = {name: place.digest.hex() for place, name in plan.coming}
         cameras = _new_cameras(map_, other, plan)
-        context.remember(after=after, ends=ends, report=report, cameras=cameras, coming=coming)
+        context.remember(after=after, report=report, cameras=cameras, coming=coming)
     try:
         _copy_places(engine, context, map_, other)
     except JobInterrupted:
@@ -271,8 +270,14 @@ def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str
 
 
 def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
-    """Copy some places in one commit."""
-    names, ends = context.notes["report"]["renamed"], context.notes["ends"]
+    """Copy some places in one commit; nobody else may enrol meanwhile.
+
+    The first commit that copies a place of a sequence keeps as many positions at its end here as the sequence has
+    there, so that what is enrolled between the commits is at other positions.  If the job is interrupted before it has
+    noted that, the rest of the sequence gets positions of its own, too.
+    """
+    names, ranges = context.notes["report"]["renamed"], dict(context.notes.get("ranges", {}))
+    ends, theirs = map_.transfer.sequence_ends(), other.transfer.sequence_ends()
     pictures = {place.id: other.picture(place.id) for place, _ in due}
     # This is read after the pictures: if a place still has its row, its picture is that of the same frame.  Places
     # that were changed or forgotten since they were listed are left to the next round.
@@ -300,9 +305,16 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             image=picture if stored.picture == "image" else None,
             keypoints=of_frame,
         )
-        ordinal = ends.get(called["sequence"] or "", 0) + place.ordinal
-        items.append((item, History(stored.picture, ordinal, stored.created_at, stored.updated_at)))
+        end = ends.get(called["sequence"], 0)
+        first, behind = ranges.setdefault(called["sequence"] or "", [end, end + theirs.get(stored.sequence, 0)])
+        ordinal = first + place.ordinal
+        history = History(
+            stored.picture, ordinal if ordinal < behind else None, stored.created_at, stored.updated_at, behind
+        )
+        items.append((item, history))
     map_.transfer.adopt(items)
+    if ranges != context.notes.get("ranges"):
+        context.remember(ranges=ranges)
 
 
 def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: BaseException) -> None:

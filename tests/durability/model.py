@@ -7,6 +7,7 @@ known, such as the time of a write that was never acknowledged, is ``ANY`` and l
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -65,6 +66,7 @@ class PlaceModel:
 
     track: where another traverse shows what it shows, as it was stored; None: at its own ordinal.
     pose_of: the place whose pose it got.
+    picture: grows in the order in which the places of a map got their pictures.
     """
 
     shown: Shown
@@ -78,6 +80,7 @@ class PlaceModel:
     keypoints: Any = None
     track: Station | None = None
     pose_of: str | None = None
+    picture: int = 0
 
     @property
     def station(self) -> Station | None:
@@ -115,7 +118,7 @@ def merged(target: Any, patch: Any) -> Any:
 class MapModel:
     """One map.  ``ends`` are the ordinals that come next in each sequence.
 
-    Frames of one picture show one view, those of different pictures do not.
+    Frames of one picture show one view, unless poses put them apart; those of different pictures do not.
     """
 
     settings: dict[str, Any]
@@ -128,6 +131,7 @@ class MapModel:
     places: dict[str, PlaceModel] = field(default_factory=dict)
     ends: dict[str | None, int] = field(default_factory=lambda: {None: 0})
     cameras: dict[str, Any] = field(default_factory=dict)
+    pictures: int = 0
 
     # Writes; each returns the answer that it must get
 
@@ -154,20 +158,16 @@ class MapModel:
         if known is None:
             sequence = fields.get("sequence")
             self.ends.setdefault(sequence, 0)
-            at = self._next(sequence, shown.digest) if ordinal is None else ordinal
+            at = self._next(sequence, shown.digest, fields) if ordinal is None else ordinal
             made = PlaceModel(shown, dict(fields), kept, at)
             self.places[place_id] = made
         else:
             known.shown, known.kept = shown, kept
-            before = known.sequence
-            self._place_in(known, fields)
-            beside = [place for place in self._along(known.sequence) if place.ordinal == known.ordinal]
-            beside = [place for place in beside if place is not known]
-            if known.sequence == before and beside and beside[0].shown.digest != shown.digest:
-                known.ordinal = self._next(known.sequence)
+            self._place_in(known, fields, replaced=True)
             known.track = known.pose_of = None
             made = known
-        made.keypoints = keypoints
+        self.pictures += 1
+        made.picture, made.keypoints = self.pictures, keypoints
         made.descriptor, made.regions, made.updated = shown.descriptor.get(self.precision, ANY), shown.regions, ANY
         return "created" if known is None else "replaced"
 
@@ -248,29 +248,50 @@ class MapModel:
         """The places of a sequence in the order of their enrolment."""
         return [place for place in self.places.values() if sequence is not None and place.sequence == sequence]
 
-    def _next(self, sequence: str | None, digest: str | None = None) -> int:
-        """The ordinal of the next frame of a sequence; that of the frame's view if it is given and there already."""
-        along = self._along(sequence) if digest is not None else []
-        if along:
+    def _next(self, sequence: str | None, digest: str, fields: Fields) -> int:
+        """The ordinal of the next frame of a sequence; that of the frame's view if it is there already."""
+        if along := self._along(sequence):
             last, end = along[-1].ordinal, self.ends[sequence]
             hidden = min(self.settings["same_place_frames"], MOST_HIDDEN)
             at = {last, *range(end - 1 - hidden, end)}
-            first = {place.ordinal: place.shown.digest for place in reversed(along) if place.ordinal in at}
-            if (along[-1].shown.digest, first[last]) == (digest, digest):
+            first = {place.ordinal: place for place in reversed(along) if place.ordinal in at}
+            there = {at for at, place in first.items() if not self._apart(place.fields, fields)}
+            there = {at for at in there if first[at].shown.digest == digest}
+            if last in there and along[-1].shown.digest == digest:
                 return last
-            for ordinal in sorted(first, reverse=True):
-                if first[ordinal] == digest:
-                    return ordinal
+            if there:
+                return max(there)
         ordinal = self.ends.setdefault(sequence, 0)
         self.ends[sequence] = ordinal + 1
         return ordinal
 
-    def _place_in(self, place: PlaceModel, fields: Fields) -> None:
+    def _apart(self, one: Fields, other: Fields) -> bool:
+        """Whether poses say that two frames do not show one view."""
+        poses = [PlaceFields.model_validate(fields).pose for fields in (one, other)]
+        if poses[0] is None or poses[1] is None or poses[0].kind() != poses[1].kind():
+            return False
+        reach: float = 3 * self.settings["same_place_radius"]
+        return math.dist(poses[0].position(), poses[1].position()) > reach
+
+    def _leaves(self, place: PlaceModel, fields: Fields, replaced: bool) -> bool:
+        """Whether a place does not belong to its position any more, with other fields and maybe another picture."""
+        there = [other for other in self._along(place.sequence) if other.ordinal == place.ordinal]
+        own = next((number for number, other in enumerate(there) if other is place), 0)
+        if own == 0:
+            return False
+        posed = replaced or canonical(place.fields)["pose"] != canonical(fields)["pose"]
+        if posed and self._apart(there[0].fields, fields):
+            return True
+        later = [other for other in there[:own] if other.picture > place.picture]
+        beside = [later[-1], there[own - 1], *there[own + 1 : own + 2]] if replaced and later else []
+        return bool(beside) and all(other.shown.digest != place.shown.digest for other in beside)
+
+    def _place_in(self, place: PlaceModel, fields: Fields, replaced: bool = False) -> None:
         if canonical(place.fields)["pose"] != canonical(fields)["pose"]:
             place.pose_of = None
         before, sequence = place.sequence, fields.get("sequence")
-        if sequence != before:
-            place.ordinal = self._next(sequence, place.shown.digest)
+        if sequence != before or self._leaves(place, fields, replaced):
+            place.ordinal = self._next(sequence, place.shown.digest, fields)
         place.fields = dict(fields)
         if sequence != before:
             self._drop_if_empty(before)

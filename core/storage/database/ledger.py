@@ -233,20 +233,34 @@ def latest_in_sequence(
     return (int(last[0]), int(last[1])), first
 
 
-def first_at(connection: sqlite3.Connection, code: int, ordinal: int, without: int | None = None) -> int | None:
+def first_at(connection: sqlite3.Connection, code: int, ordinal: int, before: int | None = None) -> int | None:
     """The row of the first place at a position of a sequence; None if none is there.
 
     Args:
-        without: the number of a place that does not count.
+        before: only places with a smaller number count; None: all.
     """
-    query = "SELECT row FROM places WHERE sequence = ? AND ordinal = ? AND number <> ? ORDER BY number LIMIT 1"
-    found = connection.execute(query, (code, ordinal, -1 if without is None else without)).fetchone()
-    return None if found is None else int(found[0])
+    query = "SELECT min(number), row FROM places WHERE sequence = ? AND ordinal = ? AND number < coalesce(?, ?)"
+    _, row = connection.execute(query, (code, ordinal, before, 1 << 62)).fetchone()
+    return None if row is None else int(row)
 
 
-def move_to_end(connection: sqlite3.Connection, stored: StoredPlace) -> None:
-    """Put a place at the end of its sequence."""
-    _set(connection, stored.number, ordinal=_next_ordinal(connection, stored.sequence))
+def beside(connection: sqlite3.Connection, stored: StoredPlace) -> list[int]:
+    """Rows of places at the position of one that gets another picture: see :func:`core.maps.views.leaves_view`."""
+    there = "FROM places WHERE sequence = ? AND ordinal = ? AND number"
+    at = (stored.sequence, stored.ordinal, stored.number)
+    found = [
+        connection.execute(f"SELECT max(number), row {there} < ? AND row > ?", (*at, stored.row)).fetchone()[1],
+        connection.execute(f"SELECT max(number), row {there} < ?", at).fetchone()[1],
+        connection.execute(f"SELECT min(number), row {there} > ?", at).fetchone()[1],
+    ]
+    return [] if found[0] is None else list({int(row) for row in found if row is not None})
+
+
+def move(connection: sqlite3.Connection, stored: StoredPlace, ordinal: int | None) -> StoredPlace:
+    """Put a place at another position of its sequence, or (None) at its end."""
+    at = _next_ordinal(connection, stored.sequence) if ordinal is None else ordinal
+    _set(connection, stored.number, ordinal=at)
+    return expect(connection, stored.place.id)
 
 
 def _next_ordinal(connection: sqlite3.Connection, code: int) -> int:
@@ -385,7 +399,8 @@ def set_history(connection: sqlite3.Connection, place_id: str, history: History)
     ordinal = stored.ordinal if history.ordinal is None else history.ordinal
     _set(connection, stored.number, ordinal=ordinal, **moments)
     connection.execute(
-        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?", (ordinal + 1, stored.sequence)
+        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?",
+        (max(ordinal + 1, history.behind), stored.sequence),
     )
     return expect(connection, place_id)
 

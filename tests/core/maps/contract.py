@@ -393,9 +393,10 @@ class StoreContract(RuleBasedStateMachine):
         filters, recent = selection.filters, selection.recent
         lately: list[str] = []
         if recent is not None:
-            along = [(place.ordinal, name) for name, place in self.model.places.items()
-                     if place.sequence == recent.sequence]  # fmt: skip
-            lately = [name for _, name in sorted(along)[-recent.frames :]]
+            along = {name: place.ordinal for name, place in self.model.places.items()
+                     if place.sequence == recent.sequence}  # fmt: skip
+            oldest = min(list(along.values())[-recent.frames :], default=0)
+            lately = [name for name, ordinal in along.items() if ordinal >= oldest]
         return [
             name
             for name, place in self.model.places.items()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from core.maps.views import ABOUT, SAME, LatestViews, Look, latest_views, likeness, shows_same
+from core.places import Pose
 
 CELLS, VALUES = 40, 24
 NO_CELLS = np.empty((0, 0), np.int8)
@@ -94,8 +97,18 @@ def test_frames_that_are_only_about_the_same_are_apart() -> None:
 
 def test_the_end_of_a_sequence_is_read_by_row() -> None:
     kept = {3: look(cells(1)), 8: look(cells(2)), 9: look(cells(2), 4, 1)}
-    views = latest_views((6, 9), {5: 3, 6: 8}, 3, lambda rows: [kept[row] for row in rows])
+    views = latest_views((6, 9), {5: 3, 6: 8}, 3, 15.0, lambda rows: [kept[row] for row in rows])
     assert views.position_of(look(cells(2), 4, 2)) == 6
     assert views.position_of(look(cells(1), 4, 2)) == 5
     assert views.position_of(look(cells(3))) is None
-    assert latest_views(None, {}, 3, lambda rows: []).position_of(look(cells(1))) is None
+    assert latest_views(None, {}, 3, 15.0, lambda rows: []).position_of(look(cells(1))) is None
+
+
+def test_poses_decide_before_looks_do() -> None:
+    def at(x: float | None) -> Look:
+        return dataclasses.replace(look(cells(1)), pose=None if x is None else Pose(x=x, y=0.0))
+
+    views = LatestViews((4, at(0.0)), {3: at(100.0), 4: at(0.0)}, 3, 15.0)
+    assert [views.position_of(at(x)) for x in (15.0, 16.0, 90.0, None)] == [4, None, 3, 4]
+    geographic = dataclasses.replace(at(None), pose=Pose(latitude=50.0, longitude=7.0))
+    assert views.position_of(geographic) == 4, "poses of two kinds tell nothing"

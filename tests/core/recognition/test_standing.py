@@ -135,6 +135,17 @@ def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Enco
     assert set(answer.candidates.whereabouts.ordinal.tolist()) == set(range(PLACES))
 
 
+@pytest.mark.parametrize("apart", [20.0, 400.0])
+def test_equal_doors_one_after_the_other_are_rivals(atlas: Atlas, encoder: Encoder, apart: float) -> None:
+    """Where the second stage does not examine all frames, either."""
+    count = encoder.candidates + 60
+    frames = [(f"{n}.0", encoder.encode(scene(n))) for n in range(count)]
+    frames += [(f"{count}.{n}", encoder.encode(noisy(scene(5000), n))) for n in range(2)]
+    poses = [20.0 * n for n in range(count)] + [20.0 * count, 20.0 * count + apart]
+    map_ = enrolled(atlas, encoder, frames, poses)
+    assert ask(map_, encoder, encoder.encode(noisy(scene(5000), 7))).judgement.verdict == "ambiguous"
+
+
 def test_a_stop_is_one_place_of_a_session(
     atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
 ) -> None:

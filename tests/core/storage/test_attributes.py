@@ -17,6 +17,7 @@ from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
 from core.storage.database.connections import FILE
 from core.storage.database.schema import LONGEST_INDEXED
+from tests.core.storage import frames
 
 DIMENSION = 4
 
@@ -105,6 +106,14 @@ def test_kinds_of_values(atlas: Atlas) -> None:
     for value, places in expected:
         assert by_index(lab, {"v": value}) == places, value
     assert by_index(lab, {"w": None}) == []
+
+
+def test_the_frame_enrolled_last_is_among_the_last_wherever_its_view_is(atlas: Atlas) -> None:
+    lab = atlas.create("lab", frames.ENCODER, frames.DIMENSION, local_shape=frames.LOCAL_SHAPE)
+    lab.enrol([frames.frame(f"p{n}", picture, sequence="walk") for n, picture in enumerate("abcdefeed")])
+    (code,) = lab.attributes.sequence_codes(["walk"]).values()
+    assert [place.ordinal for place in lab.transfer.outline()] == [0, 1, 2, 3, 4, 5, 4, 4, 3]
+    assert [lab.attributes.oldest_of_last(code, last) for last in (1, 2, 6, 7)] == [3, 3, 3, 2]
 
 
 def test_a_forgotten_sequence_is_not_found(atlas: Atlas) -> None:

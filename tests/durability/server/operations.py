@@ -95,6 +95,8 @@ def _merge(world: World, operation: Operation) -> str:
     for place_id, place in source.places.items():
         if place_id not in target.places:
             target.adopt(place_id, place, ends.get(place.sequence, 0) + place.ordinal)
+            behind = ends.get(place.sequence, 0) + source.ends[place.sequence]
+            target.ends[place.sequence] = max(target.ends[place.sequence], behind)
     return "succeeded"
 
 
@@ -104,7 +106,9 @@ def _delete(world: World, operation: Operation) -> None:
 
 
 def _import(world: World, operation: Operation) -> None:
-    world[operation["to"]] = copy.deepcopy(_map(world, operation))
+    world[operation["to"]] = made = copy.deepcopy(_map(world, operation))
+    for number, place in enumerate(made.places.values()):
+        place.picture = number  # an archive does not say which places got another picture
 
 
 _APPLIED: dict[str, Callable[[World, Operation], Any]] = {

@@ -195,14 +195,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], None]) -> None:
-    """Let something happen in the middle of the merge, once."""
+def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], None], commits: int = 2) -> None:
+    """Let something happen in the middle of the merge, or after another number of commits, once."""
     copy, calls = merging._copy, 0
 
     def counted(context: Any, *arguments: Any) -> None:
         nonlocal calls
         calls += 1
-        if calls == 3:
+        if calls == commits + 1:
             happens(context)
         copy(context, *arguments)
 
@@ -346,6 +346,28 @@ def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then
         assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
         assert runtime.engine.maps.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
+
+
+@pytest.mark.parametrize("commits", [0, 2])
+@pytest.mark.parametrize("theirs", ["monday", "tuesday"])
+def test_what_is_enrolled_into_a_sequence_meanwhile_is_at_other_positions(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, commits: int, theirs: str
+) -> None:
+    with runtime_at(folder) as runtime:
+        lab, hall = runtime.engine.maps.get("lab"), runtime.engine.maps.get("hall")
+        for number in range(COUNT):
+            hall.patch(f"h{1001 + number}", {"sequence": theirs})
+        own = enrolments(9000, 90, "robot", theirs)
+        after_two_commits(monkeypatch, lambda _: lab.enrol(own), commits)
+        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED | {"on_conflict": "skip"}))
+        assert done.state == "succeeded"
+        outline = [place for place in lab.transfer.outline() if place.sequence == theirs]
+        copied = [place.ordinal for place in outline if place.id.startswith("h")]
+        meanwhile = [place.ordinal for place in outline if place.id.startswith("robot")]
+        assert len(meanwhile) == 90 and not set(copied) & set(meanwhile)
+        there = [place.ordinal for place in hall.transfer.outline() if place.id.startswith("h")]
+        assert len({here - other for here, other in zip(copied, there, strict=True)}) == 1, "the traverse is whole"
+        assert max(copied) < min(meanwhile) if commits else max(meanwhile) < min(copied)
 
 
 @pytest.mark.parametrize("rule", ["rename", "skip"])
