@@ -106,7 +106,7 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "endless metadata": (raw(PLACES, lambda d: d.replace(b'"i":0', b'"i":1e999')), "JSON"),
     "long metadata": (place(metadata={"a": "x" * (1 << 20)}), "the metadata has more than"),
     "metadata that is a list": (place(metadata=[1]), "metadata"),
-    "half a character": (raw(SEQUENCES, lambda d: d.replace(b"monday", b"\\ud800")), "unicode"),
+    "half a character": (raw(SEQUENCES, lambda d: d.replace(b"monday", b"\\ud800")), "cannot name a sequence"),
     "half a character in metadata": (place(metadata={"a": "\ud800"}), "half a character"),
     "no digest": (place(digest="ff"), "digest"),
     "a picture of another digest": (line(PLACES, 5, picture=KEPT), "does not match its SHA-256"),
