@@ -195,7 +195,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], None], commits: int = 2) -> None:
+def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], object], commits: int = 2) -> None:
     """Let something happen in the middle of the merge, or after another number of commits, once."""
     copy, calls = merging._copy, 0
 
