@@ -18,7 +18,7 @@ from core.silence import SWITCHES
 from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
-from tests.watch import Watch, missing
+from tests.watch import CACHES, PROXIES, Watch, missing
 
 
 @pytest.fixture
@@ -29,12 +29,16 @@ def watch(tmp_path: Path) -> Watch:
 
 
 def wrapped(watch: Watch, folder: Path) -> list[str]:
-    """The words before a command that is watched, with a home and a temporary folder in ``folder``."""
+    """The words before a command that is watched, with a home and a temporary folder in ``folder``.
+
+    The command is told of no cache elsewhere, and of no proxy, whatever the machine has.
+    """
     places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "home" / "cache", "TMPDIR": folder / "temporary"}
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     wrong = dict.fromkeys(SWITCHES, "0") | {"RAY_USAGE_STATS_ENABLED": "1", "FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
-    return ["/usr/bin/env", *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
+    unset = [word for name in (*CACHES, *PROXIES) for word in ("-u", name)]
+    return ["/usr/bin/env", *unset, *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
 
 
 def written(watch: Watch, folder: Path, *own: Path) -> set[str]:
