@@ -32,8 +32,18 @@ import sys
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
+
+CACHES = ("NUMBA_CACHE_DIR", "PYTHONPYCACHEPREFIX")
+"""Variables that move what is compiled once for this checkout to where it would be taken for something else."""
+
+PROXIES = tuple(
+    name for kind in ("http", "https", "ftp", "all", "no") for name in (f"{kind}_proxy", f"{kind}_proxy".upper())
+)
+"""Variables by which a program speaks to a proxy instead of to whom it means."""
 
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _NUMBERS = {
@@ -95,6 +105,7 @@ class Watch:
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.bind(self._path)
         self._socket.listen()
+        self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Watch:
@@ -104,9 +115,13 @@ class Watch:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
+        with self._socket:
+            if kind is not None:
+                return
+            self._socket.shutdown(socket.SHUT_RDWR)  # if no program has come until now, none will
             self._thread.join()
-        self._socket.close()
+        if self._failure is not None:
+            raise RuntimeError("the watch has ended before the programs that it watched") from self._failure
 
     def told(self) -> set[str]:
         """Addresses that were connected or sent to, and names that were looked up, but for local sockets."""
@@ -130,9 +145,21 @@ class Watch:
         }
 
     def _run(self) -> None:
-        connection, _ = self._socket.accept()
-        with connection:
-            _, (listener,), _, _ = socket.recv_fds(connection, 1, 1)
+        try:
+            connection, _ = self._socket.accept()
+            with connection:
+                _, listeners, _, _ = socket.recv_fds(connection, 1, 1)
+            if not listeners:
+                raise OSError(errno.ECHILD, "the program is under no watch")
+            (listener,) = listeners
+            try:
+                self._listen(listener)
+            finally:
+                os.close(listener)  # no call is held any more: those that would be fail
+        except BaseException as problem:  # it is told where the watch is waited for
+            self._failure = problem
+
+    def _listen(self, listener: int) -> None:
         poll = select.poll()
         poll.register(listener, select.POLLIN)
         while poll.poll()[0][1] & select.POLLIN:  # else the last process has ended
@@ -144,15 +171,12 @@ class Watch:
                     continue
                 raise
             number, process, _, call, _, _, *arguments = struct.unpack("<QIIiIQ6Q", notice)
+            self.seen += _look(_NAMES[call], process, arguments)
             try:
-                self.seen += _look(_NAMES[call], process, arguments)
-            finally:
-                try:
-                    fcntl.ioctl(listener, _SEND, struct.pack("<QqiI", number, 0, 0, _CONTINUE))
-                except OSError as problem:
-                    if problem.errno != errno.ENOENT:
-                        raise
-        os.close(listener)
+                fcntl.ioctl(listener, _SEND, struct.pack("<QqiI", number, 0, 0, _CONTINUE))
+            except OSError as problem:
+                if problem.errno != errno.ENOENT:
+                    raise
 
 
 _MACHINE = platform.machine()
@@ -160,12 +184,23 @@ _NAMES = {number: name for name, number in _NUMBERS.get(_MACHINE, {}).items()}
 _SENDS = ("connect", "sendto", "sendmsg", "sendmmsg")
 
 
+@cache
 def missing() -> str:
-    """Why nothing can be watched here; empty if it can."""
+    """Why nothing can be watched here, after one call was held, read and let go; empty if it can."""
     if sys.platform != "linux" or _MACHINE not in _NUMBERS:
         return f"{sys.platform} on {_MACHINE} is not watched"
-    done = subprocess.run([sys.executable, "-I", __file__], capture_output=True, text=True)
-    return "" if done.returncode == 0 else f"the kernel lets nobody watch: {done.stderr.strip()}"
+    with TemporaryDirectory() as folder:
+        made = f"{folder}/made"
+        watch = Watch(Path(folder))
+        words = [*watch.wrapper, sys.executable, "-I", "-c", "import os, sys; os.mkdir(sys.argv[1])", made]
+        try:
+            with watch:
+                done = subprocess.run(words, capture_output=True, text=True)
+        except RuntimeError as problem:
+            return f"the kernel lets nobody watch: {problem.__cause__}; {done.stderr.strip()}"
+        if done.returncode:
+            return f"the kernel stops what is watched: {done.stderr.strip()}"
+        return "" if made in watch.written() else "the memory of what is watched cannot be read"
 
 
 def _look(call: str, process: int, arguments: list[int]) -> list[Seen]:
@@ -272,13 +307,7 @@ def _install() -> int:
 
 
 def main() -> None:
-    """Become the command behind the watch's socket, watched; without either, see whether that is possible."""
-    if len(sys.argv) == 1:
-        try:
-            _install()
-        except OSError as problem:
-            sys.exit(problem.strerror)
-        return
+    """Become the command behind the watch's socket, watched."""
     watch = socket.socket(socket.AF_UNIX)
     watch.connect(sys.argv[1])
     installed: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -289,7 +318,10 @@ def main() -> None:
         sent.set()
 
     threading.Thread(target=hand_over, daemon=True).start()
-    installed.put(_install())
+    try:
+        installed.put(_install())
+    except OSError as problem:
+        sys.exit(problem.strerror)
     sent.wait()
     os.execvp(sys.argv[2], sys.argv[2:])
 

@@ -99,9 +99,14 @@ def kinds(client: httpx.Client) -> dict[str, Callable[[], Request]]:
 
     def job(path: str, body: dict[str, object]) -> Request:
         def request(_: int) -> None:
-            answer = client.post(path, json=body).raise_for_status().json()
-            while "status" in answer and answer["status"] in ("queued", "running"):
-                answer = client.get(f"/v1/jobs/{answer['id']}").raise_for_status().json()
+            answer = client.post(path, json=body).raise_for_status()
+            if answer.status_code != httpx.codes.ACCEPTED:  # a small calibration is answered at once
+                return
+            found = answer.json()
+            while found["state"] in ("queued", "running"):
+                found = client.get(f"/v1/jobs/{found['id']}", params={"wait": 10}).raise_for_status().json()
+            if found["state"] != "succeeded":
+                raise RuntimeError(f"the job {found['kind']} is {found['state']}: {found}")
 
         return request
 

@@ -5,7 +5,7 @@ Without any choice of them, the frames in which nothing changes at all are told 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -19,7 +19,14 @@ Describe = Callable[[Frame], NDArray[np.float32] | None]
 
 
 STANDING = 1.0
-"""Metres: a robot whose poses are farther apart has moved, whatever it sees."""
+"""Metres: a robot whose poses are farther apart, and by more than their noise, has moved, whatever it sees."""
+
+NOISE = 8.0
+"""Poses of one place are hardly ever farther apart than so many times their noise.  Of a stop of 300 frames, 1 frame is
+kept, and 3 at most where poses are interpolated; with 6 these were 3 and 6."""
+
+LEAST_POSES = 8
+"""With fewer poses, nothing is said of their noise."""
 
 Look = TypeVar("Look")
 
@@ -84,25 +91,48 @@ def keyframes(
 
 
 def moving(
-    frames: Iterable[Frame], look: Callable[[Frame], Look | None], same: Callable[[Look, Look], bool]
+    frames: Sequence[Frame], look: Callable[[Frame], Look | None], same: Callable[[Look, Look], bool]
 ) -> Iterator[Frame]:
     """The frames without those that show the same as the last frame before them that is not left out.
+
+    A frame that shows the same stays where its pose says that the robot has moved, as in a tunnel: by more than
+    ``STANDING``, and by more than the noise of the recording's poses explains.
 
     Args:
         look: gives what a frame shows; None: it cannot be read, and the frame stays.
         same: whether two frames show the same.
     """
     last: tuple[Frame, Look] | None = None
+    apart = max(STANDING, NOISE * pose_noise(frames))
     for frame in frames:
         shown = look(frame)
-        if last is not None and shown is not None and same(shown, last[1]) and not _moved(frame, last[0]):
+        if (
+            last is not None
+            and shown is not None
+            and same(shown, last[1])
+            and (_metres(frame, last[0]) or 0.0) <= apart
+        ):
             continue
         last = None if shown is None else (frame, shown)
         yield frame
 
 
-def _moved(frame: Frame, before: Frame) -> bool:
-    return (_metres(frame, before) or 0.0) > STANDING
+def pose_noise(frames: Sequence[Frame]) -> float:
+    """The standard deviation of each coordinate of the frames' poses, metres.
+
+    It is told by how much the way of a second differs from that of the second before, which is little while a robot
+    stands or drives: the median of such differences, whose coordinates have six times the variance.  A second, for
+    poses between those of a receiver are interpolated.  0 if there are few poses.
+    """
+    poses = [frame.pose for frame in frames if frame.pose is not None]
+    if len(poses) < LEAST_POSES or len({pose.kind() for pose in poses}) > 1:
+        return 0.0
+    times = [frame.nanoseconds for frame in frames if frame.pose is not None and frame.nanoseconds is not None]
+    step = float(np.median(np.diff(times))) if len(times) > 1 else float(NANOSECONDS)
+    second = int(np.clip(round(NANOSECONDS / max(step, 1.0)), 1, len(poses) // 3))
+    positions = np.array([pose.position() for pose in poses])
+    differences = positions[2 * second :] - 2 * positions[second:-second] + positions[: -2 * second]
+    return float(np.median(np.linalg.norm(differences, axis=1)) / (np.sqrt(6) * np.sqrt(2 * np.log(2))))
 
 
 def _judgeable(frame: Frame, descriptor: NDArray[np.float32] | None, spacing: Spacing) -> bool:

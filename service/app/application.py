@@ -184,7 +184,7 @@ class WholeSegments:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        has_slash = scope["type"] != "lifespan" and b"%2f" in scope.get("raw_path", b"").lower()
+        has_slash = b"%2f" in (scope.get("raw_path") or b"").lower()  # which a server may leave out, or None
         await (_not_found if has_slash else self.app)(scope, receive, send)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
@@ -33,6 +34,9 @@ from service.commands.recordings import (
     TrajectoryTimes,
     without_standing,
 )
+
+if TYPE_CHECKING:
+    from core.frames.masks import Mask
 
 
 @dataclass
@@ -128,9 +132,9 @@ def enroll(
     with options.open(recording, id_prefix) as opened:
         name = _checked_sequence(opened.name if sequence is None else sequence)
 
-        def choose(used: str | None) -> list[Frame]:
-            chosen = options.choose(opened, used)
-            chosen = chosen if keep_standing else without_standing(opened, chosen)
+        def choose(used: str | None, mask: Mask | None) -> list[Frame]:
+            chosen = options.choose(opened, used, mask)
+            chosen = chosen if keep_standing else without_standing(opened, chosen, mask)
             return [Frame(taken, name, camera) for taken in chosen]
 
         report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
@@ -176,19 +180,22 @@ def _show_aligned(job: dict[str, Any]) -> None:
 async def _enroll(
     target: Target,
     map_id: str,
-    choose: Callable[[str | None], list[Frame]],
+    choose: Callable[[str | None, Mask | None], list[Frame]],
     camera: str | None,
     create: bool,
     wanted: dict[str, str | None],
 ) -> tuple[Report, int]:
-    """Enrol the frames that ``choose`` gives for the map's encoder; what became of them, and how many they are."""
+    """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
+
+    Returns:
+        What became of them, and how many they are.
+    """
     report = Report()
     async with open_service(target) as service:
         given = {key: value for key, value in wanted.items() if value is not None}
         used = await _ready_map(service, map_id, create, given)
-        if camera is not None:
-            await service.get(path_of("maps", map_id, "cameras", camera))  # otherwise each frame would be refused
-        frames = await asyncio.to_thread(choose, used)
+        mask = None if camera is None else await _mask(service, map_id, camera)
+        frames = await asyncio.to_thread(choose, used, mask)
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
@@ -219,6 +226,14 @@ async def _ready_map(service: Service, map_id: str, create: bool, settings: dict
         found = (await service.request("POST", path_of("maps"), json={"id": map_id, **settings})).json()
     encoder = found.get("encoder")
     return None if encoder is None else str(encoder)
+
+
+async def _mask(service: Service, map_id: str, camera: str) -> Mask | None:
+    """What to ignore in a camera's frames; a camera that the map does not have is refused, as each frame would be."""
+    from core.frames.masks import Mask  # here because it takes a moment
+
+    found = (await service.get(path_of("maps", map_id, "cameras", camera)))["mask"]
+    return None if found is None else Mask.model_validate_json(json.dumps(found))
 
 
 async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> frozenset[str]:

@@ -13,6 +13,7 @@ import typer
 from service.commands.console import Failure, messages, progress, remark
 
 if TYPE_CHECKING:
+    from core.frames.masks import Mask
     from core.recordings import Frame, Recording
     from core.recordings.keyframes import Describe
 
@@ -118,11 +119,12 @@ class RecordingOptions:
         measures = (self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
         return any(measure is not None for measure in measures)
 
-    def choose(self, recording: Recording, encoder: str | None) -> list[Frame]:
+    def choose(self, recording: Recording, encoder: str | None, mask: Mask | None = None) -> list[Frame]:
         """The frames that are taken: the keyframes that the options ask for, or all.
 
         Args:
             encoder: name or identity of that whose descriptors tell how much a frame has changed; None for the default.
+            mask: what to ignore in the frames.
 
         Raises:
             Failure: no frame can be judged by the options.
@@ -134,7 +136,7 @@ class RecordingOptions:
 
         spacing = Spacing(self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
         left = Left()
-        describe = None if self.every_change is None else describer(encoder)
+        describe = None if self.every_change is None else describer(encoder, mask)
         with progress() as bar:
             task = bar.add_task("Choosing keyframes", total=len(recording.frames))
             chosen = list(keyframes(bar.track(recording.frames, task_id=task), spacing, describe, left))
@@ -150,10 +152,13 @@ class RecordingOptions:
         return chosen
 
 
-def without_standing(recording: Recording, frames: list[Frame]) -> list[Frame]:
+def without_standing(recording: Recording, frames: list[Frame], mask: Mask | None = None) -> list[Frame]:
     """The frames of a bag or a video without those in which nothing has changed; says how many these are.
 
     The frames of a folder all stay, for somebody chose them.
+
+    Args:
+        mask: what to ignore in the frames.
     """
     if not recording.continuous:
         return frames
@@ -162,15 +167,17 @@ def without_standing(recording: Recording, frames: list[Frame]) -> list[Frame]:
     from core.frames.images import decode
     from core.recordings.keyframes import moving
 
-    def look(frame: Frame) -> View | None:
-        try:
-            return view_of(decode(frame.load()))
-        except (InvalidImage, InvalidRecording, OSError):
-            return None  # what is wrong with it is said where it is sent
-
     with progress() as bar:
         task = bar.add_task("Looking for stops", total=len(frames))
-        kept = list(moving(bar.track(frames, task_id=task), look, lambda one, other: one.change(other) < STILL))
+
+        def look(frame: Frame) -> View | None:
+            bar.advance(task)
+            try:
+                return view_of(decode(frame.load()), mask)
+            except (InvalidImage, InvalidRecording, OSError):
+                return None  # what is wrong with it is said where it is sent
+
+        kept = list(moving(frames, look, lambda one, other: one.change(other) < STILL))
     if left_out := len(frames) - len(kept):
         remark(
             f"{left_out} of {len(frames)} frames show the same as the frame before them, as where the robot stood, and "
@@ -179,7 +186,7 @@ def without_standing(recording: Recording, frames: list[Frame]) -> list[Frame]:
     return kept
 
 
-def describer(encoder: str | None) -> Describe:
+def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
     """What describes frames by an encoder that is installed here; frames that cannot be used have no descriptor."""
     import numpy as np
     from numpy.typing import NDArray
@@ -192,7 +199,7 @@ def describer(encoder: str | None) -> Describe:
 
     def describe(frame: Frame) -> NDArray[np.float32] | None:
         try:
-            descriptor = used.encode(decode(frame.load())).descriptor
+            descriptor = used.encode(decode(frame.load()), mask).descriptor
         except (InvalidImage, InvalidRecording, OSError):
             return None
         length = float(np.linalg.norm(descriptor))

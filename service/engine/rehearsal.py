@@ -44,15 +44,16 @@ log = logging.getLogger("placerec.rehearsal")
 def rehearse(encoder: Encoder) -> None:
     """Enrol, recognize, follow a run and align two traverses, as requests do.
 
-    Where the temporary folder cannot be written, which requests do without, the log says so and no more is done.
-
-    Raises:
-        InvalidModel: the network of keypoints cannot be loaded.
+    Requests do without: if anything fails, such as a temporary folder that cannot be written, the log says so and no
+    more is done.
     """
+    said = "the first request of each kind takes longer, for nothing could be rehearsed"
     try:
         _rehearse(encoder)
     except (StorageFull, StorageFailure, OSError) as error:
-        log.warning("the first request of each kind takes longer, for nothing could be rehearsed: %s", error)
+        log.warning("%s: %s", said, error)
+    except Exception:
+        log.exception(said)
 
 
 def _rehearse(encoder: Encoder) -> None:
@@ -110,10 +111,10 @@ def _file(frame: Pixels) -> bytes:
 
 
 def main() -> None:
-    """Check the packaged default encoder on this machine, and rehearse with it."""
+    """Check the packaged default encoder on this machine, and rehearse with it; here a failure ends the build."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     encoder.check_golden()
-    rehearse(encoder)
+    _rehearse(encoder)
 
 
 if __name__ == "__main__":

@@ -18,16 +18,13 @@ from core.silence import SWITCHES
 from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
-from tests.watch import Watch, missing
+from tests.watch import CACHES, PROXIES, Watch, missing
 
 MACHINES_THAT_BUILD = (
     *("CI", "TF_BUILD", "GITHUB_ACTIONS", "GITLAB_CI", "CIRCLECI", "TRAVIS", "JENKINS_URL", "CODEBUILD_BUILD_ID"),
     *("BUILDKITE", "TEAMCITY_VERSION", "APPVEYOR", "BITBUCKET_BUILD_NUMBER"),
 )
 """Variables by which ONNX Runtime knows a machine that builds and tests, where it reports nothing by itself."""
-
-CACHES = ("NUMBA_CACHE_DIR", "PYTHONPYCACHEPREFIX")
-"""Variables that move what is compiled once for this checkout to where it would be taken for something else."""
 
 
 @pytest.fixture
@@ -40,13 +37,14 @@ def watch(tmp_path: Path) -> Watch:
 def wrapped(watch: Watch, folder: Path) -> list[str]:
     """The words before a command that is watched, with a home and a temporary folder in ``folder``.
 
-    The command is not told that a machine tests it, since what is silent there would be so for another reason.
+    The command is told of no cache elsewhere, and of no proxy, whatever the machine has; nor that a machine tests it,
+    since what is silent there would be so for another reason.
     """
     places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "home" / "cache", "TMPDIR": folder / "temporary"}
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     wrong = dict.fromkeys(SWITCHES, "0") | {"RAY_USAGE_STATS_ENABLED": "1", "FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
-    unset = [word for name in (*MACHINES_THAT_BUILD, *CACHES) for word in ("-u", name)]
+    unset = [word for name in (*MACHINES_THAT_BUILD, *CACHES, *PROXIES) for word in ("-u", name)]
     return ["/usr/bin/env", *unset, *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
 
 

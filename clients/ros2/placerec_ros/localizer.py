@@ -83,7 +83,7 @@ class Localizer:
     def __init__(self, settings: Settings, outlet: Outlet, health: Health) -> None:
         self._settings, self._outlet, self._health = settings, outlet, health
         self.queue = FrameQueue(settings.queue_length)
-        self.odometer = Odometer()
+        self.odometer = Odometer(settings.speed_limit)
         self._latest: Frame | None = None
         self._intrinsics: dict[str, Any] | None = None
         self._camera_due = 0.0

@@ -21,9 +21,13 @@ CLOCK_JUMP = 1.0
 """Seconds by which a stamp may be older than the last one before the clock counts as set back."""
 MOST_KEPT = 10_000
 FASTEST = 100.0
-"""Metres a second. Odometry that moves faster has begun anew, as when its node was restarted."""
-AWAY, AT_START = 1.0, 0.05
-"""Odometry has begun anew, too, if it is suddenly at its start, to so many metres and radians, from so far away."""
+"""Metres a second. No robot is faster, whatever is known of it."""
+GAINED = 2.0
+"""Metres a second by which a robot becomes faster in a second."""
+AWAY = 1.0
+"""Metres that a pose may be farther away than the robot can have gone; farther, and odometry has begun anew."""
+OVER_LIMIT = 2.0
+"""How many times the limit of its speed a robot may seem to go, as the service has it."""
 FLAT = (0, 1, 5, 6, 7, 11, 30, 31, 35)
 """Where a covariance of ROS, 6 x 6, has those of x, y and the turn about z."""
 LARGEST_COVARIANCE = 1e12
@@ -40,11 +44,13 @@ class Reading:
     """What a message of odometry tells.
 
     stamp: nanoseconds.
+    speed: metres a second, by the twist; 0 if the message tells none.
     covariance: of x, y and yaw, nine numbers row by row; None if the message has none that can be used.
     """
 
     stamp: int
     pose: Planar
+    speed: float
     covariance: Covariance | None
 
 
@@ -54,9 +60,14 @@ def stamp_of(message: Any) -> int:
 
 
 class Odometer:
-    """The last seconds of odometry; one thread may feed it while others ask."""
+    """The last seconds of odometry; one thread may feed it while others ask.
 
-    def __init__(self) -> None:
+    Args:
+        speed_limit: metres a second that the robot does not exceed; 0: not known.
+    """
+
+    def __init__(self, speed_limit: float = 0.0) -> None:
+        self._fastest = min(FASTEST, OVER_LIMIT * speed_limit) if speed_limit else FASTEST
         self._poses: list[Reading] = []
         self._lock = threading.Lock()
         self._beginnings = 0  # of the odometry, since this object was made
@@ -76,11 +87,13 @@ class Odometer:
         if not all(math.isfinite(one) for one in (position.x, position.y, position.z)):
             raise ValueError("the position is not finite")
         planar = Planar(position.x, position.y, yaw_of(turned.x, turned.y, turned.z, turned.w), position.z)
-        reading = Reading(stamp, planar, _covariance(message.pose.covariance))
+        twist = message.twist.twist.linear
+        speed = math.hypot(twist.x, twist.y)
+        speed = speed if math.isfinite(speed) else 0.0
+        reading = Reading(stamp, planar, speed, _covariance(message.pose.covariance))
         with self._lock:
             frame = message.header.frame_id
-            last = self._poses[-1] if self._poses else None
-            if frame != self.frame or (last is not None and _begins_anew(last, reading)):
+            if frame != self.frame or self._begins_anew(reading):
                 self._poses.clear()
                 self._beginnings += 1
             self.frame, self.child = frame, message.child_frame_id
@@ -144,21 +157,34 @@ class Odometer:
             wrapped(first.yaw + share * wrapped(second.yaw - first.yaw)),
             first.z + share * (second.z - first.z),
         )
-        return Reading(stamp, pose, covariance)
+        return Reading(stamp, pose, max(before.speed, after.speed), covariance)
+
+    def _begins_anew(self, reading: Reading) -> bool:
+        """Whether odometry begins anew with a message: its clock was set back, as by a bag, or its pose has jumped.
+
+        A pose has jumped if it is farther away than the robot can have gone since the message before.
+        """
+        if not self._poses:
+            return False
+        last = self._poses[-1]
+        seconds = (reading.stamp - last.stamp) / NANOSECONDS
+        if seconds <= 0:
+            return seconds < -CLOCK_JUMP
+        gone = self._fastest * seconds
+        speeds = [speed for speed in (last.speed, reading.speed) if speed]
+        if len(self._poses) > 1 and (before := self._poses[-2]).stamp < last.stamp:
+            speeds.append(_metres(before, last) * NANOSECONDS / (last.stamp - before.stamp))
+        if speeds:
+            gone = min(gone, max(speeds) * seconds + GAINED * seconds**2)
+        return _metres(last, reading) > AWAY + gone
+
+
+def _metres(one: Reading, other: Reading) -> float:
+    return math.hypot(other.pose.x - one.pose.x, other.pose.y - one.pose.y)
 
 
 def _stamp(reading: Reading) -> int:
     return reading.stamp
-
-
-def _begins_anew(last: Reading, reading: Reading) -> bool:
-    """Whether odometry began anew after a message: its clock was set back, as by a bag, or its pose has jumped."""
-    seconds = (reading.stamp - last.stamp) / NANOSECONDS
-    if seconds <= 0:
-        return seconds < -CLOCK_JUMP
-    moved = math.hypot(reading.pose.x - last.pose.x, reading.pose.y - last.pose.y)
-    at_start = math.hypot(reading.pose.x, reading.pose.y) < AT_START and abs(reading.pose.yaw) < AT_START
-    return moved > AWAY and (at_start or moved > AWAY + FASTEST * seconds)
 
 
 def _covariance(numbers: Sequence[float]) -> Covariance | None:

@@ -25,6 +25,7 @@ def odometry(
     yaw: float = 0.0,
     frame_id: str = "odom",
     covariance: Sequence[float] = (0.0,) * 36,
+    speed: float = 0.0,
 ) -> Any:
     turned = quaternion(yaw)
     pose = SimpleNamespace(
@@ -32,7 +33,8 @@ def odometry(
         orientation=SimpleNamespace(x=turned[0], y=turned[1], z=turned[2], w=turned[3]),
     )
     told = SimpleNamespace(pose=pose, covariance=covariance)
-    return SimpleNamespace(header=header(stamp, frame_id), child_frame_id="base_link", pose=told)
+    twist = SimpleNamespace(twist=SimpleNamespace(linear=SimpleNamespace(x=speed, y=0.0, z=0.0)))
+    return SimpleNamespace(header=header(stamp, frame_id), child_frame_id="base_link", pose=told, twist=twist)
 
 
 def image(encoding: str, width: int, height: int, data: bytes, step: int = 0, big: int = 0) -> Any:

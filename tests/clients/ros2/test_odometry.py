@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,6 +130,45 @@ def test_odometry_that_begins_anew_is_told_as_another() -> None:
     changes = [one != other for one, other in pairwise(origins)]
     assert changes == [False, True, False, True, False, True, True, True, False]
     assert at(odometer, 5.15) is not None and at(odometer, 5.05) is None, "nothing is read across a beginning"
+
+
+def origins(odometer: Odometer, messages: Iterable[Any]) -> int:
+    """With how many origins messages are told."""
+    found = set()
+    for message in messages:
+        odometer.add(message)
+        found.add(told(odometer, message.header.stamp.sec + message.header.stamp.nanosec * 1e-9).origin)
+    return len(found)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.5], ids=["twist is not told", "twist is told"])
+@pytest.mark.parametrize("yaw", [0.0, 1.0], ids=["heading of wheels", "heading of an IMU"])
+def test_a_restart_is_seen_whatever_the_heading(speed: float, yaw: float) -> None:
+    before = [odometry(10 + number * 0.1, 29.9 + 0.15 * number, 0.0, yaw, speed=speed) for number in range(3)]
+    assert origins(Odometer(), [*before, odometry(13.2, 0.0, 0.0, yaw), odometry(13.3, 0.1, 0.0, yaw)]) == 2
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.5], ids=["twist is not told", "twist is told"])
+@pytest.mark.parametrize("seconds", [0.02, 1.0, 3.0])
+def test_a_robot_that_drives_where_it_can_keeps_its_origin(speed: float, seconds: float) -> None:
+    """Over its own origin, slow as its odometry may be, after a stop, and over a gap."""
+    drive = [odometry(10 + number * seconds, 1.5 * seconds * (number - 4), 0.0, speed=speed) for number in range(9)]
+    assert origins(Odometer(), drive) == 1
+    stop = [odometry(10 + number * seconds, 5.0, 0.0) for number in range(3)]
+    start = [odometry(10 + number * seconds, 5 + 1.5 * seconds * (number - 2), 0.0) for number in range(3, 6)]
+    assert origins(Odometer(), stop + start) == 1
+    assert origins(Odometer(), drive[:4] + drive[8:]) == 1, "messages were lost"
+
+
+def test_what_a_twist_tells_beyond_numbers_is_ignored() -> None:
+    broken = [odometry(10.0 + number, 1.0, 0.0, speed=speed) for number, speed in enumerate((math.nan, math.inf, 0.0))]
+    assert origins(Odometer(), [*broken, odometry(15.0, 40.0, 0.0)]) == 2
+
+
+def test_the_limit_of_the_speed_tells_how_far_a_robot_can_have_gone() -> None:
+    messages = [odometry(10.0, 30.0, 0.0), odometry(13.0, 0.0, 0.0, 1.0)]
+    assert origins(Odometer(), messages) == 1, "nobody knows how fast it is"
+    assert origins(Odometer(speed_limit=2.0), messages) == 2
 
 
 @given(poses, poses)

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from placerec_ros.parameters import PARAMETERS, InvalidParameters, Settings, settings
+from core.names import TEXT
+from placerec_ros.parameters import PARAMETERS, TRAVERSE, InvalidParameters, Settings, settings
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "how-to" / "ros2.md"
@@ -34,13 +35,19 @@ def values(**given: Any) -> dict[str, Any]:
         ({"image_type": "h264"}, "one of auto, compressed, raw"),
         ({"verify": "sometimes"}, "one of auto, always, never"),
         ({"map_frame": ""}, "name a frame"),
-        ({"sequence": "a/b"}, "cannot name a traverse"),
+        *(({"sequence": name}, "cannot name a traverse") for name in ("a/b", ".", "..", "\u202e", "\x85", "x" * 129)),
         ({"key_file": "/nowhere/key"}, "key file /nowhere/key cannot be read: No such file"),
     ],
 )
 def test_a_value_that_cannot_be_is_named(given: dict[str, Any], said: str) -> None:
     with pytest.raises(InvalidParameters, match=said):
         settings(values(**given), {})
+
+
+def test_names_are_those_that_the_service_takes() -> None:
+    assert TRAVERSE.pattern == TEXT
+    for name in ("monday", "...", "ü b?#", "x" * 128, ""):
+        assert settings(values(sequence=name), {}).sequence == name
 
 
 def test_the_key_comes_from_the_file_or_the_variable_and_is_shown_nowhere(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.places import Pose
 from core.recordings import Frame
 from core.recordings.frame import NANOSECONDS
-from core.recordings.keyframes import SLACK, Left, Spacing, keyframes, moving
+from core.recordings.keyframes import SLACK, Left, Spacing, keyframes, moving, pose_noise
 
 
 def frame(number: int, x: float | None = None, heading: float | None = None, seconds: float | None = None) -> Frame:
@@ -114,5 +114,32 @@ def test_frames_that_show_what_the_last_one_shows_are_left_out() -> None:
 
 
 def test_a_robot_whose_poses_say_that_it_moves_does_not_stand() -> None:
-    frames = [frame(number, 0.4 * number) for number in range(8)]
-    assert [one.id for one in moving(frames, lambda one: 0, lambda a, b: True)] == ["0", "3", "6"]
+    frames = [frame(number, 0.4 * number) for number in range(12)]
+    assert [one.id for one in moving(frames, lambda one: 0, lambda a, b: True)] == ["0", "3", "6", "9"]
+
+
+@pytest.mark.parametrize("every", [1, 10], ids=["each frame has a pose of its own", "poses are interpolated"])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 3.0])
+def test_noise_of_poses_moves_no_robot(noise: float, every: int) -> None:
+    """Thirty seconds of a stop, and of a drive through a tunnel whose walls are the same everywhere."""
+    for seed in range(20):
+        noises = np.random.default_rng(seed).normal(0, noise, (2, 300 // every + 1))
+        x, y = (np.interp(np.arange(300), every * np.arange(len(one)), one) for one in noises)
+
+        def frames(speed: float, x: NDArray[np.float64] = x, y: NDArray[np.float64] = y) -> list[Frame]:
+            return [
+                Frame(str(n), "", bytes, Pose(x=0.1 * speed * n + x[n], y=y[n]), nanoseconds=n * NANOSECONDS // 10)
+                for n in range(300)
+            ]
+
+        stop = list(moving(frames(0.0), lambda one: 0, lambda a, b: True))
+        assert len(stop) <= (1 if every == 1 else 3)
+        tunnel = [int(one.id) for one in moving(frames(15.0), lambda one: 0, lambda a, b: True)]
+        assert 1.5 * max(np.diff(tunnel)) <= 3 + 16 * noise, "of each stretch there is a frame"
+
+
+def test_poses_on_the_earth_have_noise_in_metres() -> None:
+    degrees = np.random.default_rng(0).normal(0, 1 / 111_195, (400, 2))
+    poses = [Pose(latitude=60 + a, longitude=20 + b / np.cos(np.radians(60))) for a, b in degrees]
+    assert pose_noise([Frame("", "", bytes, pose) for pose in poses]) == pytest.approx(1.0, abs=0.1)
+    assert pose_noise([Frame("", "", bytes, pose) for pose in poses[:5]]) == 0

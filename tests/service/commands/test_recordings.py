@@ -147,6 +147,36 @@ def test_of_a_video_the_frames_of_a_stop_are_left_out_unless_wanted(placerec: Pl
     assert "12 of 12 frames are places" in whole.stdout
 
 
+@pytest.mark.parametrize("where", ["--url", "--data-dir"])
+def test_what_the_mask_of_a_camera_covers_is_no_stop(
+    placerec: Placerec, tmp_path: Path, server: Server, where: str
+) -> None:
+    """A robot's body takes up 80 % of the picture, and a little of the rest changes as it drives."""
+
+    def seen(number: int) -> bytes:
+        pixels = scene(0, 320, 240)
+        pixels[:48] = 128 + 0.08 * (scene(1 + number, 320, 240)[:48].astype(np.float32) - 128)
+        return encoded(pixels, ".png")
+
+    bag = [compressed(START + number * SECOND, seen(number), form="png") for number in range(4)]
+    words = ("enroll", write_mcap(tmp_path / "walk.mcap", bag), "--map", f"masked{where}")
+    server.create_map(f"masked{where}")
+    server.client.put(f"/v1/maps/masked{where}/cameras/front", json={"mask": BODY}).raise_for_status()
+    at = ("--url", f"http://127.0.0.1:{server.port}")
+    if where == "--data-dir":
+        file = tmp_path / "masked.tar"
+        file.write_bytes(server.client.get(f"/v1/maps/masked{where}/export").content)
+        at = ("--data-dir", str(tmp_path / "data"))
+        placerec("maps", "import", file, *at)
+    assert "4 of 4 frames are places" in placerec(*words, "--camera", "front", *at).stdout
+    whole = placerec("enroll", *words[1:], "--sequence", "without", "--id-prefix", "without-", *at)
+    assert "3 of 4 frames show the same" in whole.stderr, "without the mask they show the body"
+
+
+BODY = {"polygons": [[[0, 0.2], [1, 0.2], [1, 1], [0, 1]]]}
+"""What covers four fifths of the picture."""
+
+
 def test_keyframes_of_a_bag_follow_its_poses(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(6))
     words = ("enroll", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)

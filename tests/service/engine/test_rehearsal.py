@@ -18,20 +18,24 @@ CACHE = "[cache] "
 """How lines begin by which Numba tells that it loads a compiled loop, or has compiled one."""
 
 
+@pytest.mark.timeout(600)  # of a slow machine whose cache is empty
 def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
     server = Server(tmp_path, {"rehearsal": True}, forked=False)
     try:
-        server.wait()
+        server.wait(seconds=500)
         assert loops(server), "Numba does not tell what it loads"
         asked_first = {"enrolment of a map": prepared(enrol, server.client), **kinds(server.client)}
         later = {}
         for name, prepare in asked_first.items():
             before = len(loops(server))
             prepare()(0)
+            jobs = server.client.get("/v1/jobs").raise_for_status().json()["items"]
+            assert all(job["state"] == "succeeded" for job in jobs), name
             if new := loops(server)[before:]:
                 later[name] = new
         assert later == {}
+        assert {job["kind"] for job in jobs} == {"align", "prune"}
     finally:
         server.kill()
 
@@ -52,3 +56,12 @@ def test_a_service_does_without_where_nothing_can_be_written(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "no such folder"))
     rehearse(EncoderCatalogue().get(DEFAULT_ENCODER))
     assert "nothing could be rehearsed" in caplog.text
+
+
+def test_a_rehearsal_that_fails_keeps_no_service_from_being_ready(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    monkeypatch.setattr(type(encoder), "encode", property(lambda _: {}["a loop that cannot be compiled"]))
+    rehearse(encoder)
+    assert "nothing could be rehearsed" in caplog.text and "a loop that cannot be compiled" in caplog.text

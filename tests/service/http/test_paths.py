@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
+from contextlib import nullcontext
 from typing import Any
 
 import httpx
 import pytest
+from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
 
+from service.app.application import WholeSegments
 from tests.clients.python.models import operations
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -124,3 +129,20 @@ def test_a_deletion_that_says_more_than_its_path_deletes_nothing(server: Server,
             assert refused.status_code == 422 and "nothing was deleted" in refused.json()["detail"], path
         assert server.client.request("DELETE", path, json={"ids": ["p"]}).status_code == 422, path
     assert there(server, lab) == before
+
+
+@pytest.mark.parametrize("raw", [{}, {"raw_path": None}, {"raw_path": b"/v1/maps"}, {"raw_path": b"/v1%2Fmaps"}])
+def test_a_server_need_not_tell_the_path_as_it_came(raw: dict[str, Any]) -> None:
+    passed: list[Scope] = []
+
+    async def inner(scope: Scope, receive: Receive, send: Send) -> None:
+        passed.append(scope)
+
+    async def unused(*_: Any) -> Any:
+        raise AssertionError
+
+    scope = {"type": "http", "method": "GET", "path": "/v1/maps", "headers": [], **raw}
+    whole = raw.get("raw_path") != b"/v1%2Fmaps"
+    with nullcontext() if whole else pytest.raises(HTTPException):
+        asyncio.run(WholeSegments(inner)(scope, unused, unused))
+    assert passed == ([scope] if whole else [])
