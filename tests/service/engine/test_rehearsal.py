@@ -61,7 +61,10 @@ def test_a_service_does_without_where_nothing_can_be_written(
 def test_a_rehearsal_that_fails_keeps_no_service_from_being_ready(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    def fail(*_: object) -> None:
+        raise KeyError("a loop that cannot be compiled")
+
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    monkeypatch.setattr(type(encoder), "encode", property(lambda _: {}["a loop that cannot be compiled"]))
+    monkeypatch.setattr(type(encoder), "encode", fail)
     rehearse(encoder)
     assert "nothing could be rehearsed" in caplog.text and "a loop that cannot be compiled" in caplog.text
