@@ -1,12 +1,12 @@
 """The job that prunes a map: it removes places whose neighbours can stand in for them, and measures what is lost.
 
-Where the robot stood, the first frame stands for the others and always stays.  What is lost is counted without the
-others, for the many frames of a stop would outvote all other places.
+Where the robot stood, the first frame stands for the others and always stays.  That the others go is the first thing
+that is tried.  What is lost is counted without them, for the many frames of a stop would outvote all other places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -87,15 +87,12 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
     removable = references & _members(names, options["sequence"]) if options["sequence"] is not None else references
     removable = removable & ~own.members(looks[:, 0])
     similarity = _similarities(engine, context, own, pairs)
-    choices = [options["similarity"]]
-    if options["similarity"] is None:
-        choices = steps(_by_stop(similarity, looks), STEPS)
     before = trial.found(references)
     tried: list[Thinning] = []
-    for least in choices:
+    for least, scores in _choices(similarity, len(looks), options["similarity"]):
         context.check_cancelled()
         # Places that must stay can stand in for others, but not the other way round.
-        kept = thinned(len(own), pairs, similarity, least, removable)
+        kept = thinned(len(own), pairs, scores, least, removable)
         tried.append(Thinning(least, kept, before, trial.found(kept & references)))
     most_loss = 1.0 if options["similarity"] is not None else options["max_recall_loss"]
     chosen = best_thinning(tried, most_loss)
@@ -121,11 +118,24 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
     return report, going
 
 
-def _by_stop(similarity: NDArray[np.float32], looks: NDArray[np.int64]) -> NDArray[np.float32]:
-    """The scores of pairs, of which the first are ``looks``, int64 [m, 2]: of those of one stop the least alone."""
-    order = np.lexsort((similarity[: len(looks)], looks[:, 0]))
-    least = order[np.diff(looks[order, 0], prepend=-1) > 0]
-    return np.concatenate([similarity[least], similarity[len(looks) :]])
+def _choices(
+    similarity: NDArray[np.float32], looks: int, least: float | None
+) -> Iterator[tuple[float, NDArray[np.float32]]]:
+    """Thresholds to try, those that remove less first, and the score of each pair, float32 [pairs], beside them.
+
+    Args:
+        similarity: float32 [pairs], of which the first ``looks`` are of further looks where the robot stood.
+        least: the one threshold that the caller wants; None: further looks go alone, then with ever more places.
+    """
+    if least is not None:
+        yield least, similarity
+        return
+    scores = similarity.copy()
+    scores[:looks] = np.inf
+    if looks:
+        yield float(similarity[:looks].min()), np.where(np.arange(len(scores)) < looks, scores, -np.inf)
+    for step in steps(similarity[looks:], STEPS):
+        yield step, scores
 
 
 def _members(names: NDArray[np.str_], sequence: str) -> NDArray[np.bool_]:

@@ -60,7 +60,7 @@ def health(
     for stop in report["stops"]:
         remark(
             f"{stop['frames']} frames of traverse {stop['sequence']} show one view, from place {stop['place']} "
-            f"on: placerec maps prune {map_id} removes most of them."
+            f"on: placerec maps prune {map_id} --yes deletes all but the first."
         )
     if not report["complete"]:
         remark("The time was up before the whole map was examined; --seconds gives it more.")
@@ -141,6 +141,8 @@ def prune(
     body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     body |= {"max_recall_loss": max_recall_loss, "dry_run": not yes}
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
+    if not yes:
+        remark("Nothing is deleted without --yes: this is what would be.")
 
 
 def merge(

@@ -78,6 +78,8 @@ def test_of_a_stop_further_looks_go_and_the_first_stays(server: Server) -> None:
     dry = finished(server, asked(server, "stood", "prune", max_recall_loss=0))["result"]
     assert dry["queries"] <= 24, "the looks do not outvote the other places"
     assert dry["recall_before"]["value"] == dry["recall_after"]["value"]
+    assert dry["tried"][0]["removed"] == stop["frames"] - 1, "the further looks go first, whatever else looks alike"
+    assert dry["removed"] >= stop["frames"] - 1
     bold = finished(server, asked(server, "stood", "prune", similarity=-1.0, dry_run=False))["result"]
     left = places(server, "stood")
     assert stop["place"] in left and bold["removed"] >= stop["frames"] - 1

@@ -80,8 +80,8 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     assert "monday" in shown
 
     delete = ("maps", "places", "delete", name, "1", "2")
-    told = placerec(*delete, "11", "12", "--yes", *where, status=1).stderr
-    assert f"The map {name} has no place 11, 12; nothing was deleted." in told
+    told = placerec(*delete, "11", "1\u200b", "--yes", *where, status=1).stderr
+    assert f"The map {name} has no place 11, '1\\u200b'; nothing was deleted." in told, "the space is seen"
     asked = placerec(*delete, *where, status=1, stdin="n\n")
     assert f"Delete from the map {name}: 1, 2?" in asked.output
     assert len(json.loads(placerec("maps", "places", "list", name, "--json", *where).stdout)) == 4

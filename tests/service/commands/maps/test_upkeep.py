@@ -58,7 +58,9 @@ def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, 
 
     pruned = placerec("maps", "prune", lab, "--similarity", 2, "--yes", "--json", *where)
     assert json.loads(pruned.stdout)["result"]["removed"] == 0, "nothing is so alike"
-    printed = placerec("maps", "prune", lab, *where).stdout
+    dry = placerec("maps", "prune", lab, *where)
+    assert "Nothing is deleted without --yes" in " ".join(dry.stderr.split())
+    printed = dry.stdout
     assert re.search(r"recall_before +[01]\.\d{3} \(0\.\d{3} to [01]\.\d{3}; \d of \d\)", printed)
     assert re.search(r"^similarity +removed +recall *$", printed, re.MULTILINE), "what was tried is a table"
     assert not re.search(r"[{}\['\]]|None|True|False", printed), printed
