@@ -289,19 +289,23 @@ class Whereabouts:
         """Which of the places ``order``, int64 [n], are at the position of an earlier one of them; bool [n]."""
         return _repeated(self.sequence[order], self.ordinal[order])
 
+    def view_keys(self) -> NDArray[np.int64]:
+        """A number for the position of each place, int64 [n]; that of a place without a sequence means nothing."""
+        return _position_keys(self.sequence, self.ordinal)
+
     def of_views(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the places show a view that one of ``rows``, int64 [k], shows; bool [n]."""
-        keys = _view_keys(self.sequence, self.ordinal)
+        keys = self.view_keys()
         return (self.sequence != NO_SEQUENCE) & np.isin(keys, keys[rows])
 
 
-def _view_keys(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.int64]:
+def _position_keys(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.int64]:
     return (sequence.astype(np.int64) << _SEQUENCE) + ordinal
 
 
 def _repeated(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which of n positions in sequences are those of an earlier one; bool [n].  Without a sequence none is."""
-    keys = _view_keys(sequence, ordinal)
+    keys = _position_keys(sequence, ordinal)
     repeated = np.zeros(len(keys), np.bool_)
     ordered = np.sort(keys)
     if (ordered[1:] == ordered[:-1]).any():

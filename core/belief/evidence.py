@@ -115,11 +115,10 @@ def evidence(
 
 def _of_views(verified: NDArray[np.float64], where: Whereabouts) -> NDArray[np.float64]:
     """What verification found of n places, or most of other frames of the same view; NaN where neither is known."""
-    positions = np.stack([where.sequence, where.ordinal])
-    _, view = np.unique(positions, axis=1, return_inverse=True)
+    _, view = np.unique(where.view_keys(), return_inverse=True)
     most = np.full(len(verified), np.nan)
-    np.fmax.at(most, view.ravel(), verified)
-    return np.where(np.isnan(verified) & (where.sequence != NO_SEQUENCE), most[view.ravel()], verified)
+    np.fmax.at(most, view, verified)
+    return np.where(np.isnan(verified) & (where.sequence != NO_SEQUENCE), most[view], verified)
 
 
 def believable_score(

@@ -114,12 +114,19 @@ class Speeds:
 
     def at(self, places: NDArray[np.int64]) -> Masses:
         """The probabilities of the speeds at some places, int64 [k]; float32 [k, S]."""
+        found, own = self._tracked(places)
+        shares = np.tile(self.elsewhere, (len(places), 1))
+        shares[own] = self.shares[found]
+        return shares
+
+    def _tracked(self, places: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Of some places, [k], the rows of those that have shares of their own, int64 [m], and which have, bool [k]."""
         if not len(self.places):
-            return np.tile(self.elsewhere, (len(places), 1))
+            return np.empty(0, np.int64), np.zeros(len(places), np.bool_)
         order = np.argsort(self.places)
         found = order[np.minimum(np.searchsorted(self.places[order], places), len(order) - 1)]
         own = self.places[found] == places
-        return np.where(own[:, np.newaxis], self.shares[found], self.elsewhere)
+        return found[own], own
 
     def weighed(self, places: NDArray[np.int32], likelihoods: Masses) -> tuple[Speeds, Masses]:
         """The speeds after a frame, and the likelihood of it at each place whatever the speed is, float32 [k].
@@ -130,12 +137,9 @@ class Speeds:
         """
         joint = self.at(places.astype(np.int64)) * likelihoods
         factors: Masses = joint.sum(axis=1)
-        order = np.argsort(self.places)
         shares = self.shares.copy()
-        if len(order):
-            found = order[np.minimum(np.searchsorted(self.places[order], places), len(order) - 1)]
-            own = self.places[found] == places
-            shares[found[own]] = joint[own] / factors[own, np.newaxis]
+        found, own = self._tracked(places)
+        shares[found] = joint[own] / factors[own, np.newaxis]
         return Speeds(self.places, shares, self.elsewhere), factors
 
     def contradicted(self, factors: Masses) -> tuple[Speeds, Masses, float]:

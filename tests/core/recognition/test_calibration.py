@@ -10,21 +10,12 @@ import pytest
 
 from core.judgement.trials import Trials
 from core.maps import Enrolment, MapSettings
-from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import queries_from_map, run_trials
 from core.storage import Atlas
-from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 
 PLACES, QUERIES = 400, 30
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
-    folder = tmp_path_factory.mktemp("models")
-    install_two_stage_encoder(folder)
-    return EncoderCatalogue(folder).get(TWO_STAGES)
 
 
 def walk(encoder: Encoder) -> list[Enrolment]:

@@ -21,20 +21,13 @@ from core.places import PlaceFields, Pose
 from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
 from core.recognition.stages import likeness, rank_places
 from core.storage import Atlas, Map, Snapshot
-from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
+from tests.service.encoders import SECOND_STAGE
 from tests.service.scenes import jpeg, scene, seen_again
 
 PLACES = 8
 CANDIDATES = SECOND_STAGE.candidates
 EXAMINED = max(CANDIDATES, 1 + TOP_PLACES)
 """The best one and enough others to hold it against; all places are places of their own here."""
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
-    folder = tmp_path_factory.mktemp("models")
-    install_two_stage_encoder(folder)
-    return EncoderCatalogue(folder).get(TWO_STAGES)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from core.belief import Run, RunOptions, Step, evidence, place_graph
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
 from core.maps import Enrolment, MapSettings
-from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import Answer, locate
@@ -22,7 +21,6 @@ from core.recognition.stages import neighborhood_of
 from core.storage import Atlas, Map
 from core.upkeep.redundancy import neighbour_pairs, stops
 from tests.core.storage.search.test_indexing import settled
-from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import scene
 
 PLACES, SPOT, LOOKS = 12, 5, 120
@@ -40,13 +38,6 @@ def noisy(pixels: Pixels, seed: int) -> Pixels:
     light = np.clip(pixels * random.uniform(0.95, 1.05) + random.normal(0, 3, pixels.shape), 0, 255)
     _, data = cv2.imencode(".jpg", light.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 75])
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
-    folder = tmp_path_factory.mktemp("models")
-    install_two_stage_encoder(folder)
-    return EncoderCatalogue(folder).get(TWO_STAGES)
 
 
 @pytest.fixture(scope="module")
