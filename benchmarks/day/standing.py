@@ -30,7 +30,7 @@ import numpy as np
 import typer
 
 from benchmarks.report import report
-from core.belief import Run, RunOptions, Step, View, evidence, place_graph, view_of
+from core.belief import Run, RunOptions, Step, View, evidence_of, place_graph, view_of
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
@@ -201,10 +201,7 @@ def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Ses
     graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood)
     run, session = Run(RunOptions(), graph), Session([], [])
     for shot, answer in zip(shots, answers, strict=True):
-        seen = answer.candidates
-        verified = None if seen.geometry is None else seen.geometry.evidence
-        known = (answer.calibration, neighborhood, seen.examined, verified)
-        run.advance(evidence(seen.rows, seen.scores, seen.whereabouts, *known), Step(), shot.view)
+        run.advance(evidence_of(answer, neighborhood), Step(), shot.view)
         found = run.estimate(1, snapshot.alive)
         told = None
         if found.verdict == "recognized":

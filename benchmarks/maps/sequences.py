@@ -32,11 +32,13 @@ from core.belief import (
     View,
     evidence,
     place_graph,
+    sighted,
     view_of,
 )
 from core.evaluation.samples import jpeg, sample_frame
 from core.evaluation.timing import medians
 from core.frames.images import decode
+from core.judgement.verdict import judge
 from core.maps import MapSettings
 from core.maps.views import MOST_HIDDEN, LatestViews, Look
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -73,8 +75,8 @@ def evidences(
         stage = second_stage(encoder, local, references.local[rows].__getitem__)
         found = examine(scores[rows], where.take(rows), SAME_PLACE, *stage)
         ranked = rows[found.order]
-        seen = evidence(ranked, found.scores, where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
-        yield int(ranked[0]), seen
+        known = (where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
+        yield int(ranked[0]), sighted(evidence(ranked, found.scores, *known), ranked, judge(found.scores, *known))
 
 
 def positions(references: Encodings) -> NDArray[np.int64]:

@@ -35,6 +35,7 @@ from core.belief import (
     View,
     evidence,
     place_graph,
+    sighted,
     view_of,
 )
 from core.frames.preprocessing import Pixels
@@ -108,10 +109,11 @@ class Walk:
         found = examine(scores[rows], self.where.take(rows), SAME_PLACE, *stage)
         ranked = rows[found.order]
         known = (self.where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
+        judgement = judge(found.scores, *known)
         return Look(
             int(ranked[0]),
-            judge(found.scores, *known).verdict,
-            evidence(ranked, found.scores, *known),
+            judgement.verdict,
+            sighted(evidence(ranked, found.scores, *known), ranked, judgement),
             view_of(pixels),
             right,
         )

@@ -7,7 +7,7 @@ serializes a run.
 """
 
 from core.belief.estimate import Candidate, Estimate
-from core.belief.evidence import NOTHING, Evidence, evidence
+from core.belief.evidence import NOTHING, Evidence, Sighting, evidence, evidence_of, sighted
 from core.belief.graph import PlaceGraph, place_graph
 from core.belief.motion import Odometry, Step, Stride
 from core.belief.odometry import OdometryPose
@@ -28,12 +28,15 @@ __all__ = [
     "RunOptions",
     "RunState",
     "Sight",
+    "Sighting",
     "Step",
     "Stride",
     "View",
     "evidence",
+    "evidence_of",
     "from_bytes",
     "place_graph",
+    "sighted",
     "to_bytes",
     "view_of",
 ]

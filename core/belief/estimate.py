@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.belief.evidence import Sighting
 from core.belief.filter import Belief
 from core.belief.graph import PlaceGraph
 from core.judgement.verdict import Verdict
@@ -46,7 +48,7 @@ class Estimate:
     unknown: float
 
 
-def estimate(belief: Belief, graph: PlaceGraph, count: int) -> Estimate:
+def estimate(belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting | None = None) -> Estimate:
     """Summarize a belief.
 
     The verdict is ``unknown`` if not being in the map has a probability of at least RECOGNIZED, ``recognized`` if one
@@ -54,14 +56,46 @@ def estimate(belief: Belief, graph: PlaceGraph, count: int) -> Estimate:
 
     Args:
         count: how many candidates to list.
+        sighting: of the present frame, if it is recognized by itself.
     """
-    modes = [] if not len(graph) else _modes(belief.places, graph, max(count, MODES))
-    verdict: Verdict = "ambiguous"
-    if belief.unknown >= RECOGNIZED or not modes:
-        verdict = "unknown"
-    elif modes[0].probability >= RECOGNIZED:
-        verdict = "recognized"
-    return Estimate(verdict, tuple(modes[:count]), belief.unknown)
+    candidates, unknown = [] if not len(graph) else _modes(belief.places, graph, max(count, MODES)), belief.unknown
+    if sighting is not None and candidates:
+        candidates, unknown = _sighted(candidates, unknown, sighting, graph)
+    return Estimate(_verdict(candidates, unknown), tuple(candidates[:count]), unknown)
+
+
+def _verdict(candidates: Sequence[Candidate], unknown: float) -> Verdict:
+    if unknown >= RECOGNIZED or not candidates:
+        return "unknown"
+    return "recognized" if candidates[0].probability >= RECOGNIZED else "ambiguous"
+
+
+def _sighted(
+    candidates: list[Candidate], unknown: float, sighting: Sighting, graph: PlaceGraph
+) -> tuple[list[Candidate], float]:
+    """The candidates, best first, and the probability of not being in the map, where a sighting is surer than these.
+
+    Its place gets its probability, and everything else shares the rest as before (Jeffrey's rule of conditioning).  A
+    belief that is sure of another place is contradicted: one of the two is right at most, so that they share what they
+    have, and neither is recognized.  One that is sure not to be in the map needs more than a single frame.
+    """
+    best, verdict = candidates[0], _verdict(candidates, unknown)
+    (place,) = graph.places_at(np.array([sighting.row])).tolist()
+    if place < 0 or sighting.probability <= best.probability:
+        return candidates, unknown
+    near = np.isin(graph.places_at(np.array([one.row for one in candidates])), graph.same_place(place))
+    if verdict == "unknown" and not near[0]:
+        return candidates, unknown
+    believed = sum(one.probability for one, same in zip(candidates, near, strict=True) if same)
+    others = [one for one, same in zip(candidates, near, strict=True) if not same]
+    if verdict == "recognized" and not near[0]:
+        half = (best.probability + believed) / 2
+        claims, others, rest = [replace(best, probability=half), Candidate(sighting.row, half)], others[1:], 1.0
+    else:
+        probability = max(sighting.probability, believed)
+        claims, rest = [Candidate(sighting.row, probability)], (1 - probability) / max(1 - believed, 1e-9)
+    found = [*claims, *(replace(one, probability=rest * one.probability) for one in others)]
+    return sorted(found, key=lambda one: -one.probability), rest * unknown
 
 
 def _modes(masses: NDArray[np.float32], graph: PlaceGraph, count: int) -> list[Candidate]:

@@ -9,19 +9,21 @@ compact index returns only about the best hundred, and a second stage compares o
 On traverses of camvid and nordland_tiny the true place's score is distributed so that its log likelihood ratio grows by
 about 5 from the mean score to the believable one, and flattens at 7 to 8; a true place that is not listed has -1 to -2.
 Consecutive frames show the same things and lead to the same mistakes, so that less than half of that is counted.  How
-much a frame shows that the last one did not is for ``view`` to say.
+much a frame shows that the last one did not is for ``view`` to say.  A frame that is recognized by itself is a sighting
+as well, which ``estimate`` holds against the belief.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.background import GUARD_FACTOR
-from core.judgement.verdict import Calibration
+from core.judgement.verdict import Calibration, Judgement
 from core.places import NO_SEQUENCE, Neighborhood, Whereabouts
+from core.recognition.recognition import Answer
 
 LISTED = 100
 """Without a second stage, this many places are listed; every index returns as many."""
@@ -48,25 +50,65 @@ was chosen on."""
 
 
 @dataclass(frozen=True)
+class Sighting:
+    """What a frame that is recognized by itself says of where it was taken.
+
+    row: of the map, the place that it shows.
+    probability: that it does, whatever came before.
+    """
+
+    row: int
+    probability: float
+
+
+@dataclass(frozen=True)
 class Evidence:
     """The evidence of one frame; the background's log likelihood is 0.
 
     rows: int64 [k], rows of the map.
     gains: float32 [k], over 0: the log likelihood ratio of those places to the background.
     unknown: the log likelihood ratio of not being in the map to the background.
+    sighting: None if the frame is not recognized by itself.
     """
 
     rows: NDArray[np.int64]
     gains: NDArray[np.float32]
     unknown: float
+    sighting: Sighting | None = None
 
     def tempered(self, weight: float) -> Evidence:
         """The evidence with every log likelihood ratio multiplied by ``weight``."""
-        return Evidence(self.rows, self.gains * np.float32(weight), self.unknown * weight)
+        return replace(self, gains=self.gains * np.float32(weight), unknown=self.unknown * weight)
 
 
 NOTHING = Evidence(np.empty(0, np.int64), np.empty(0, np.float32), 0.0)
 """The evidence of a frame that says nothing: one without regions, or one in an empty map."""
+
+
+def evidence_of(answer: Answer, neighborhood: Neighborhood) -> Evidence:
+    """The evidence of a frame that was answered alone."""
+    ranked = answer.candidates
+    seen = evidence(
+        ranked.rows,
+        ranked.scores,
+        ranked.whereabouts,
+        answer.calibration,
+        neighborhood,
+        ranked.examined,
+        None if ranked.geometry is None else ranked.geometry.evidence,
+    )
+    return sighted(seen, ranked.rows, answer.judgement)
+
+
+def sighted(seen: Evidence, rows: NDArray[np.int64], judgement: Judgement) -> Evidence:
+    """Evidence with the sighting of a frame, if its verdict is ``recognized`` and says how probable it is.
+
+    Args:
+        rows: int64 [n], of the ranking that was judged, best first.
+    """
+    if judgement.verdict != "recognized" or judgement.probability is None:
+        return seen
+    return replace(seen, sighting=Sighting(int(rows[0]), judgement.probability))
 
 
 def evidence(

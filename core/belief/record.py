@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from core.belief.evidence import Sighting
 from core.belief.motion import Odometry
 from core.belief.odometry import OdometryPose
 from core.belief.run import RunState
@@ -33,7 +34,7 @@ class DamagedRecord(ValueError):
 def to_bytes(state: RunState) -> bytes:
     """Serialize a state, in a few kilobytes: 8 bytes for each row, 4 for each probability, 1 for
     each share of a speed."""
-    odometry, pose = state.odometry, state.pose
+    odometry, pose, sighting = state.odometry, state.pose, state.sighting
     head = {
         "format": FORMAT,
         "unknown": state.unknown,
@@ -48,6 +49,7 @@ def to_bytes(state: RunState) -> bytes:
         "constant": state.constant,
         "pending_reach": state.pending_reach,
         "pose": None if pose is None else [pose.x, pose.y, pose.heading, pose.covariance, pose.origin],
+        "sighting": None if sighting is None else [sighting.row, sighting.probability],
     }
     text = json.dumps(head, separators=(",", ":")).encode()
     arrays = [state.rows.astype("<i8"), state.masses.astype("<f4")]
@@ -104,6 +106,7 @@ def from_bytes(data: bytes) -> RunState:
             head.get("pending_reach", 0.0),
             _pose(head.get("pose")),
             shares,
+            None if head.get("sighting") is None else Sighting(*head["sighting"]),
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.belief.estimate import Estimate, estimate
-from core.belief.evidence import NOTHING, Evidence
+from core.belief.evidence import NOTHING, Evidence, Sighting
 from core.belief.filter import (
     Belief,
     Smoother,
@@ -86,6 +86,7 @@ class RunState:
     blind, constant: as of the :class:`Run`.
     pending_reach: metres that the robot may have moved in the constant frames.
     pose: as of the :class:`Run`.
+    sighting: of the last frame that counted; None if it was not recognized by itself.
     """
 
     rows: NDArray[np.int64]
@@ -101,6 +102,7 @@ class RunState:
     pending_reach: float = 0.0
     pose: OdometryPose | None = None
     shares: NDArray[np.float32] = field(default_factory=lambda: UNKNOWN.shares)
+    sighting: Sighting | None = None
 
 
 def _apart(speed: ArrayLike) -> NDArray[np.float64]:
@@ -128,6 +130,7 @@ class Run:
         self.blind = self.constant = 0
         self.pose: OdometryPose | None = None
         self._view: View | None = None
+        self._sighting: Sighting | None = None
         self._pending_reach = 0.0
         self._pending = Pending()
         self._smoother = Smoother(options.lag)
@@ -181,7 +184,7 @@ class Run:
         """
         change = None if view is None or self._view is None else view.change(self._view)
         new = 1.0 if change is None else novelty(change)
-        fitting = fits(self.belief, seen, self.graph)
+        fitting = fits(self.belief, seen, self.graph) or self._confirms(seen.sighting)
         shows_nothing = seen is NOTHING and len(self.graph) > 0
         if shows_nothing or (view is not None and view.uniform and not fitting):
             self.sight, seen, share, change = "covered", NOTHING, 1.0, None
@@ -192,11 +195,20 @@ class Run:
         else:
             self.sight, self.blind, share = None, 0, new
             self._view = view or self._view
+        if self.sight != "constant":  # a view that stays shows what it has shown
+            self._sighting = seen.sighting
         stands = self.sight == "constant" and (step.odometry is None or not by_poses(self.graph, step))
         self._filter(seen, step, share, stands, change)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
         self.frames += 1
+
+    def _confirms(self, sighting: Sighting | None) -> bool:
+        """Whether a frame is recognized by itself where the last one that counted was."""
+        if sighting is None or self._sighting is None:
+            return False
+        here, there = self.graph.places_at(np.array([self._sighting.row, sighting.row])).tolist()
+        return here >= 0 and there in self.graph.same_place(here)
 
     def _filter(self, seen: Evidence, step: Step, share: float, stands: bool, change: float | None) -> None:
         """Move the belief and weigh it by what was seen, and by how much the view has changed, if that is known."""
@@ -270,7 +282,7 @@ class Run:
             count: how many candidates to list.
             alive: bool [rows of the map]; places that were removed since the graph was made are not listed.
         """
-        found = self._estimate(self._now(), count, alive)
+        found = self.look(count, alive)
         if found.verdict == "recognized":
             self.unrecognized = 0
         elif self.unrecognized is not None:
@@ -279,14 +291,19 @@ class Run:
 
     def look(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
         """Where the robot is, without counting: for calls between two frames."""
-        return self._estimate(self._now(), count, alive)
+        sighting = self._sighting
+        if sighting is not None and self.blind:
+            sighting = replace(sighting, probability=sighting.probability * FADING**self.blind)
+        return self._estimate(self._now(), count, alive, sighting)
 
     def earlier(self, count: int, alive: NDArray[np.bool_]) -> Estimate | None:
         """Where the robot was ``lag`` frames ago, given all frames since; None if that is not known."""
         smoothed = self._smoother.smoothed(self.graph) if self.options.lag else None
         return None if smoothed is None else self._estimate(smoothed, count, alive)
 
-    def _estimate(self, belief: Belief, count: int, alive: NDArray[np.bool_]) -> Estimate:
+    def _estimate(
+        self, belief: Belief, count: int, alive: NDArray[np.bool_], sighting: Sighting | None = None
+    ) -> Estimate:
         rows = self.graph.rows
         there = (rows < len(alive)) & alive[np.minimum(rows, max(len(alive) - 1, 0))] if len(alive) else rows < 0
         if not there.all():
@@ -294,7 +311,9 @@ class Run:
             unknown = belief.unknown + (1 - belief.unknown) * gone
             given = np.where(there, belief.given, np.float32(0)) / np.float32(max(1 - gone, 1e-9))
             belief = Belief(given.astype(np.float32), min(unknown, 1.0))
-        return estimate(belief, self.graph, count)
+            if sighting is not None and not (sighting.row < len(alive) and alive[sighting.row]):
+                sighting = None
+        return estimate(belief, self.graph, count, sighting)
 
     def _now(self) -> Belief:
         """The present belief; what is believed to be seen fades while the view is covered or tells nothing."""
@@ -318,6 +337,7 @@ class Run:
             self._pending_reach,
             self.pose,
             self.belief.speeds.at(best),
+            self._sighting,
         )
 
     @classmethod
@@ -327,7 +347,7 @@ class Run:
         run.frames, run.unrecognized = state.frames, state.unrecognized
         run._pending = Pending(state.odometry, state.reach)
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
-        run._pending_reach, run.pose = state.pending_reach, state.pose
+        run._pending_reach, run.pose, run._sighting = state.pending_reach, state.pose, state.sighting
         if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))
             given = np.full(len(graph), max(rest / len(graph), 1e-12), np.float32)

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.belief import Odometry, Run, RunOptions, Step, evidence, place_graph, view_of
+from core.belief import Odometry, Run, RunOptions, Step, evidence_of, place_graph, view_of
 from core.errors import StorageFailure, StorageFull
 from core.frames.preprocessing import Pixels
 from core.judgement.alignment import LEAST_FRAMES, of_matrix, shared_stretches
@@ -90,11 +90,7 @@ def _follow(map_: Map, frames: Sequence[Pixels], answers: Sequence[Answer]) -> N
     for step in STEPS:
         run = Run(RunOptions(lag=1), graph)
         for frame, answer in zip(frames, answers, strict=True):
-            ranked = answer.candidates
-            found = evidence(
-                ranked.rows, ranked.scores, ranked.whereabouts, answer.calibration, neighborhood, ranked.examined
-            )
-            run.advance(found, step, view_of(frame))
+            run.advance(evidence_of(answer, neighborhood), step, view_of(frame))
             run.estimate(1, snapshot.alive)
             run.earlier(1, snapshot.alive)
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
+from core.belief import NOTHING, Candidate, Estimate, Run, Step, View, evidence_of, view_of
 from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
@@ -166,7 +166,8 @@ def _advance(
     """Update the belief, save the session, and answer."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    run.advance(_evidence(map_, answered), step, view, options.odometry_pose())
+    seen = NOTHING if answered is None else evidence_of(answered, neighborhood_of(map_))
+    run.advance(seen, step, view, options.odometry_pose())
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -226,22 +227,6 @@ def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, M
     if run.graph.posed.any():
         motion = "odometry" if odometry is not None else "speed-limit" if reach is not None else motion
     return Step(odometry, reach, frames), motion
-
-
-def _evidence(map_: Map, found: Answer | None) -> Evidence:
-    if found is None:
-        return NOTHING
-    ranked = found.candidates
-    verified = None if ranked.geometry is None else ranked.geometry.evidence
-    return evidence(
-        ranked.rows,
-        ranked.scores,
-        ranked.whereabouts,
-        found.calibration,
-        neighborhood_of(map_),
-        ranked.examined,
-        verified,
-    )
 
 
 def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]:

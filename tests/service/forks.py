@@ -12,9 +12,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping
-from multiprocessing.context import ForkServerContext
+from multiprocessing import popen_forkserver
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -36,6 +39,24 @@ context: ForkServerContext = multiprocessing.get_context("forkserver")
 context.set_forkserver_preload(list(MODULES))
 
 
+class _Popen(popen_forkserver.Popen):
+    """Its exit status is read once: of two threads that read it at the same time, one would find 255."""
+
+    def __init__(self, process: BaseProcess) -> None:
+        self._reading = threading.Lock()
+        super().__init__(process)
+
+    def poll(self, flag: int = os.WNOHANG) -> int | None:
+        with self._reading:
+            return super().poll(flag)
+
+
+class _Process(ForkServerProcess):
+    @staticmethod
+    def _Popen(process_obj: BaseProcess) -> _Popen:  # noqa: N802
+        return _Popen(process_obj)
+
+
 class ForkedServer:
     """``placerec serve`` in a process that was forked off; used as :class:`subprocess.Popen` is.
 
@@ -46,7 +67,7 @@ class ForkedServer:
     """
 
     def __init__(self, environment: Mapping[str, str], log: Path, traced: bool = False) -> None:
-        self._process = context.Process(target=_serve, args=(dict(environment), log, traced), daemon=True)
+        self._process = _Process(target=_serve, args=(dict(environment), log, traced), daemon=True)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid

@@ -98,7 +98,8 @@ class Localizer:
         self._sent: Frame | None = None
         self._correction: Planar | None = None
         self._mapping = False
-        self._paused_until = self._heard = self._pictured = 0.0
+        self._paused_until = 0.0
+        self._heard = self._pictured = -math.inf  # a robot that has just started counts few seconds
         self._pause = FIRST_PAUSE
         began = datetime.now(UTC)
         self._sequence = settings.sequence or f"ros-{began:%Y%m%dT%H%M%SZ}"

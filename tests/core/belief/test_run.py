@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from core.belief import (
     PlaceGraph,
     Run,
     RunOptions,
+    Sighting,
     Step,
     Stride,
     View,
@@ -168,6 +170,62 @@ def test_a_record_that_was_changed_is_refused() -> None:
     for bad in (b"", data[:7], data[:-1], data[:9] + b"?" + data[10:]):
         with pytest.raises(DamagedRecord):
             from_bytes(bad)
+
+
+def recognized_at(row: int, probability: float = 0.8, *rows: int) -> Evidence:
+    """A frame that is recognized by itself, and speaks for a row no more than for others."""
+    return replace(shows(row, *rows, gain=0.5, unknown=NOWHERE), sighting=Sighting(row, probability))
+
+
+def test_a_first_frame_that_is_recognized_by_itself_is_recognized() -> None:
+    graph = graph_of(walk(200), Neighborhood(5, 3))
+    run = Run(DEFAULT, graph)
+    run.advance(recognized_at(90), Step(), view(90))
+    told = run.estimate(5, alive(graph))
+    assert told.verdict == "recognized" and told.candidates[0].row == 90
+    assert told.candidates[0].probability == pytest.approx(0.8)
+    again = Run.restored(DEFAULT, graph, from_bytes(to_bytes(run.state())))
+    assert again.look(1, alive(graph)).verdict == "recognized", "after a restart, too"
+    for _ in range(5):  # it stands there
+        run.advance(recognized_at(91), Step(), view(90))
+        assert run.sight == "constant" and run.estimate(1, alive(graph)).verdict == "recognized"
+    living = alive(graph)
+    living[90] = False
+    assert run.look(1, living).verdict != "recognized", "the place was deleted meanwhile"
+    verdicts = []
+    for _ in range(4):
+        run.advance(shows(90, gain=0.1, unknown=NOWHERE), Step(), view(90))
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    assert verdicts[0] == "recognized" and verdicts[-1] == "unknown", "its view no longer fits"
+    run.advance(NOTHING, Step(), BLACK)
+    assert run.estimate(1, alive(graph)).verdict == "unknown"
+
+
+def test_a_frame_that_is_recognized_elsewhere_makes_a_run_that_is_sure_ambiguous() -> None:
+    random, graph = np.random.default_rng(3), graph_of(walk(400), Neighborhood(5, 3))
+    run = Run(DEFAULT, graph)
+    for row in range(50, 80):
+        run.advance(seen_at(row, 400, random), Step(), view(row))
+    sure = run.estimate(1, alive(graph))
+    assert sure.verdict == "recognized" and sure.candidates[0].row == 79
+    run.advance(recognized_at(300, 0.6, 80), Step(), view(300))
+    assert run.look(1, alive(graph)).candidates[0].row == 80, "the run is surer than this frame"
+    run.advance(recognized_at(301, 0.999, 81), Step(), view(301))
+    told = run.look(2, alive(graph))
+    assert told.verdict == "ambiguous"
+    assert {one.row for one in told.candidates} == {301, 81}
+
+
+def test_probabilities_of_a_run_add_up_to_one_whatever_a_frame_alone_says() -> None:
+    random, graph = np.random.default_rng(8), graph_of(walk(30), Neighborhood(5, 1))
+    run = Run(DEFAULT, graph)
+    for row in (5, 6, 7, 20, 21):
+        run.advance(replace(seen_at(row, 30, random), sighting=Sighting(row, 0.95)), Step(), view(row))
+        told = run.estimate(30, alive(graph))
+        assert sum(one.probability for one in told.candidates) + told.unknown == pytest.approx(1, abs=2e-2)
+        assert [one.probability for one in told.candidates] == sorted(
+            (one.probability for one in told.candidates), reverse=True
+        )
 
 
 def test_the_place_of_some_frames_ago_is_told_better_later() -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from core.belief import Run, RunOptions, Step, evidence, place_graph
+from core.belief import Run, RunOptions, Step, evidence_of, place_graph
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
 from core.maps import Enrolment, MapSettings
@@ -146,11 +146,7 @@ def test_a_stop_is_one_place_of_a_session(
     assert len(graph) == PLACES
     run = Run(RunOptions(), graph)
     for encoding in walk:
-        answer = ask(map_, encoder, encoding)
-        seen = answer.candidates
-        run.advance(
-            evidence(seen.rows, seen.scores, seen.whereabouts, answer.calibration, neighborhood, seen.examined), Step()
-        )
+        run.advance(evidence_of(ask(map_, encoder, encoding), neighborhood), Step())
     found = run.estimate(1, snapshot.alive)
     (place,) = map_.places_at([found.candidates[0].row])
     assert found.verdict == "recognized" and place is not None
