@@ -16,6 +16,9 @@ from core.judgement.verdict import Verdict
 RECOGNIZED = 0.5
 """A place is recognized from this probability on, its neighbours included; so is not being in the map."""
 
+CLEAR = 2.0
+"""A place is recognized if it is this many times as probable as any other: of two that look the same none is."""
+
 MODES = 8
 """At least this many distinct places are looked for, each with its neighbours."""
 
@@ -52,7 +55,7 @@ def estimate(belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting |
     """Summarize a belief.
 
     The verdict is ``unknown`` if not being in the map has a probability of at least RECOGNIZED, ``recognized`` if one
-    place with its neighbours has, else ``ambiguous``.
+    place with its neighbours has, and is CLEAR of all others, else ``ambiguous``.
 
     Args:
         count: how many candidates to list.
@@ -67,7 +70,8 @@ def estimate(belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting |
 def _verdict(candidates: Sequence[Candidate], unknown: float) -> Verdict:
     if unknown >= RECOGNIZED or not candidates:
         return "unknown"
-    return "recognized" if candidates[0].probability >= RECOGNIZED else "ambiguous"
+    best, second = candidates[0].probability, candidates[1].probability if len(candidates) > 1 else 0.0
+    return "recognized" if best >= max(RECOGNIZED, CLEAR * second) else "ambiguous"
 
 
 def _sighted(

@@ -15,6 +15,7 @@ as well, which ``estimate`` holds against the belief.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,6 +97,7 @@ def evidence_of(answer: Answer, neighborhood: Neighborhood) -> Evidence:
         neighborhood,
         ranked.examined,
         None if ranked.geometry is None else ranked.geometry.evidence,
+        [place for group in answer.judgement.rivals if group.same_place for place in group.positions],
     )
     return sighted(seen, ranked.rows, answer.judgement)
 
@@ -119,6 +121,7 @@ def evidence(
     neighborhood: Neighborhood,
     examined: NDArray[np.bool_] | None = None,
     verified: NDArray[np.float64] | None = None,
+    rivals: Sequence[int] = (),
 ) -> Evidence:
     """The evidence of a search.
 
@@ -133,6 +136,8 @@ def evidence(
         verified: float64 [n], what geometric verification found of them (``core.geometry.verification``), -ln of the
             number of false alarms; NaN where a place was not verified, of which other frames of its view may tell.
             None: none was.
+        rivals: positions of places that show what the best match shows, as another traverse's do.  They and their
+            neighbours are no background: a robot is at one of them, whichever it is, and in the map.
     """
     if len(rows) == 0:
         return NOTHING
@@ -141,6 +146,9 @@ def evidence(
     values = scores[listed].astype(np.float64)
     others = whereabouts.others(int(listed[0]), neighborhood, across=False)
     apart = ~whereabouts.near(int(listed[0]), neighborhood.times(GUARD_FACTOR))
+    for rival in rivals:
+        elsewhere = ~whereabouts.near(rival, neighborhood)
+        others, apart = others & elsewhere, apart & elsewhere
     rest = values[others[listed]]
     ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])
     shares = (values - ordinary) / (believable - ordinary)
@@ -148,6 +156,8 @@ def evidence(
     if verified is not None:
         found = np.log1p(_of_views(verified[listed], whereabouts.take(listed))) - np.log1p(VERIFIED)
         ratios += np.nan_to_num(0.5 * np.clip(found, LEAST_VERIFIED, MOST_VERIFIED))
+    if rivals:  # neighbours of one of them, cut to as much as it, would decide between them
+        ratios *= min(1.0, STRONGEST / float(ratios.max()))
     gains = np.minimum(ratios, STRONGEST).astype(np.float32)
     gaining = gains > 0
     beside = others[listed] & gaining

@@ -11,7 +11,9 @@ however alike the two are.  So equal doors of a long corridor are several views.
 
 How alike two frames are is told by the cells of the second stage at the same spots of both: freed of what all cells of
 their frame have in common, the mean of their cosines.  Noise, compression and exposure change it hardly, a step of the
-robot does at once.  Encoders without a second stage have descriptors only, which noise changes more.
+robot does at once.  Somebody who passes changes some of the cells and leaves the others as they were, so that two
+frames show nearly the same, too, if many of their cells do.  Encoders without a second stage have descriptors only,
+which noise changes more.
 """
 
 from __future__ import annotations
@@ -30,6 +32,12 @@ SAME, ABOUT = 0.9, 0.8
 5 % of exposure leave 0.98 and more by day and 0.93 by night (train/day_night); consecutive frames of corridor have 0.88
 at most, those of lip6 0.76.  At 25 frames for each of theirs, a map has about one view for each reference of corridor
 and three for each of lip6 (``python -m benchmarks.day.standing``)."""
+
+UNCHANGED, STAYING = 0.96, 0.4
+"""Cosine from which a cell has not changed, and the share of such cells from which two frames show nearly the same
+behind what has.  Somebody who hides a fifth of the picture leaves 0.4 or more in nine cases of ten; consecutive frames
+of corridor, lip6, kitti_short and train/tower have fewer.  Of train/camvid it adds the frames of a car that waits while
+others drive past."""
 
 SAME_DESCRIPTOR, ABOUT_DESCRIPTOR = 0.74, 0.6
 """The same for the cosine of descriptors.  The encoders without a second stage have 0.72 and more after such noise;
@@ -64,22 +72,33 @@ def are_apart(one: Pose | None, other: Pose | None, reach: float) -> bool:
 def shows_same(one: Look, other: Look, about: bool = False) -> bool:
     """Whether two frames of one map show nearly the same, or ``about`` the same."""
     if one.local.size and other.local.size:
-        return likeness(one.local, other.local) >= (ABOUT if about else SAME)
+        alike = cosines(one.local, other.local)
+        if not len(alike):
+            return False
+        return bool(alike.mean() >= (ABOUT if about else SAME) or (alike >= UNCHANGED).mean() >= STAYING)
     return cosine(one.descriptor, other.descriptor) >= (ABOUT_DESCRIPTOR if about else SAME_DESCRIPTOR)
 
 
 def likeness(one: NDArray[np.int8], other: NDArray[np.int8]) -> float:
-    """The mean cosine of the cells that two frames have at the same spots, int8 [C, L] each, freed of their means.
+    """The mean of :func:`cosines`; 0 without any."""
+    alike = cosines(one, other)
+    return float(alike.mean()) if len(alike) else 0.0
 
-    Cells that are hidden in one of them, which are zero, do not count; with none left it is 0.
+
+def cosines(one: NDArray[np.int8], other: NDArray[np.int8]) -> NDArray[np.float32]:
+    """The cosines of the cells that two frames have at the same spots, int8 [C, L] each, freed of their means.
+
+    Returns:
+        float32 [n]; cells that are hidden in one of the frames, which are zero, are left out.
     """
     seen = one.any(axis=1) & other.any(axis=1)
     if not seen.any():
-        return 0.0
+        return np.empty(0, np.float32)
     a, b = (_centred(cells[seen].astype(np.float32)) for cells in (one, other))
     products = np.einsum("cl,cl->c", a, b)
     lengths = np.sqrt(np.einsum("cl,cl->c", a, a) * np.einsum("cl,cl->c", b, b))
-    return float((products / np.maximum(lengths, 1e-9)).mean())
+    found: NDArray[np.float32] = products / np.maximum(lengths, 1e-9)
+    return found
 
 
 def _centred(cells: NDArray[np.float32]) -> NDArray[np.float32]:

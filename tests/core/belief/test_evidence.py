@@ -57,6 +57,18 @@ def test_tiny_maps() -> None:
     assert 0 not in told([0.01], 1)
 
 
+def test_places_that_show_the_same_do_not_speak_against_one_another() -> None:
+    scores = np.array([1.0, 0.99, *np.linspace(0.08, 0.06, 60)], np.float32)
+    rows, where, marks = np.arange(len(scores)), walk(*[1] * len(scores)), np.arange(len(scores)) < 30
+    alone = evidence(np.delete(rows, 1), np.delete(scores, 1), walk(*[1] * 61), CALIBRATION, APART, np.delete(marks, 1))
+    twins = evidence(rows, scores, where, CALIBRATION, APART, marks, rivals=[1])
+    rivals = evidence(rows, scores, where, CALIBRATION, APART, marks)
+    assert twins.unknown == pytest.approx(alone.unknown, abs=0.05) and rivals.unknown > twins.unknown + 1
+    assert twins.gains[:2] == pytest.approx(alone.gains[0], abs=0.1)
+    scores[2] = 0.9  # a neighbour of the first: it says less
+    assert evidence(rows, scores, where, CALIBRATION, APART, marks, rivals=[1]).gains[2] < 0.95 * STRONGEST
+
+
 def test_what_verification_found_raises_and_lowers_a_places_evidence() -> None:
     scores = np.array([0.16, 0.15, 0.14, *np.linspace(0.08, 0.06, 60)], np.float32)
     verified = np.full(len(scores), np.nan)

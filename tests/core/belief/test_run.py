@@ -228,6 +228,15 @@ def test_probabilities_of_a_run_add_up_to_one_whatever_a_frame_alone_says() -> N
         )
 
 
+def test_of_two_places_that_look_the_same_none_is_recognized() -> None:
+    graph = graph_of(walk(40, 40))
+    run = Run(DEFAULT, graph)
+    for row in range(20):
+        run.advance(shows(row, 40 + row, gain=6, unknown=-3), Step(), view(row))
+        told = run.estimate(1, alive(graph))
+        assert told.verdict == "ambiguous" and told.unknown < 0.1
+
+
 def test_the_place_of_some_frames_ago_is_told_better_later() -> None:
     graph = graph_of(walk(40))
     run = Run(RunOptions(lag=3, stride=Stride()), graph)

@@ -69,6 +69,19 @@ def test_a_robot_that_stands_is_at_one_position() -> None:
     assert positions([look(cells(1)), *stop, look(cells(3))]) == [0, *[1] * 50, 2]
 
 
+def test_people_who_pass_hide_no_stop() -> None:
+    stop = cells(2)
+    looks = []
+    for number in range(20):
+        passed = stop.copy()
+        if number % 2:  # another one each time, before other cells
+            start = number % 5 * 5
+            passed[start : start + 15] = cells(100 + number)[:15]
+        looks.append(look(passed, 2, number))
+    assert likeness(looks[0].local, looks[1].local) < ABOUT
+    assert positions([look(cells(1)), *looks, look(cells(3))]) == [0, *[1] * 20, 2]
+
+
 @pytest.mark.parametrize(("between_them", "expected"), [(2, [0, 1, 2, 0]), (4, [0, 1, 2, 3, 4, 5])])
 def test_a_view_may_be_hidden_for_a_moment_only(between_them: int, expected: list[int]) -> None:
     others = [look(cells(10 + number)) for number in range(between_them)]
