@@ -19,14 +19,19 @@ from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 
 from core.errors import InvalidIdentifier
 
-UNSEEN = r"\x00-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
-"""The inside of a character class: controls (C0, DEL, C1), ends of lines and paragraphs, marks of direction, and what
-takes no room.  The two joiners (U+200C, U+200D) are allowed, for they change how letters of some scripts look."""
+UNSEEN = (
+    r"\x00-\x1f\x7f-\x9f\xad\u061c\u115f\u1160\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\u2800\u3164\ufeff"
+    r"\uffa0\ufff9-\ufffb"
+)
+"""The inside of a character class: controls (C0, DEL, C1), ends of lines and paragraphs, marks of direction, what takes
+no room, and what fills room that looks empty (of Hangul and Braille).  The two joiners (U+200C, U+200D) are allowed,
+for they change how letters of some scripts look."""
 
 _NONE_OF = rf"/\\{UNSEEN}"
 
-TEXT = rf"(\.{{0,2}}[^.{_NONE_OF}]|\.{{3}})[^{_NONE_OF}]*"
-"""Any text that has neither a slash, nor a backslash, nor an unseen character, and is not ``.`` or ``..``."""
+TEXT = rf"(\.{{0,2}}[^.\s{_NONE_OF}]|\.{{3}})[^{_NONE_OF}]*"
+"""Any text that has neither a slash, nor a backslash, nor an unseen character, is not ``.`` or ``..``, and does not
+begin with a space, also behind these, so that it is not empty for those who look."""
 
 _NO_NAME = re.compile(r"(\.|%2e){1,2}|.*[\ud800-\udfff\U000e0001\U000e0020-\U000e007f].*", re.IGNORECASE | re.DOTALL)
 """What is a text by the pattern and no name: the dots of a path, what UTF-8 has not, and tags, which nobody sees."""
@@ -88,7 +93,7 @@ def texts(what: str) -> Names:
     """Names that are texts, of 1 to ``LONGEST`` characters."""
     rule = (
         f"has 1 to {LONGEST} characters, no slash or backslash, no characters that cannot be seen, "
-        "and is not '.' or '..', however they are written"
+        "no space at its beginning, and is not '.' or '..', however they are written"
     )
     return Names(what, TEXT, rule, LONGEST)
 

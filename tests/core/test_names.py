@@ -31,12 +31,14 @@ from core.places import (
     check_sequence,
 )
 
+FILLERS = "\u115f\u1160\u2800\u3164\uffa0"
 JOINERS = {"\u200c", "\u200d"}
 SEEN = {*map(chr, range(0x600, 0x606)), "\u06dd", "\u070f", "\u0890", "\u0891", "\u08e2"}
 SEEN_BEYOND = {chr(point) for point in range(0x10000, 0xE0000) if unicodedata.category(chr(point)) == "Cf"}
 """Signs that are drawn, of the category Cf: of Arabic and Syriac; beyond U+FFFF also of shorthand and of music."""
 ODD = (
-    "./\\%2eE \n\r\0\x7f\x80\x9f\xad\u061c\u200b\u200d\u200e\u2028\u2029\u202e\u2066\u2069\ufeff\U000e0041\ud800üА日💡"
+    "./\\%2eE \u2003\u3164"
+    "\n\r\0\x7f\x80\x9f\xad\u061c\u200b\u200d\u200e\u2028\u2029\u202e\u2066\u2069\ufeff\U000e0041\ud800üА日💡"
 )
 SEQUENCE: TypeAdapter[str] = TypeAdapter(Sequence)
 WORDS = (MAP_ID, PLACE_ID, NETWORK_NAMES.pattern, word(64), word(64, more="@"))
@@ -44,12 +46,13 @@ WORDS = (MAP_ID, PLACE_ID, NETWORK_NAMES.pattern, word(64), word(64, more="@"))
 
 def can_be(text: str) -> bool:
     dots = unquote(text) in (".", "..")
-    return 0 < len(text) <= LONGEST and not dots and not any(map(cannot_be_in, text))
+    blank = not text.startswith("...") and text.lstrip(".")[:1].isspace()
+    return not blank and 0 < len(text) <= LONGEST and not dots and not any(map(cannot_be_in, text))
 
 
 def cannot_be_in(letter: str) -> bool:
     unseen = unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp")
-    return letter in "/\\" or (unseen and letter not in JOINERS | SEEN | SEEN_BEYOND)
+    return letter in "/\\" or letter in FILLERS or (unseen and letter not in JOINERS | SEEN | SEEN_BEYOND)
 
 
 def taken(text: str) -> bool:
@@ -73,7 +76,7 @@ def test_a_name_is_what_can_be_read_and_stands_in_a_path(text: str) -> None:
     assert taken(text) == can_be(text)
 
 
-@pytest.mark.parametrize("letter", [chr(point) for point in range(0x3000) if cannot_be_in(chr(point))], ids=ascii)
+@pytest.mark.parametrize("letter", [chr(point) for point in range(0x3200) if cannot_be_in(chr(point))], ids=ascii)
 def test_no_name_has_an_unseen_character(letter: str) -> None:
     for text in (letter, f"a{letter}", f"{letter}a", f"a{letter}b", f"..{letter}", f"...{letter}"):
         assert not taken(text)
@@ -81,7 +84,8 @@ def test_no_name_has_an_unseen_character(letter: str) -> None:
 
 def test_dots_are_names_only_from_three_on() -> None:
     assert [taken("." * count) for count in range(5)] == [False, False, False, True, True]
-    assert all(map(taken, (".a", "..a", "a..", "a.", "a", ". ", ".%", "…", "x" * LONGEST)))
+    assert all(map(taken, (".a", "..a", "a..", "a.", "a", "a ", "... ", ".%", "…", "x" * LONGEST)))
+    assert not any(map(taken, (" ", "\u2003", " a", ". ", "..\u00a0")))
     assert not taken("x" * (LONGEST + 1))
 
 

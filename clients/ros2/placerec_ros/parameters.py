@@ -15,8 +15,11 @@ from urllib.parse import urlsplit
 
 MAP_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
-_UNSEEN = r"\x00-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
-TRAVERSE = re.compile(rf"(\.{{0,2}}[^./\\{_UNSEEN}]|\.{{3}})[^/\\{_UNSEEN}]*")
+_UNSEEN = (
+    r"\x00-\x1f\x7f-\x9f\xad\u061c\u115f\u1160\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\u2800\u3164\ufeff"
+    r"\uffa0\ufff9-\ufffb"
+)
+TRAVERSE = re.compile(rf"(\.{{0,2}}[^.\s/\\{_UNSEEN}]|\.{{3}})[^/\\{_UNSEEN}]*")
 """What the service takes for the name of a traverse, of 128 characters at most: no ``.`` or ``..``, nothing unseen."""
 KEY_VARIABLE = "PLACEREC_KEY"
 
@@ -182,7 +185,8 @@ def settings(values: Mapping[str, Any], environment: Mapping[str, str] = os.envi
     if values["sequence"] and (len(values["sequence"]) > 128 or not TRAVERSE.fullmatch(values["sequence"])):
         raise InvalidParameters(
             f"The parameter sequence is {values['sequence'][:140]!a}, which cannot name a traverse: a name has 1 to "
-            "128 characters, no slash or backslash, no characters that cannot be seen, and is not '.' or '..'."
+            "128 characters, no slash or backslash, no characters that cannot be seen, no space at its beginning, "
+            "and is not '.' or '..'."
         )
     return Settings(**{one.name: values[one.name] for one in PARAMETERS}, key=_key(values["key_file"], environment))
 
