@@ -37,7 +37,7 @@ Url = Annotated[
     typer.Option(
         "--url",
         envvar="PLACEREC_URL",
-        help="URL of the service. Without it the command opens the data directory itself, unless a service uses it.",
+        help="URL of the service. Without it the command opens the data directory itself, which no service may hold.",
     ),
 ]
 DataDir = Annotated[
@@ -201,7 +201,7 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
         try:
             await stack.enter_async_context(application.router.lifespan_context(application))
         except DataDirectoryLocked as error:
-            raise Failure(f"{error} Give --url to use the service that holds it.") from error
+            raise Failure(str(error)) from error
         client = AsyncClient(
             "http://placerec",
             timeout=ANSWER_SECONDS,
