@@ -246,9 +246,15 @@ class EarlierBelief(BaseModel):
 class BeliefView(BaseModel):
     """The belief about where a robot is."""
 
-    verdict: Verdict = Field(description="recognized: one place, with its neighbours, is at least as probable as not.")
+    verdict: Verdict = Field(
+        description="recognized: one place, with its neighbours, is at least as probable as not, and twice as probable "
+        "as any other."
+    )
     place: PlaceView | None = Field(description="Non-null only if recognized.")
-    probability: float | None = Field(description="The probability of the best candidate; null if there is none.")
+    probability: float | None = Field(
+        description="The probability of the best candidate, by the run, or by this frame alone if that is surer; null if "
+        "there is none."
+    )
     unknown: float = Field(description="The probability that the robot is at a place that the map does not have.")
     lost: bool = Field(description="The robot was recognized in this session, but not in the last five frames or more.")
     candidates: list[BelievedPlace] = Field(description="Distinct places, best first, with any verdict.")
