@@ -252,8 +252,8 @@ class BeliefView(BaseModel):
     )
     place: PlaceView | None = Field(description="Non-null only if recognized.")
     probability: float | None = Field(
-        description="The probability of the best candidate, by the run, or by this frame alone if that is surer; null if "
-        "there is none."
+        description="The probability of the best candidate, by the run, or by this frame alone if that is surer; null "
+        "if there is none."
     )
     unknown: float = Field(description="The probability that the robot is at a place that the map does not have.")
     lost: bool = Field(description="The robot was recognized in this session, but not in the last five frames or more.")
