@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core.belief.evidence import Sighting
 from core.belief.filter import Belief
 from core.belief.graph import PlaceGraph
+from core.judgement.background import GUARD_FACTOR
 from core.judgement.verdict import Verdict
 
 RECOGNIZED = 0.5
@@ -51,7 +52,9 @@ class Estimate:
     unknown: float
 
 
-def estimate(belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting | None = None) -> Estimate:
+def estimate(
+    belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting | None = None, guided: bool = False
+) -> Estimate:
     """Summarize a belief.
 
     The verdict is ``unknown`` if not being in the map has a probability of at least RECOGNIZED, ``recognized`` if one
@@ -60,39 +63,49 @@ def estimate(belief: Belief, graph: PlaceGraph, count: int, sighting: Sighting |
     Args:
         count: how many candidates to list.
         sighting: of the present frame, if it is recognized by itself.
+        guided: whether the motion to this frame was known among the poses of the map.
     """
     candidates, unknown = [] if not len(graph) else _modes(belief.places, graph, max(count, MODES)), belief.unknown
     if sighting is not None and candidates:
-        candidates, unknown = _sighted(candidates, unknown, sighting, graph)
-    return Estimate(_verdict(candidates, unknown), tuple(candidates[:count]), unknown)
+        candidates, unknown = _sighted(candidates, unknown, sighting, graph, guided)
+    return Estimate(_verdict(candidates, unknown, graph), tuple(candidates[:count]), unknown)
 
 
-def _verdict(candidates: Sequence[Candidate], unknown: float) -> Verdict:
+def _verdict(candidates: Sequence[Candidate], unknown: float, graph: PlaceGraph) -> Verdict:
     if unknown >= RECOGNIZED or not candidates:
         return "unknown"
-    best, second = candidates[0].probability, candidates[1].probability if len(candidates) > 1 else 0.0
-    return "recognized" if best >= max(RECOGNIZED, CLEAR * second) else "ambiguous"
+    elsewhere = ~_near(candidates[0].row, candidates, graph, GUARD_FACTOR)
+    rival = max((one.probability for one, far in zip(candidates, elsewhere, strict=True) if far), default=0.0)
+    return "recognized" if candidates[0].probability >= max(RECOGNIZED, CLEAR * rival) else "ambiguous"
+
+
+def _near(row: int, candidates: Sequence[Candidate], graph: PlaceGraph, times: float = 1) -> NDArray[np.bool_]:
+    """Which candidates are within so many times the reach of what is the same place as a row; bool [k]."""
+    places = graph.places_at(np.array([row, *(one.row for one in candidates)]))
+    return graph.whereabouts.take(places).near(0, graph.neighborhood.times(times))[1:]
 
 
 def _sighted(
-    candidates: list[Candidate], unknown: float, sighting: Sighting, graph: PlaceGraph
+    candidates: list[Candidate], unknown: float, sighting: Sighting, graph: PlaceGraph, guided: bool
 ) -> tuple[list[Candidate], float]:
     """The candidates, best first, and the probability of not being in the map, where a sighting is surer than these.
 
     Its place gets its probability, and everything else shares the rest as before (Jeffrey's rule of conditioning).  A
     belief that is sure of another place is contradicted: one of the two is right at most, so that they share what they
-    have, and neither is recognized.  One that is sure not to be in the map needs more than a single frame.
+    have, and neither is recognized.  But where exactly the robot is, a belief that is sure of a place beside it knows
+    better, and so does one that is sure not to be in the map.
     """
-    best, verdict = candidates[0], _verdict(candidates, unknown)
+    best, verdict = candidates[0], _verdict(candidates, unknown, graph)
     (place,) = graph.places_at(np.array([sighting.row])).tolist()
     if place < 0 or sighting.probability <= best.probability:
         return candidates, unknown
-    near = np.isin(graph.places_at(np.array([one.row for one in candidates])), graph.same_place(place))
-    if verdict == "unknown" and not near[0]:
+    near = _near(sighting.row, candidates, graph)
+    beside = bool(_near(sighting.row, candidates[:1], graph, GUARD_FACTOR)[0])
+    if (verdict == "unknown" and not near[0]) or (verdict == "recognized" and beside and (guided or not near[0])):
         return candidates, unknown
     believed = sum(one.probability for one, same in zip(candidates, near, strict=True) if same)
     others = [one for one, same in zip(candidates, near, strict=True) if not same]
-    if verdict == "recognized" and not near[0]:
+    if verdict == "recognized" and not beside:
         half = (best.probability + believed) / 2
         claims, others, rest = [replace(best, probability=half), Candidate(sighting.row, half)], others[1:], 1.0
     else:

@@ -131,6 +131,7 @@ class Run:
         self.pose: OdometryPose | None = None
         self._view: View | None = None
         self._sighting: Sighting | None = None
+        self._guided = False
         self._pending_reach = 0.0
         self._pending = Pending()
         self._smoother = Smoother(options.lag)
@@ -197,7 +198,8 @@ class Run:
             self._view = view or self._view
         if self.sight != "constant":  # a view that stays shows what it has shown
             self._sighting = seen.sighting
-        stands = self.sight == "constant" and (step.odometry is None or not by_poses(self.graph, step))
+        self._guided = by_poses(self.graph, step)
+        stands = self.sight == "constant" and (step.odometry is None or not self._guided)
         self._filter(seen, step, share, stands, change)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
@@ -313,7 +315,7 @@ class Run:
             belief = Belief(given.astype(np.float32), min(unknown, 1.0))
             if sighting is not None and not (sighting.row < len(alive) and alive[sighting.row]):
                 sighting = None
-        return estimate(belief, self.graph, count, sighting)
+        return estimate(belief, self.graph, count, sighting, self._guided)
 
     def _now(self) -> Belief:
         """The present belief; what is believed to be seen fades while the view is covered or tells nothing."""

@@ -183,7 +183,9 @@ class FolderLock:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(self._descriptor)
-            raise DataDirectoryLocked(f"Another process holds {path.parent}: stop it first, or use it with --url.") from error
+            raise DataDirectoryLocked(
+                f"Another process holds {path.parent}: stop it first, or use it with --url."
+            ) from error
         except OSError:
             os.close(self._descriptor)
             raise
