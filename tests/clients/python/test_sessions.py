@@ -206,6 +206,28 @@ def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
 
 
 @pytest.mark.parametrize("streamed", [False, True])
+def test_a_refused_frame_leaves_the_numbers_alone(walk: Map, streamed: bool) -> None:
+    frame = jpeg(0, 64, 48)
+    with walk.sessions.begin() as session, session.stream() as stream:
+        send = (stream if streamed else session).send
+        assert [send(frame).frame for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(problems.FrameOutOfOrder):
+            send(frame, frame=1)
+        with pytest.raises(problems.NotAnImage):
+            send(b"no picture")
+        with pytest.raises(problems.NotAnImage):
+            send(b"no picture", frame=9)
+        assert send(frame).frame == 3
+        assert send(frame, frame=3).repeated
+        assert send(frame).frame == 4
+        # Another one has sent frames since: the number that was refused is not given again and again.
+        walk.sessions[session.id].send(frame, frame=20)
+        with pytest.raises(problems.FrameOutOfOrder):
+            send(frame)
+        assert send(frame).frame == 21
+
+
+@pytest.mark.parametrize("streamed", [False, True])
 def test_frames_at_the_same_time_are_sent_in_their_order(url: str, walk: Map, streamed: bool) -> None:
     async def work() -> list[models.SessionAnswer]:
         async with AsyncClient(url) as client, client.maps[walk.id].sessions.begin() as session:

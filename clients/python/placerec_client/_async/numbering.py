@@ -6,10 +6,11 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from placerec_client import models, parameters
+from placerec_client import models, parameters, problems
 from placerec_client._async.concurrency import Lock, acquire
 from placerec_client._async.connection import AsyncConnection
-from placerec_client.errors import DeadlineExceeded
+from placerec_client.answers import OVERLOADED
+from placerec_client.errors import DeadlineExceeded, Problem
 
 
 class AsyncNumbering:
@@ -29,6 +30,8 @@ class AsyncNumbering:
     async def turn(self, deadline: float | None) -> AsyncIterator[Callable[[], float | None]]:
         """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
 
+        A frame that the service refuses within leaves the next number as it was.
+
         Raises:
             DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
         """
@@ -37,8 +40,15 @@ class AsyncNumbering:
             await acquire(self._lock, deadline)
         except TimeoutError as error:
             raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
+        before = self._next
         try:
             yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
+        except Problem as problem:
+            if isinstance(problem, problems.FrameOutOfOrder) and self._next != before:
+                self._next = None  # another one has sent frames since: the service is asked how far it is
+            elif problem.status not in OVERLOADED:  # before which an attempt may have been lost and counted
+                self._next = before
+            raise
         finally:
             self._lock.release()
 
@@ -55,5 +65,5 @@ class AsyncNumbering:
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next
-        self._next = given + 1
+        self._next = max(given + 1, self._next or 0)
         return {**options, "frame": given}

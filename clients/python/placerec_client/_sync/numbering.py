@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from placerec_client import models, parameters
+from placerec_client import models, parameters, problems
 from placerec_client._sync.concurrency import Lock, acquire
 from placerec_client._sync.connection import Connection
-from placerec_client.errors import DeadlineExceeded
+from placerec_client.answers import OVERLOADED
+from placerec_client.errors import DeadlineExceeded, Problem
 
 
 class Numbering:
@@ -30,6 +31,8 @@ class Numbering:
     def turn(self, deadline: float | None) -> Iterator[Callable[[], float | None]]:
         """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
 
+        A frame that the service refuses within leaves the next number as it was.
+
         Raises:
             DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
         """
@@ -38,8 +41,15 @@ class Numbering:
             acquire(self._lock, deadline)
         except TimeoutError as error:
             raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
+        before = self._next
         try:
             yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
+        except Problem as problem:
+            if isinstance(problem, problems.FrameOutOfOrder) and self._next != before:
+                self._next = None  # another one has sent frames since: the service is asked how far it is
+            elif problem.status not in OVERLOADED:  # before which an attempt may have been lost and counted
+                self._next = before
+            raise
         finally:
             self._lock.release()
 
@@ -56,5 +66,5 @@ class Numbering:
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next
-        self._next = given + 1
+        self._next = max(given + 1, self._next or 0)
         return {**options, "frame": given}
