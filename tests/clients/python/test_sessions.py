@@ -189,9 +189,33 @@ def test_a_session_that_has_not_begun_says_how_it_begins(lab: Map) -> None:
             PlacerecError, match=r"has not begun: .*`with lab\.sessions\.begin\(\) as session:`, or by sess"
         ):
             use()
-    session.begin()
-    assert session.send(jpeg(1, 64, 48)).frames == 1
+    assert session.begin().send(jpeg(1, 64, 48)).frames == 1
+    assert session.view is not None and session.view.id == session.id
     session.delete()
+
+
+def test_a_session_that_is_entered_once_more_is_another_one(url: str, lab: Map) -> None:
+    session, ids = lab.sessions.begin(lag=2), list[str]()
+    for _ in range(2):
+        with session:
+            assert session.send(jpeg(1, 64, 48)).frame == 0
+            assert session.read().lag == 2
+            ids.append(session.id)
+        with pytest.raises((problems.SessionExpired, problems.UnknownSession)):
+            session.read()
+    with session.begin():  # it is not begun twice
+        ids.append(session.id)
+        session.delete()
+    assert len(set(ids)) == 3 and list(lab.sessions) == []
+
+    async def work() -> None:
+        async with AsyncClient(url) as client:
+            again = client.maps[lab.id].sessions.begin()
+            for _ in range(2):
+                async with again:
+                    assert (await again.send(jpeg(1, 64, 48))).frame == 0
+
+    asyncio.run(work())
 
 
 def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
