@@ -35,7 +35,7 @@ class _Row(BaseModel):
 
 
 def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[str]]:
-    """The frames of a directory, and remarks on them.
+    """The frames of a directory, and remarks on them; one of whose name no id can be made has its name as its id.
 
     Args:
         prefix: of the ids that are made from file names.
@@ -70,11 +70,7 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[
 
 
 def picture_frame(path: Path) -> Frame:
-    """A single image file as a frame; its pose and time are those of its EXIF data.
-
-    Raises:
-        InvalidTraverse: no id can be made of its name.
-    """
+    """A single image file as a frame; its pose and time are those of its EXIF data."""
     return Frame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
 
 
@@ -89,10 +85,11 @@ def read_picture(path: Path) -> bytes:
 
 
 def _id(path: Path, prefix: str) -> str:
+    """The id that a file's name makes; the name itself, which is the id of no place, where it makes none."""
     try:
         return make_id(path.stem, prefix)
-    except InvalidRecording as error:
-        raise InvalidTraverse(str(error)) from error
+    except InvalidRecording:
+        return prefix + path.stem
 
 
 def _listed_frames(path: Path, prefix: str) -> Iterator[tuple[Path, Frame]]:

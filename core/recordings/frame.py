@@ -18,7 +18,8 @@ NANOSECONDS = 1_000_000_000
 class Frame:
     """A frame that is read when it is needed.
 
-    id: the id of its place, the same whenever the recording is opened.
+    id: the id of its place, the same whenever the recording is opened; what no place can have if its file's name makes
+        none.
     name: what a message calls it, such as the name of its file.
     load: reads the bytes of a JPEG, PNG or WebP file; raises OSError or InvalidImage.  Frames that are loaded in their
         order cost least, for a bag keeps one chunk unpacked and a video decodes forward only.

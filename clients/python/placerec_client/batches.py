@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from placerec_client import models, problems
-from placerec_client.errors import InvalidFrame, PlacerecError, Problem, UnexpectedAnswer
+from placerec_client.errors import (
+    InvalidFrame,
+    InvalidName,
+    InvalidParameter,
+    PlacerecError,
+    Problem,
+    UnexpectedAnswer,
+)
 from placerec_client.frames import Frame, frame_bytes
-from placerec_client.requests import fields
+from placerec_client.requests import dumps, fields, name_of
 
 FIRST_BATCH, LARGEST_BATCH, FASTEST_GROWTH = 16, 128, 8
 BATCH_BYTES = 16 * 1024 * 1024
@@ -33,6 +41,9 @@ TOO_SLOW = frozenset({"deadline-exceeded"})
 
 OUT_OF_ORDER = problems.BatchOutOfOrder
 """The problem of a batch whose predecessor is not stored."""
+
+PLACE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,127}")
+"""What the service takes for the id of a place. It also names the frame's part of a form, which cannot be any text."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,7 @@ class Located:
 
 @dataclass(frozen=True)
 class Read:
-    """A frame that was read; ``data`` is empty if only its digest is sent, or if it cannot be read."""
+    """A frame that was read; ``data`` is empty if only its digest is sent, or if there is an ``error``: nothing is."""
 
     place: NewPlace
     entry: dict[str, Any] = field(default_factory=dict)
@@ -97,13 +108,26 @@ class Read:
 
 
 def read_place(place: NewPlace, digest: bool = False) -> Read:
-    """Read a frame and make its entry; with ``digest`` only the digest of its bytes is kept."""
+    """Read a frame and make its entry; with ``digest`` only the digest of its bytes is kept.
+
+    Raises:
+        InvalidParameter: the place is none; what is wrong with one is its ``error``.
+    """
+    if not isinstance(place, NewPlace):
+        raise InvalidParameter(f"What is enrolled has to be a NewPlace, not a {type(place).__name__}.")
     try:
+        if not PLACE_ID.fullmatch(name_of(place.id)):
+            raise InvalidName(
+                place.id,
+                "the id of a place has 1 to 128 characters, letters of ASCII, digits and . _ ~ -, and begins with a "
+                "letter or a digit",
+            )
         data = frame_bytes(place.frame() if callable(place.frame) else place.frame)
-    except InvalidFrame as error:
+        given = place.fields(data) if callable(place.fields) else place.fields
+        entry = {"id": place.id, **{name: value for name, value in fields(given).items() if value is not None}}
+        dumps(entry)
+    except (InvalidName, InvalidParameter, InvalidFrame) as error:
         return Read(place, error=error)
-    given = place.fields(data) if callable(place.fields) else place.fields
-    entry = {"id": place.id, **{name: value for name, value in fields(given).items() if value is not None}}
     if digest:
         return Read(place, {**entry, "sha256": hashlib.sha256(data).hexdigest()})
     return Read(place, {**entry, "file": place.id}, data)
@@ -112,7 +136,9 @@ def read_place(place: NewPlace, digest: bool = False) -> Read:
 def outcome_of(read: Read, item: models.BatchResult | None, error: PlacerecError | None, uploaded: bool) -> Enrolled:
     """What became of a frame, from the service's answer, or without one."""
     if item is None or item.change is None:
-        return Enrolled(read.place, None, error or read.error, fields=read.fields, uploaded=uploaded)
+        return Enrolled(
+            read.place, None, error or read.error, fields=read.fields, uploaded=uploaded and read.error is None
+        )
     return Enrolled(read.place, item.change, view=item.place, fields=read.fields, uploaded=uploaded)
 
 

@@ -37,11 +37,16 @@ class UnexpectedAnswer(PlacerecError):
 
 
 class InvalidName(PlacerecError, ValueError):
-    """Nothing can have this name: it is empty, ``.`` or ``..``, or has a slash. Nothing was sent."""
+    """Nothing can have this name: it is no text, empty, ``.`` or ``..``, or has a slash. Nothing was sent of it."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(f"{name[:140]!a} is no name: it is empty, '.' or '..', or has a slash.")
+    def __init__(self, name: object, why: str = "it is empty, '.' or '..', or has a slash") -> None:
+        shown = ascii(name[:140]) if isinstance(name, str) else ascii(name)[:140]
+        super().__init__(f"{shown} is no name: {why if isinstance(name, str) else 'it has to be a text'}.")
         self.name = name
+
+
+class InvalidParameter(PlacerecError, ValueError):
+    """A value is of a type that the call does not take, such as bytes for a text. Nothing was sent of it."""
 
 
 class InvalidOdometry(PlacerecError, ValueError):

@@ -56,6 +56,8 @@ def frame_bytes(frame: Frame) -> bytes:
     except OSError as error:
         name = f"{os.fspath(frame)} " if isinstance(frame, str | os.PathLike) else "The frame's file "
         raise InvalidFrame(f"{name}cannot be read: {error.strerror}.") from error
+    except ValueError as error:  # such as a closed file, or a name with a null
+        raise InvalidFrame(f"The frame cannot be read: {error}.") from error
     except AttributeError as error:
         raise InvalidFrame(f"A {type(frame).__name__} is no frame.") from error
     if not isinstance(data, bytes):

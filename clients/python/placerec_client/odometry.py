@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from placerec_client import parameters
 from placerec_client.errors import InvalidOdometry
+from placerec_client.requests import number_of
 
 MOST = {"x": 1e8, "y": 1e8, "heading": 1e6, "forward": 1e5, "left": 1e5, "turn": 36000.0}
 """How large numbers may be that can have either sign, as at the service."""
@@ -81,7 +82,7 @@ def with_motion(options: parameters.SendFrame, odometry: Odometry | None) -> par
 
 
 def _check_number(name: str, value: Any) -> None:
-    number = _number(value)
+    number = number_of(value)
     if number is None or not abs(number) <= MOST[name]:
         raise InvalidOdometry(
             f"{name} has to be a finite number of {UNITS[name]}, at most {MOST[name]:.0f} either way."
@@ -91,19 +92,9 @@ def _check_number(name: str, value: Any) -> None:
 def _check_covariance(covariance: Any) -> None:
     """Raise InvalidOdometry unless these are nine numbers of a symmetric matrix without negative variances."""
     listed = [] if isinstance(covariance, str) or not hasattr(covariance, "__iter__") else list(covariance)
-    numbers = [number for number in map(_number, listed) if number is not None and abs(number) <= LARGEST_COVARIANCE]
+    numbers = [number for number in map(number_of, listed) if number is not None and abs(number) <= LARGEST_COVARIANCE]
     if len(numbers) != 9 or len(listed) != 9:
         raise InvalidOdometry("covariance has to be nine finite numbers, those of x, y and heading row by row.")
     alike = (math.isclose(numbers[i], numbers[j], rel_tol=1e-6, abs_tol=1e-9) for i, j in ((1, 3), (2, 6), (5, 7)))
     if not all(alike) or min(numbers[0], numbers[4], numbers[8]) < 0:
         raise InvalidOdometry("covariance has to be that of a symmetric matrix without negative variances.")
-
-
-def _number(value: Any) -> float | None:
-    """A number of Python or NumPy; None if it is none."""
-    if isinstance(value, bool | str | bytes) or getattr(value, "ndim", 0) != 0:
-        return None
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return None

@@ -6,6 +6,8 @@ import random
 import time
 from dataclasses import dataclass
 
+from placerec_client.requests import seconds_of
+
 SHORTEST_PAUSE = 0.05
 """Seconds between two attempts at least, unless the rule has shorter pauses; no attempt begins later than that before
 the end of the time."""
@@ -41,11 +43,16 @@ class Clock:
     Args:
         deadline: seconds until an answer is of no use; None for none.
         retry: for how long the call is repeated if it has no deadline.
+
+    Raises:
+        InvalidParameter: the deadline is no number.
     """
 
     __slots__ = ("_last", "_retry", "_until", "attempts", "deadline", "lost")
 
     def __init__(self, deadline: float | None, retry: Retry) -> None:
+        if deadline is not None:
+            deadline = seconds_of("deadline", deadline)
         now = time.monotonic()
         self._until = None if deadline is None else now + deadline
         self._last = now + retry.patience if self._until is None or not retry.patience else self._until

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from core.errors import PlacerecError
 from placerec_client import Enrolled, NewPlace
-from placerec_client.errors import InvalidFrame
+from placerec_client.errors import InvalidFrame, InvalidName
 from service.commands.connection.client import Service, failures
 
 if TYPE_CHECKING:
@@ -105,6 +105,8 @@ def _load(frame: Frame) -> bytes:
 
 def _outcome(frame: Frame, found: Enrolled) -> Outcome:
     if found.change is None:
-        return Outcome(frame, None, refusal=str(found.error), uploaded=found.uploaded)
+        nameless = isinstance(found.error, InvalidName)
+        refusal = "no id can be made from its name; give it one in places.csv." if nameless else str(found.error)
+        return Outcome(frame, None, refusal=refusal, uploaded=found.uploaded)
     posed = bool(found.fields.keys() & {"x", "latitude"})
     return Outcome(frame, found.change, posed=posed, uploaded=found.uploaded)

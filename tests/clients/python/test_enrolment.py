@@ -6,12 +6,27 @@ import asyncio
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import httpx
 import pytest
 
-from placerec_client import AsyncClient, Client, ConnectionFailed, Enrolled, NewPlace, Retry, batches, problems
+from core.places import PLACE_IDS
+from placerec_client import (
+    AsyncClient,
+    Client,
+    ConnectionFailed,
+    Enrolled,
+    InvalidFrame,
+    InvalidName,
+    InvalidParameter,
+    NewPlace,
+    Retry,
+    batches,
+    problems,
+)
+from placerec_client.frames import Frame
 from tests.clients.python.test_retries import problem
 from tests.fuzz.encoder import SMALL
 from tests.service.map_jobs import wait_until
@@ -143,6 +158,41 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, f
     # The same again goes on.
     enrol(server, map_id, 40, Mischief({}))
     assert list(server.places(map_id)) == [f"p{index}" for index in range(40)]
+
+
+WRONG: list[Any] = ["", ".", "..", "a/b", "\n", 'a"b', "ä ö", "p" * 129, "\ud800", None, 5, b"p", ["p"]]
+"""What is no id of a place."""
+
+
+@pytest.mark.parametrize("known", [None, ()])
+def test_a_place_that_cannot_be_sent_fails_alone(
+    server: Server, client: Client, map_id: str, known: Sequence[str] | None
+) -> None:
+    """Nothing of it is sent: the service is not asked about it, and its frame is not read."""
+
+    def unread() -> Frame:
+        raise AssertionError("the frame was read")
+
+    lab, picture = client.maps[map_id], jpeg(0, 64, 48)
+    lab.places.put("p2", jpeg(2, 64, 48))
+    wrong = [NewPlace(name, unread) for name in WRONG]
+    unsendable: list[Any] = [{"metadata": {"a": object()}}, {"sequence": b"monday"}, {1: 2}, 5]
+    wrong += [NewPlace("p1", picture, fields) for fields in unsendable]
+    wrong += [NewPlace("p1", b"", lambda _: {"x": object()}), NewPlace("p1", "no such file")]
+    right = [NewPlace(f"p{index}", jpeg(index, 64, 48)) for index in range(len(wrong))]
+    given = [place for pair in zip(wrong, right, strict=True) for place in pair]
+    told = lab.enrol(given, known=known)
+    assert [one.place for one in told] == given
+    assert {one.change for one in told[1::2]} <= {"created", "unchanged"}
+    assert list(server.places(map_id)) == ["p2", *(f"p{index}" for index in range(len(wrong)) if index != 2)]
+    assert {(one.change, one.uploaded) for one in told[::2]} == {(None, False)}
+    assert [type(one.error) for one in told[::2]] == [InvalidName] * len(WRONG) + [InvalidParameter] * 5 + [
+        InvalidFrame
+    ]
+
+
+def test_the_ids_of_places_are_those_of_the_service() -> None:
+    assert batches.PLACE_ID.pattern == PLACE_IDS.pattern
 
 
 @pytest.mark.timeout(300)

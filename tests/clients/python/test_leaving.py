@@ -17,8 +17,10 @@ import pytest
 from placerec_client import AsyncClient, Client, ConnectionFailed, Map, Retry, problems
 from placerec_client._async import concurrency as async_concurrency
 from placerec_client._async import sessions as async_sessions
-from placerec_client._sync import concurrency, sessions
+from placerec_client._async import streams as async_streams
+from placerec_client._sync import concurrency, sessions, streams
 from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.clients.python.moments import Moments
 from tests.service.refusing import refusing_server
 from tests.service.scenes import jpeg
 from tests.service.server import Server, free_port
@@ -141,6 +143,80 @@ def test_a_session_is_left_asynchronously(
         with pytest.raises(asyncio.CancelledError):
             asyncio.run(work(url))
         assert len(heads.seen) == 1 and left_after(heads.seen[0]) <= SECONDS
+
+
+class Silent:
+    """A WebSocket that refuses a frame, or is broken off, and does not answer when it is closed."""
+
+    def __init__(self, moments: Moments, broken_off: bool, close_timeout: float) -> None:
+        self._moments, self._broken_off, self._close_timeout = moments, broken_off, close_timeout
+
+    def __enter__(self) -> Silent:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._moments.sleep(self._close_timeout)
+
+    def send(self, _: object) -> None:
+        pass
+
+    def recv(self, timeout: float | None = None) -> str:
+        if self._broken_off:
+            raise KeyError("on its way")
+        return '{"problem": {"type": "urn:placerec:problem:not-an-image", "status": 422}}'
+
+
+class AsyncSilent(Silent):
+    async def __aenter__(self) -> AsyncSilent:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.__exit__()
+
+    async def send(self, _: object) -> None:  # type: ignore[override]
+        pass
+
+    async def recv(self, timeout: float | None = None) -> str:  # type: ignore[override]
+        return super().recv()
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+@pytest.mark.parametrize("broken_off", [False, True])
+def test_a_stream_and_its_session_are_left_within_one_second(
+    half: Any, broken_off: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moments, waited = Moments(monkeypatch), list[float]()
+    monkeypatch.setattr(streams, "time", moments)
+    monkeypatch.setattr(async_streams, "time", moments)
+    monkeypatch.setattr(
+        streams, "connect", lambda _, close_timeout, **options: Silent(moments, broken_off, close_timeout)
+    )
+    monkeypatch.setattr(
+        async_streams, "connect", lambda _, close_timeout, **options: AsyncSilent(moments, broken_off, close_timeout)
+    )
+    for module, seconds in zip((sessions, async_sessions), USUAL_SECONDS, strict=True):
+        monkeypatch.setattr(module, "LEAVE_SECONDS", seconds)
+
+    def within(seconds: float, _: object) -> None:
+        waited.append(seconds)
+
+    async def within_async(seconds: float, _: object) -> None:
+        waited.append(seconds)
+
+    monkeypatch.setattr(sessions, "within", within)
+    monkeypatch.setattr(async_sessions, "within", within_async)
+
+    async def work() -> None:
+        async with AsyncClient("robot").maps["lab"].sessions["of-before"] as session, session.stream() as stream:
+            await stream.send(b"frame", frame=0)
+
+    with pytest.raises(KeyError if broken_off else problems.NotAnImage):
+        if half is AsyncClient:
+            asyncio.run(work())
+        else:
+            with Client("robot").maps["lab"].sessions["of-before"] as session, session.stream() as stream:
+                stream.send(b"frame", frame=0)
+    assert 0.4 < moments.now <= 0.5 and waited == [pytest.approx(1 - moments.now)]
 
 
 def test_work_that_does_not_end_is_left() -> None:

@@ -179,6 +179,23 @@ def test_no_name_leads_a_call_astray(half: Any, refusing: tuple[str, Seen], tmp_
     } <= tried
 
 
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_what_is_no_text_is_no_name(half: Any, refusing: tuple[str, Seen], tmp_path: Path) -> None:
+    url, seen = refusing
+
+    async def work() -> None:
+        client = half(url, retry=ONCE)
+        for words, count, call in list(calls(client)):
+            for name in (None, b"x", 2.5, ["x"]):
+                sent, error = await outcome(seen, call, client, [name] * count, tmp_path)
+                assert error is not None or words == "client.maps[…].sessions.begin", f"{words} with {name!r}"
+                assert not any(str(name) in unquote(path) for _, path in sent), f"{words} with {name!r}"
+        if inspect.isawaitable(closed := client.close()):
+            await closed
+
+    asyncio.run(work())
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_map_outlives_whatever_is_deleted_from_it(client: Client, lab: Map, server: Server, name: str) -> None:
     server.enrol(lab.id, "p", jpeg(1), sequence="monday")

@@ -189,9 +189,33 @@ def test_a_session_that_has_not_begun_says_how_it_begins(lab: Map) -> None:
             PlacerecError, match=r"has not begun: .*`with lab\.sessions\.begin\(\) as session:`, or by sess"
         ):
             use()
-    session.begin()
-    assert session.send(jpeg(1, 64, 48)).frames == 1
+    assert session.begin().send(jpeg(1, 64, 48)).frames == 1
+    assert session.view is not None and session.view.id == session.id
     session.delete()
+
+
+def test_a_session_that_is_entered_once_more_is_another_one(url: str, lab: Map) -> None:
+    session, ids = lab.sessions.begin(lag=2), list[str]()
+    for _ in range(2):
+        with session:
+            assert session.send(jpeg(1, 64, 48)).frame == 0
+            assert session.read().lag == 2
+            ids.append(session.id)
+        with pytest.raises((problems.SessionExpired, problems.UnknownSession)):
+            session.read()
+    with session.begin():  # it is not begun twice
+        ids.append(session.id)
+        session.delete()
+    assert len(set(ids)) == 3 and list(lab.sessions) == []
+
+    async def work() -> None:
+        async with AsyncClient(url) as client:
+            again = client.maps[lab.id].sessions.begin()
+            for _ in range(2):
+                async with again:
+                    assert (await again.send(jpeg(1, 64, 48))).frame == 0
+
+    asyncio.run(work())
 
 
 def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
@@ -203,6 +227,28 @@ def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
         assert session.send(jpeg(1, 64, 48), frame=42).repeated
         with pytest.raises(problems.FrameOutOfOrder):
             session.send(jpeg(1, 64, 48), frame=7)
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_a_refused_frame_leaves_the_numbers_alone(walk: Map, streamed: bool) -> None:
+    frame = jpeg(0, 64, 48)
+    with walk.sessions.begin() as session, session.stream() as stream:
+        send = (stream if streamed else session).send
+        assert [send(frame).frame for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(problems.FrameOutOfOrder):
+            send(frame, frame=1)
+        with pytest.raises(problems.NotAnImage):
+            send(b"no picture")
+        with pytest.raises(problems.NotAnImage):
+            send(b"no picture", frame=9)
+        assert send(frame).frame == 3
+        assert send(frame, frame=3).repeated
+        assert send(frame).frame == 4
+        # Another one has sent frames since: the number that was refused is not given again and again.
+        walk.sessions[session.id].send(frame, frame=20)
+        with pytest.raises(problems.FrameOutOfOrder):
+            send(frame)
+        assert send(frame).frame == 21
 
 
 @pytest.mark.parametrize("streamed", [False, True])

@@ -96,6 +96,18 @@ def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) 
     assert "1.jpg" not in done.stderr
 
 
+def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
+    odd = monday / "ä ö.jpg"
+    odd.write_bytes(jpeg(5))
+    done = placerec("enroll", monday, "--map", "lab", "--create", status=1)
+    assert "4 of 5 frames are places of lab" in done.stdout and "4 sent in" in done.stdout
+    assert "Error: ä ö.jpg: no id can be made from its name; give it one in places.csv." in done.stderr
+    assert "1.jpg" not in done.stderr
+    assert "ä ö.jpg" in placerec("query", odd, "--map", "lab").stdout
+    (monday / "places.csv").write_text("file,id\nä ö.jpg,umlauts\n", encoding="utf-8")
+    assert "1 of 1 frames are places of lab" in placerec("enroll", monday, "--map", "lab").stdout
+
+
 def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
     refused = placerec("enroll", monday, "--map", "lab", status=1)
     assert "There is no map 'lab'. Give --create to create it." in refused.stderr
@@ -222,7 +234,7 @@ def test_many_frames_keep_their_order_and_are_not_sent_twice(
     folder, url = many(tmp_path / "many", 60), server.client.base_url
     (folder / "17.jpg").write_bytes(b"not an image")
     first = placerec("enroll", folder, "--map", map_id, "--url", url, status=1)
-    assert "59 of 60 frames are places" in first.stdout and "60 sent" in first.stdout
+    assert "59 of 60 frames are places" in first.stdout and "59 sent" in first.stdout
     assert "Error: 17.jpg: " in first.stderr
     items = server.client.get(f"/v1/maps/{map_id}/places", params={"limit": 100}).json()["items"]
     assert [place["id"] for place in items] == [str(index) for index in range(60) if index != 17]

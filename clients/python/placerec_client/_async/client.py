@@ -27,7 +27,7 @@ class AsyncClient:
 
     All calls raise :class:`~placerec_client.PlacerecError`: a class of :mod:`placerec_client.problems` for each kind of
     problem that the service answers with, ``ConnectionFailed`` without an answer, ``DeadlineExceeded`` without one in
-    time.
+    time, and ``InvalidName``, ``InvalidParameter`` or ``InvalidFrame`` for what cannot be sent.
 
     Args:
         url: of the service; a host without ``http://``, such as ``127.0.0.1:8000``, is one by http.

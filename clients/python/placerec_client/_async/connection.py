@@ -18,13 +18,14 @@ from placerec_client.errors import (
     ClientClosed,
     ConnectionFailed,
     DeadlineExceeded,
+    InvalidParameter,
     PlacerecError,
     Problem,
     UnexpectedAnswer,
 )
 from placerec_client.model import Model
 from placerec_client.problems import UnknownPath
-from placerec_client.requests import dumps, query_string
+from placerec_client.requests import dumps, query_string, seconds_of, text_of
 from placerec_client.retry import Clock, Retry
 from placerec_client.version import VERSION
 
@@ -66,6 +67,7 @@ class AsyncConnection:
 
     Raises:
         ConnectionFailed: the URL is none of a service.
+        InvalidParameter: the key is no text, or ``timeout`` no number.
         PlacerecError: the key has characters that none has, such as the end of the line after it in a file.
     """
 
@@ -79,7 +81,7 @@ class AsyncConnection:
         name: str | None = None,
     ) -> None:
         self.url = service_url(url)
-        self.name, self.timeout, self.retry = name or self.url, timeout, retry
+        self.name, self.timeout, self.retry = name or self.url, seconds_of("timeout", timeout), retry
         parsed_url = httpx.URL(self.url)
         self._closed = threading.Event()  # shared with the connections that differ in patience
         self._transport = transport or AsyncLanes(parsed_url, IDLE_SECONDS)
@@ -88,6 +90,8 @@ class AsyncConnection:
             (b"User-Agent", f"placerec-client/{VERSION}".encode()),
         ]
         if key is not None:
+            if not isinstance(key, str):
+                raise InvalidParameter(f"The key has to be a text, not {type(key).__name__}.")
             if not KEY.fullmatch(key):  # httpx would show it in its error
                 raise PlacerecError("The key has characters that no key has, such as a space or the end of a line.")
             self.headers.append((b"Authorization", f"Bearer {key}".encode()))
@@ -146,11 +150,12 @@ class AsyncConnection:
         Raises:
             Problem: the service answers with a problem.
             ConnectionFailed, DeadlineExceeded, UnexpectedAnswer: no answer of a service came, or none in time.
+            InvalidParameter: a value cannot be sent.
             ClientClosed: the connection was closed.
         """
         if json is not None:
             content, media_type = dumps(json).encode(), "application/json"
-        sent = [*self.headers, (b"X-Request-Id", (request_id or uuid.uuid4().hex).encode())]
+        sent = [*self.headers, (b"X-Request-Id", text_of("request_id", request_id or uuid.uuid4().hex).encode())]
         if media_type is not None:
             sent.append((b"Content-Type", media_type.encode()))
         if isinstance(content, bytes):
@@ -296,6 +301,8 @@ def service_url(url: str) -> str:
     Raises:
         ConnectionFailed: it is none.
     """
+    if not isinstance(url, str):
+        raise ConnectionFailed(f"{url!r} is not a URL of a service: it has to be a text.")
     full = url if url.startswith(("http://", "https://")) else f"http://{url}" if HOST.fullmatch(url) else None
     if full is None:
         raise ConnectionFailed(

@@ -22,7 +22,7 @@ from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
 from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.renamed import OldNames, Subscripted
-from placerec_client.requests import Part, dumps, fields, form, path_of
+from placerec_client.requests import Part, dumps, fields, form, name_of, path_of, text_of
 
 TRANSFER_PATIENCE = 3600.0
 """Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
@@ -246,7 +246,8 @@ class AsyncMap:
 
         It can be broken off and called again with the same frames: those that the map holds already are neither sent
         nor encoded a second time; their fields are updated. A frame that cannot be used has an ``error``, and the
-        others are enrolled. Within a batch, frames that the map holds come first.
+        others are enrolled; one whose id or fields no place can have is not sent. Within a batch, frames that the map
+        holds come first.
 
         ::
 
@@ -299,7 +300,8 @@ class AsyncMap:
             encoder: name or identity that the map must have.
 
         Raises:
-            InvalidFrame: a frame cannot be read; nothing is enrolled.
+            InvalidFrame, InvalidName, InvalidParameter: a frame cannot be read, or no place can have its id or its
+                fields; nothing is enrolled.
         """
         options = {"align": align or None, "encoder": encoder}
         return await enrol_by_job(self.connection.lasting(PATIENCE), self.path + "/places", places, options)
@@ -324,7 +326,7 @@ class AsyncMap:
             models.ClosureAnswer,
             "POST",
             self.path + "/query:enrol",
-            params={**options, "id": place_id},
+            params={**options, "id": name_of(place_id)},
             content=data,
             media_type=media_type(data),
             deadline=deadline,
@@ -353,7 +355,7 @@ class AsyncMap:
 
     async def explanation(self, explanation: str) -> bytes:
         """Return the picture of an explanation, a PNG file, by its id or the address in an answer."""
-        path = path_of("explanations", explanation.rpartition("/")[2], below=self.path)
+        path = path_of("explanations", text_of("explanation", explanation).rpartition("/")[2], below=self.path)
         return (await self.connection.request("GET", path)).content
 
     @overload
@@ -533,7 +535,8 @@ def _condition(if_match: int | str | None) -> dict[str, str]:
     """The header that makes an edit depend on the revision."""
     if if_match is None:
         return {}
-    return {"If-Match": if_match if isinstance(if_match, str) and if_match.startswith('"') else f'"{if_match}"'}
+    revision = text_of("if_match", if_match)
+    return {"If-Match": revision if revision.startswith('"') else f'"{revision}"'}
 
 
 def _holds(view: models.MapView, wanted: Mapping[str, Any]) -> bool:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from operator import index
 
-from placerec_client import models, parameters
+from placerec_client import models, parameters, problems
 from placerec_client._async.concurrency import Lock, acquire
 from placerec_client._async.connection import AsyncConnection
-from placerec_client.errors import DeadlineExceeded
+from placerec_client.answers import OVERLOADED
+from placerec_client.errors import DeadlineExceeded, InvalidParameter, Problem
+from placerec_client.requests import seconds_of
 
 
 class AsyncNumbering:
@@ -29,16 +32,30 @@ class AsyncNumbering:
     async def turn(self, deadline: float | None) -> AsyncIterator[Callable[[], float | None]]:
         """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
 
+        A frame that the service refuses within leaves the next number as it was.
+
         Raises:
+            InvalidParameter: the deadline is no number.
             DeadlineExceeded: those before have taken longer; the frame has no number and was not sent.
         """
+        if deadline is not None:
+            deadline = seconds_of("deadline", deadline)
         began = time.monotonic()
         try:
             await acquire(self._lock, deadline)
         except TimeoutError as error:
             raise DeadlineExceeded(f"The frames before took longer than {deadline:g} s.") from error
+        before = self._next
         try:
             yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
+        except (Problem, InvalidParameter) as error:
+            if isinstance(error, problems.FrameOutOfOrder) and self._next != before:
+                self._next = None  # another one has sent frames since: the service is asked how far it is
+            elif (
+                getattr(error, "status", None) not in OVERLOADED
+            ):  # before which an attempt may have been lost and counted
+                self._next = before
+            raise
         finally:
             self._lock.release()
 
@@ -46,6 +63,7 @@ class AsyncNumbering:
         """Return the options of a frame with its number: the caller's own, or the next one.
 
         Raises:
+            InvalidParameter: the caller's own is no whole number.
             DeadlineExceeded: the service did not tell its last number within the seconds that were left.
         """
         given = options.get("frame")
@@ -55,5 +73,9 @@ class AsyncNumbering:
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next
-        self._next = given + 1
+        try:
+            given = index(given)
+        except TypeError as error:
+            raise InvalidParameter(f"frame has to be a whole number, not {ascii(given)[:140]}.") from error
+        self._next = max(given + 1, self._next or 0)
         return {**options, "frame": given}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 LEAVE_SECONDS = 1.0
-"""How long leaving a session waits for the service."""
+"""How long leaving a session, with the stream in it, waits for the service."""
 
 log = getLogger("placerec_client")
 
@@ -36,7 +36,7 @@ class AsyncSessions(Subscripted):
         self._connection, self._path = connection, path + "/sessions"
 
     def __getitem__(self, session_id: str) -> AsyncSession:
-        return AsyncSession(self._connection, self._path, {}, session_id)
+        return AsyncSession(self._connection, self._path, None, session_id)
 
     def __aiter__(self) -> AsyncIterator[models.SessionView]:
         return self.list()
@@ -50,8 +50,9 @@ class AsyncSessions(Subscripted):
     def begin(self, **options: Unpack[parameters.NewSession]) -> AsyncSession:
         """Return a session that begins when it is entered, and ends when it is left.
 
-        Leaving takes a second at most and raises nothing: of a session that the service did not end in that time the
-        log ``placerec_client`` has a warning, and it ends by itself after ``expires_after``.
+        Entered once more, it is another one. Leaving takes a second at most, together with a stream in it, and raises
+        nothing: of a session that the service did not end in that time the log ``placerec_client`` has a warning, and
+        it ends by itself after ``expires_after``.
 
         ::
 
@@ -69,14 +70,22 @@ class AsyncSession(OldNames, end="delete"):
 
     Attributes:
         id: of the session; empty before it has begun.
+        view: its settings as it has begun here; None before, and if it was begun elsewhere.
     """
 
     def __init__(
-        self, connection: AsyncConnection, path: str, options: parameters.NewSession, session_id: str | None = None
+        self,
+        connection: AsyncConnection,
+        path: str,
+        options: parameters.NewSession | None,
+        session_id: str | None = None,
     ) -> None:
         self._connection, self._sessions, self._options = connection, path, options
         self.id = session_id or ""
+        self.view: models.SessionView | None = None
         self._numbering = None
+        self._is_over = False
+        self._closing = 0.0  # seconds that closing its last stream took
         if session_id is not None:
             self._numbering = AsyncNumbering(connection, path_of(session_id, below=path), None)
 
@@ -84,36 +93,43 @@ class AsyncSession(OldNames, end="delete"):
         return f"{type(self).__name__}({self.id!r})"
 
     async def __aenter__(self) -> Self:
-        if not self.id:
+        if self._options is not None and (self._numbering is None or self._is_over):
             await self.begin()
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        seconds = LEAVE_SECONDS - min(self._closing, LEAVE_SECONDS / 2)
+        self._is_over = True
         try:
-            await within(LEAVE_SECONDS, self._leave)
+            await within(seconds, lambda: self._leave(seconds))
         except Exception as failure:  # whatever it is, the one that is on its way counts more
             silent = isinstance(failure, TimeoutError)
-            reason = str(failure) or (f"no answer came within {LEAVE_SECONDS:g} s." if silent else repr(failure))
+            reason = str(failure) or (f"no answer came within {seconds:.2g} s." if silent else repr(failure))
             log.warning("The session %s was left, but the service did not end it now: %s", self.id, reason)
 
-    async def _leave(self) -> None:
+    async def _leave(self, seconds: float) -> None:
         """End the session by one attempt; one that has ended already, or with its map, is left so."""
         with suppress(problems.UnknownSession, problems.SessionExpired, problems.UnknownMap):
-            await self._connection.patient(Retry(0)).request("DELETE", self.path, deadline=LEAVE_SECONDS)
+            await self._connection.patient(Retry(0)).request("DELETE", self.path, deadline=seconds)
 
-    async def begin(self) -> models.SessionView:
-        """Begin the session. If the answer to an attempt is lost, the next one gets the session that it has begun."""
-        view = await self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
-        self.id = view.id
+    async def begin(self) -> Self:
+        """Begin the session, and return it with its ``view``.
+
+        If the answer to an attempt is lost, the next one gets the session that it has begun.
+        """
+        self.view = await self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options or {})
+        self.id = self.view.id
         self._numbering = AsyncNumbering(self._connection, path_of(self.id, below=self._sessions), 0)
-        return view
+        self._is_over = False
+        return self
 
     async def delete(self) -> None:
         """Delete the session, for the run is over; one that is gone already is no error."""
         with suppress(problems.UnknownSession, problems.SessionExpired):
             await self._connection.request("DELETE", self.path)
+        self._is_over = True
 
     async def read(self) -> models.SessionReport:
         """Return the session and the present belief about where its robot is."""
@@ -172,7 +188,10 @@ class AsyncSession(OldNames, end="delete"):
         """
         from placerec_client._async.streams import AsyncStream
 
-        return AsyncStream(self._connection, self.path + "/stream", self._numbers())
+        return AsyncStream(self._connection, self.path + "/stream", self._numbers(), self._stream_closed)
+
+    def _stream_closed(self, seconds: float) -> None:
+        self._closing = seconds
 
     def _numbers(self) -> AsyncNumbering:
         if self._numbering is None:

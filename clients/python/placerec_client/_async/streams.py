@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 import uuid
+from collections.abc import Callable
 from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, Self, Unpack
@@ -15,6 +17,7 @@ from placerec_client import models, parameters, problems
 from placerec_client._async.concurrency import received, sleep
 from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.numbering import AsyncNumbering
+from placerec_client._async.sessions import LEAVE_SECONDS
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
@@ -22,7 +25,10 @@ from placerec_client.odometry import Odometry, with_motion
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
-CONNECT_SECONDS, CLOSE_SECONDS = 5.0, 1.0
+CONNECT_SECONDS = 5.0
+CLOSE_SECONDS = LEAVE_SECONDS / 2
+"""How long closing waits for the service; leaving the session, which often follows, has what is left of its second."""
+
 MOST_BYTES = 64 << 20
 """Bytes of an answer."""
 
@@ -34,8 +40,10 @@ class AsyncStream:
     the same number, so that it counts once.
     """
 
-    def __init__(self, connection: AsyncConnection, path: str, numbering: AsyncNumbering) -> None:
-        self._connection, self._path, self._numbering = connection, path, numbering
+    def __init__(
+        self, connection: AsyncConnection, path: str, numbering: AsyncNumbering, closed: Callable[[float], object]
+    ) -> None:
+        self._connection, self._path, self._numbering, self._closed = connection, path, numbering, closed
         self._socket: ClientConnection | None = None
         self._opened = AsyncExitStack()
 
@@ -49,8 +57,13 @@ class AsyncStream:
 
     async def close(self) -> None:
         """Close the connection; the session goes on."""
+        was_open, began = self._socket is not None, time.monotonic()
         self._socket = None
-        await self._opened.aclose()
+        try:
+            await self._opened.aclose()
+        finally:
+            if was_open:
+                self._closed(time.monotonic() - began)
 
     async def send(
         self,

@@ -84,7 +84,7 @@ class Enrolment(Batches[Read, Enrolled]):
 
     def _read_known(self) -> list[Read]:
         asked: list[Read] = []
-        while len(asked) < KNOWN_AT_ONCE and (place := self._peek()) is not None and place.id in self._known:
+        while len(asked) < KNOWN_AT_ONCE and (place := self._peek()) is not None and self._knows(place):
             asked.append(read_place(self._waiting.popleft(), digest=True))
         return asked
 
@@ -94,13 +94,16 @@ class Enrolment(Batches[Read, Enrolled]):
         while len(batch) < most and size < BATCH_BYTES:
             if self._needed:
                 place = self._needed.popleft()
-            elif (following := self._peek()) is None or following.id in self._known:
+            elif (following := self._peek()) is None or self._knows(following):
                 break
             else:
                 place = self._waiting.popleft()
             batch.append(read_place(place))
             size += len(batch[-1].data)
         return batch
+
+    def _knows(self, place: NewPlace) -> bool:
+        return isinstance(place, NewPlace) and isinstance(place.id, str) and place.id in self._known
 
     def _peek(self) -> NewPlace | None:
         if not self._waiting:
@@ -147,7 +150,7 @@ class Enrolment(Batches[Read, Enrolled]):
     def _post(self, batch: Sequence[Read], order: Mapping[str, str]) -> Answered:
         """Send one form with the frames that could be read."""
         sent = [one for one in batch if one.error is None]
-        items: dict[str, models.BatchResult] = {}
+        items: dict[int, models.BatchResult] = {}
         if sent:
             parts = [Part("places", dumps([one.entry for one in sent]).encode(), "application/json", is_file=False)]
             parts += [Part(one.place.id, one.data, media_type(one.data)) for one in sent if "file" in one.entry]
@@ -161,8 +164,8 @@ class Enrolment(Batches[Read, Enrolled]):
                 media_type=kind,
                 final=TOO_SLOW if len(sent) > 1 else frozenset(),
             )
-            items = dict(zip((one.place.id for one in sent), found.items, strict=True))
-        return [(one, items.get(one.place.id), _error(items.get(one.place.id))) for one in batch]
+            items = dict(zip(map(id, sent), found.items, strict=True))
+        return [(one, items.get(id(one)), _error(items.get(id(one)))) for one in batch]
 
 
 class Named(Sent[Enrolled]):

@@ -15,7 +15,7 @@ from placerec_client._sync.following import follow
 from placerec_client.answers import parsed, problem_of
 from placerec_client.errors import DeadlineExceeded, JobCancelled
 from placerec_client.renamed import Subscripted
-from placerec_client.requests import path_of
+from placerec_client.requests import path_of, seconds_of
 
 OPEN = ("queued", "running")
 WAIT_SECONDS = 20.0
@@ -93,7 +93,7 @@ class Job:
             JobCancelled: it was cancelled.
             DeadlineExceeded: it has not ended in time.
         """
-        until = None if deadline is None else time.monotonic() + deadline
+        until = None if deadline is None else time.monotonic() + seconds_of("deadline", deadline)
         step = WAIT_SECONDS if progress is None else PROGRESS_SECONDS
         while True:
             left = step if until is None else min(step, max(until - time.monotonic(), 0.0))

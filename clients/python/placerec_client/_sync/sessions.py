@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 LEAVE_SECONDS = 1.0
-"""How long leaving a session waits for the service."""
+"""How long leaving a session, with the stream in it, waits for the service."""
 
 log = getLogger("placerec_client")
 
@@ -37,7 +37,7 @@ class Sessions(Subscripted):
         self._connection, self._path = connection, path + "/sessions"
 
     def __getitem__(self, session_id: str) -> Session:
-        return Session(self._connection, self._path, {}, session_id)
+        return Session(self._connection, self._path, None, session_id)
 
     def __iter__(self) -> Iterator[models.SessionView]:
         return self.list()
@@ -51,8 +51,9 @@ class Sessions(Subscripted):
     def begin(self, **options: Unpack[parameters.NewSession]) -> Session:
         """Return a session that begins when it is entered, and ends when it is left.
 
-        Leaving takes a second at most and raises nothing: of a session that the service did not end in that time the
-        log ``placerec_client`` has a warning, and it ends by itself after ``expires_after``.
+        Entered once more, it is another one. Leaving takes a second at most, together with a stream in it, and raises
+        nothing: of a session that the service did not end in that time the log ``placerec_client`` has a warning, and
+        it ends by itself after ``expires_after``.
 
         ::
 
@@ -70,14 +71,22 @@ class Session(OldNames, end="delete"):
 
     Attributes:
         id: of the session; empty before it has begun.
+        view: its settings as it has begun here; None before, and if it was begun elsewhere.
     """
 
     def __init__(
-        self, connection: Connection, path: str, options: parameters.NewSession, session_id: str | None = None
+        self,
+        connection: Connection,
+        path: str,
+        options: parameters.NewSession | None,
+        session_id: str | None = None,
     ) -> None:
         self._connection, self._sessions, self._options = connection, path, options
         self.id = session_id or ""
+        self.view: models.SessionView | None = None
         self._numbering = None
+        self._is_over = False
+        self._closing = 0.0  # seconds that closing its last stream took
         if session_id is not None:
             self._numbering = Numbering(connection, path_of(session_id, below=path), None)
 
@@ -85,36 +94,43 @@ class Session(OldNames, end="delete"):
         return f"{type(self).__name__}({self.id!r})"
 
     def __enter__(self) -> Self:
-        if not self.id:
+        if self._options is not None and (self._numbering is None or self._is_over):
             self.begin()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        seconds = LEAVE_SECONDS - min(self._closing, LEAVE_SECONDS / 2)
+        self._is_over = True
         try:
-            within(LEAVE_SECONDS, self._leave)
+            within(seconds, lambda: self._leave(seconds))
         except Exception as failure:  # whatever it is, the one that is on its way counts more
             silent = isinstance(failure, TimeoutError)
-            reason = str(failure) or (f"no answer came within {LEAVE_SECONDS:g} s." if silent else repr(failure))
+            reason = str(failure) or (f"no answer came within {seconds:.2g} s." if silent else repr(failure))
             log.warning("The session %s was left, but the service did not end it now: %s", self.id, reason)
 
-    def _leave(self) -> None:
+    def _leave(self, seconds: float) -> None:
         """End the session by one attempt; one that has ended already, or with its map, is left so."""
         with suppress(problems.UnknownSession, problems.SessionExpired, problems.UnknownMap):
-            self._connection.patient(Retry(0)).request("DELETE", self.path, deadline=LEAVE_SECONDS)
+            self._connection.patient(Retry(0)).request("DELETE", self.path, deadline=seconds)
 
-    def begin(self) -> models.SessionView:
-        """Begin the session. If the answer to an attempt is lost, the next one gets the session that it has begun."""
-        view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
-        self.id = view.id
+    def begin(self) -> Self:
+        """Begin the session, and return it with its ``view``.
+
+        If the answer to an attempt is lost, the next one gets the session that it has begun.
+        """
+        self.view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options or {})
+        self.id = self.view.id
         self._numbering = Numbering(self._connection, path_of(self.id, below=self._sessions), 0)
-        return view
+        self._is_over = False
+        return self
 
     def delete(self) -> None:
         """Delete the session, for the run is over; one that is gone already is no error."""
         with suppress(problems.UnknownSession, problems.SessionExpired):
             self._connection.request("DELETE", self.path)
+        self._is_over = True
 
     def read(self) -> models.SessionReport:
         """Return the session and the present belief about where its robot is."""
@@ -173,7 +189,10 @@ class Session(OldNames, end="delete"):
         """
         from placerec_client._sync.streams import Stream
 
-        return Stream(self._connection, self.path + "/stream", self._numbers())
+        return Stream(self._connection, self.path + "/stream", self._numbers(), self._stream_closed)
+
+    def _stream_closed(self, seconds: float) -> None:
+        self._closing = seconds
 
     def _numbers(self) -> Numbering:
         if self._numbering is None:

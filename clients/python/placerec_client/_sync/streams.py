@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import time
 import uuid
+from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self, Unpack
@@ -16,6 +18,7 @@ from placerec_client import models, parameters, problems
 from placerec_client._sync.concurrency import received, sleep
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.numbering import Numbering
+from placerec_client._sync.sessions import LEAVE_SECONDS
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
@@ -23,7 +26,10 @@ from placerec_client.odometry import Odometry, with_motion
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
-CONNECT_SECONDS, CLOSE_SECONDS = 5.0, 1.0
+CONNECT_SECONDS = 5.0
+CLOSE_SECONDS = LEAVE_SECONDS / 2
+"""How long closing waits for the service; leaving the session, which often follows, has what is left of its second."""
+
 MOST_BYTES = 64 << 20
 """Bytes of an answer."""
 
@@ -35,8 +41,10 @@ class Stream:
     the same number, so that it counts once.
     """
 
-    def __init__(self, connection: Connection, path: str, numbering: Numbering) -> None:
-        self._connection, self._path, self._numbering = connection, path, numbering
+    def __init__(
+        self, connection: Connection, path: str, numbering: Numbering, closed: Callable[[float], object]
+    ) -> None:
+        self._connection, self._path, self._numbering, self._closed = connection, path, numbering, closed
         self._socket: ClientConnection | None = None
         self._opened = ExitStack()
 
@@ -50,8 +58,13 @@ class Stream:
 
     def close(self) -> None:
         """Close the connection; the session goes on."""
+        was_open, began = self._socket is not None, time.monotonic()
         self._socket = None
-        self._opened.close()
+        try:
+            self._opened.close()
+        finally:
+            if was_open:
+                self._closed(time.monotonic() - began)
 
     def send(
         self,

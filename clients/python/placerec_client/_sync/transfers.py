@@ -38,7 +38,7 @@ def export(
     progress: Progress | None = None,
 ) -> str | None:
     """Download a map to a file; see ``Map.export``."""
-    file = Path(path)
+    file = _file(path)
     if file.exists() and not overwrite:
         raise TransferFailed(f"{file} already exists.")
     partial = file.with_name(file.name + PARTIAL)
@@ -129,7 +129,7 @@ def upload(
     progress: Progress | None,
 ) -> Job:
     """Upload the file of a map; see ``Maps.import_``."""
-    file = Path(path)
+    file = _file(path)
     try:
         size = file.stat().st_size
         digest = in_thread(digest_of, file)
@@ -171,6 +171,13 @@ def settle(partial: Path, path: Path) -> None:
             os.close(folder)
     except OSError as error:
         raise TransferFailed(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _file(path: str | os.PathLike[str]) -> Path:
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise TransferFailed(f"A {type(path).__name__} is no path of a file.") from error
 
 
 def _size_of(headers: Mapping[str, str]) -> int:
