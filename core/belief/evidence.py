@@ -136,28 +136,32 @@ def evidence(
         verified: float64 [n], what geometric verification found of them (``core.geometry.verification``), -ln of the
             number of false alarms; NaN where a place was not verified, of which other frames of its view may tell.
             None: none was.
-        rivals: positions of places that show what the best match shows, as another traverse's do.  They and their
-            neighbours are no background: a robot is at one of them, whichever it is, and in the map.
+        rivals: positions of places that show what the best match shows, as another traverse's do.  A robot is at one of
+            them or at the best match, and in the map: they gain together what the best match would without them.
     """
     if len(rows) == 0:
         return NOTHING
     second_stage = examined is not None and bool(examined.any())
     listed = np.flatnonzero(examined) if examined is not None and second_stage else np.arange(min(len(rows), LISTED))
     values = scores[listed].astype(np.float64)
-    others = whereabouts.others(int(listed[0]), neighborhood, across=False)
-    apart = ~whereabouts.near(int(listed[0]), neighborhood.times(GUARD_FACTOR))
-    for rival in rivals:
-        elsewhere = ~whereabouts.near(rival, neighborhood)
-        others, apart = others & elsewhere, apart & elsewhere
-    rest = values[others[listed]]
-    ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])
-    shares = (values - ordinary) / (believable - ordinary)
-    ratios = STRENGTH * shares
+    best = int(listed[0])
+    others = whereabouts.others(best, neighborhood, across=False)
+    apart = ~whereabouts.near(best, neighborhood.times(GUARD_FACTOR))
+
+    def ratios_beside(others: NDArray[np.bool_], apart: NDArray[np.bool_]) -> NDArray[np.float64]:
+        rest = values[others[listed]]
+        ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])
+        return STRENGTH * (values - ordinary) / (believable - ordinary)
+
+    ratios = ratios_beside(others, apart)
+    if rivals:
+        alike = np.logical_or.reduce([whereabouts.near(one, neighborhood) for one in rivals])
+        others, apart = others & ~alike, apart & ~alike
+        raised = min(float(ratios_beside(others, apart)[0]), STRONGEST) - float(ratios[0])
+        ratios[(alike | whereabouts.near(best, neighborhood))[listed]] += max(0.0, raised)
     if verified is not None:
         found = np.log1p(_of_views(verified[listed], whereabouts.take(listed))) - np.log1p(VERIFIED)
         ratios += np.nan_to_num(0.5 * np.clip(found, LEAST_VERIFIED, MOST_VERIFIED))
-    if rivals:  # neighbours of one of them, cut to as much as it, would decide between them
-        ratios *= min(1.0, STRONGEST / float(ratios.max()))
     gains = np.minimum(ratios, STRONGEST).astype(np.float32)
     gaining = gains > 0
     beside = others[listed] & gaining
