@@ -33,8 +33,9 @@ class Day:
         self.server = Server(folder).wait()
 
     def restart(self) -> None:
+        port = self.server.reservation.dup()
         assert self.server.stop() == 0
-        self.server = Server(self._folder, port=self.server.port).wait()
+        self.server = Server(self._folder, reservation=port).wait()
 
     def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> Drive:
         """What becomes of a robot in a situation."""

@@ -43,8 +43,7 @@ def walked_again(frames: list[Pixels]) -> list[bytes]:
 
 
 def ros_environment(**more: str) -> dict[str, str]:
-    """The environment of processes of .venv-ros: ROS keeps to this machine and
-    logs as it goes, and nothing is asked by a proxy."""
+    """The environment of processes of .venv-ros: ROS keeps to this machine and logs as it goes; there is no proxy."""
     dropped = ("PLACEREC_", "ROS_", "RMW_", *PROXIES)
     kept = {name: value for name, value in os.environ.items() if not name.startswith(dropped)}
     own = {
