@@ -19,7 +19,7 @@ import httpx
 from tests.service.forks import ROOT as ROOT
 from tests.service.forks import ForkedServer
 
-START_SECONDS = 120.0
+START_SECONDS = 300.0
 
 
 def free_port() -> int:

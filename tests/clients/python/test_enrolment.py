@@ -145,7 +145,6 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, f
     assert list(server.places(map_id)) == [f"p{index}" for index in range(40)]
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("moment", [9, pytest.param(20, marks=pytest.mark.thorough)])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, moment: int) -> None:
     server = Server(tmp_path / "service").wait()
