@@ -120,7 +120,7 @@ def test_the_python_of_the_client_runs_as_it_is_written(shared: Server, tmp_path
 
 def run(command: Sequence[str | Path], folder: Path, environment: Mapping[str, str]) -> str:
     """What a command that has to succeed writes to standard output."""
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=110)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, f"{done.stderr[-3000:]}\n{done.stdout[-3000:]}"
     return done.stdout
 

@@ -100,7 +100,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_disk_without_power(tmp_path: Path) -> None:
     root, trace = tmp_path / "root", tmp_path / "trace"
     command = [*arguments(trace), sys.executable, "-S", "-c", SCRIPT, str(root)]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
     disk = Disk(root)
     with trace.open() as lines:
         told = [what for what in disk.replay(lines, lambda sent: "ack" if sent == b"ack\n" else None) if what]

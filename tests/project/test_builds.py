@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -18,8 +19,13 @@ def test_git_sees_nothing_of_a_build(tmp_path: Path) -> None:
     shutil.copytree(CLIENT, checkout / CLIENT.name, ignore=shutil.ignore_patterns("*.egg-info", "build"))
     shutil.copy(ROOT / ".gitignore", checkout)
 
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+
     def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=checkout, check=True, capture_output=True, text=True).stdout
+        done = subprocess.run(
+            ["git", *words], cwd=checkout, env=environment, check=True, capture_output=True, text=True
+        )
+        return done.stdout
 
     git("init", "--quiet")
     git("add", ".")

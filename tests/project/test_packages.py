@@ -52,7 +52,7 @@ def installed(folder: Path, **given: str) -> tuple[list[str], str, int]:
     code = f"import sys; sys.executable = {str(stub)!r}; from scripts.packages import main; sys.exit(main('service'))"
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("UV_", "PIP_"))}
     environment |= {"LOG": str(log), "TORCH_BACKEND": "cpu", "PYTHONPATH": str(ROOT)}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
     return log.read_text().splitlines(), run.stderr, run.returncode
 
 

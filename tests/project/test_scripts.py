@@ -65,7 +65,7 @@ class Checkout:
     def prepare(self, profile: str, backend: str = "") -> list[str]:
         """Run ``environment PROFILE``; what it installed, in order."""
         self.log.write_text("")
-        out, error = self.start(profile, backend=backend).communicate(timeout=60)
+        out, error = self.start(profile, backend=backend).communicate(timeout=300)
         assert out == "ready\n", error
         return self.log.read_text().split()
 
@@ -107,7 +107,7 @@ def test_a_venv_of_an_earlier_version_is_made_anew(checkout: Checkout) -> None:
 
 def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
     runs = [checkout.start("development") for _ in range(3)]
-    assert [run.communicate(timeout=60)[0] for run in runs] == ["ready\n"] * 3
+    assert [run.communicate(timeout=300)[0] for run in runs] == ["ready\n"] * 3
     assert checkout.log.read_text().split() == ["venv", "development", "cpu", "."]
 
 
@@ -117,13 +117,13 @@ def test_an_interrupted_installation_is_repeated(checkout: Checkout) -> None:
     full = Path(f"{checkout.log}.full")
     full.touch()
     run = checkout.start("service")
-    assert run.communicate(timeout=60)[0] == "" and run.returncode != 0
+    assert run.communicate(timeout=300)[0] == "" and run.returncode != 0
     full.unlink()
     assert checkout.prepare("service")
 
 
 def test_an_old_python_is_refused_with_a_message(checkout: Checkout) -> None:
     run = checkout.start("service", python="/bin/false")
-    out, error = run.communicate(timeout=60)
+    out, error = run.communicate(timeout=300)
     assert (out, run.returncode) == ("", 1)
     assert "Python 3.11 or later" in error

@@ -19,7 +19,7 @@ import httpx
 from tests.service.forks import ROOT as ROOT
 from tests.service.forks import ForkedServer
 
-START_SECONDS = 120.0
+START_SECONDS = 300.0
 
 
 def free_port() -> int:
@@ -27,6 +27,17 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def reserved() -> socket.socket:
+    """A socket that holds a free port for a server on this machine: nobody else is given it.
+
+    It never listens, so that who connects is refused. It has SO_REUSEADDR, so that a server that has it can listen.
+    """
+    held = socket.socket()
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    held.bind(("127.0.0.1", 0))
+    return held
 
 
 class Server:
@@ -39,7 +50,7 @@ class Server:
         key: that the client sends.
         forked: start it off a process that has imported everything; not if it has a wrapper, or has to be where this
             process is, as in a network of its own.
-        port: that it listens on; a free one if left out.
+        reservation: of the port that it listens on; it is closed when the server ends. A free port if left out.
     """
 
     def __init__(
@@ -49,9 +60,10 @@ class Server:
         wrapper: Sequence[str] = (),
         key: str | None = None,
         forked: bool = True,
-        port: int | None = None,
+        reservation: socket.socket | None = None,
     ) -> None:
-        self.folder, self.port, self.key = folder, port or free_port(), key
+        self.reservation = reservation or reserved()
+        self.folder, self.port, self.key = folder, int(self.reservation.getsockname()[1]), key
         self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
@@ -91,12 +103,14 @@ class Server:
         self.process.send_signal(signal.SIGKILL)
         self.process.wait(60)
         self.client.close()
+        self.reservation.close()
 
     def stop(self) -> int:
         """End it as an operator would; the exit status."""
         self.process.send_signal(signal.SIGTERM)
         status = self.process.wait(60)
         self.client.close()
+        self.reservation.close()
         return status
 
     def lines(self, **wanted: object) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from tests.watch import CACHES, PROXIES, Watch, missing
 
 MACHINES_THAT_BUILD = (
     *("CI", "TF_BUILD", "GITHUB_ACTIONS", "GITLAB_CI", "CIRCLECI", "TRAVIS", "JENKINS_URL", "CODEBUILD_BUILD_ID"),
-    *("BUILDKITE", "TEAMCITY_VERSION", "APPVEYOR", "BITBUCKET_BUILD_NUMBER"),
+    *("BUILDKITE", "TEAMCITY_VERSION", "APPVEYOR", "BITBUCKET_BUILD_NUMBER", "SYSTEM_TEAMFOUNDATIONCOLLECTIONURI"),
 )
 """Variables by which ONNX Runtime knows a machine that builds and tests, where it reports nothing by itself."""
 

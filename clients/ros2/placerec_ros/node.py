@@ -402,6 +402,9 @@ def main(arguments: list[str] | None = None) -> int:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except RuntimeError:  # rclpy's, of a message that came while it was told to end
+        if rclpy.ok():
+            raise
     finally:
         node.close()
         executor.shutdown()

@@ -95,7 +95,6 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str
     assert running.stop() == 0
 
 
-@pytest.mark.timeout(300)
 def test_every_operation_has_a_call(guarded: tuple[str, str], tmp_path: Path) -> None:
     recording = Recording()
     url, key = guarded
@@ -223,7 +222,6 @@ def jobs(client: Client, folder: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_every_call_is_there_asynchronously(guarded: tuple[str, str], tmp_path: Path) -> None:
     """The halves have the same names, so the same tour goes through both: each await is done for it."""
     recording = AsyncRecording()

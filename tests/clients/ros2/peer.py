@@ -48,6 +48,8 @@ BAG_TYPES = {
     "Odometry": "nav_msgs/msg/Odometry",
 }
 PATIENCE = 40.0
+TRIES = 4
+"""How often a service is called that only tells something: its answer is lost if it does not know its caller yet."""
 
 
 class Peer:
@@ -95,8 +97,9 @@ class Peer:
         return {}
 
     def deafen(self, topic: str) -> dict[str, Any]:
-        """End the recording of a topic."""
-        self.node.destroy_subscription(self._subscriptions.pop(topic))
+        """End the recording of a topic, if there is one."""
+        if (made := self._subscriptions.pop(topic, None)) is not None:
+            self.node.destroy_subscription(made)
         return {}
 
     def take(self, topic: str) -> dict[str, Any]:
@@ -219,32 +222,34 @@ class Peer:
 
     def get(self, names: list[str], node: str) -> dict[str, Any]:
         """The values of parameters of a node, by their names; of strings and numbers."""
-        done = self._call(GetParameters, f"/{node}/get_parameters", GetParameters.Request(names=names))
+        done = self._call(GetParameters, f"/{node}/get_parameters", GetParameters.Request(names=names), tries=TRIES)
         values = {one: parameter_value_to_python(value) for one, value in zip(names, done.values, strict=True)}
         return {"values": values}
 
     def describe(self, names: list[str]) -> dict[str, Any]:
         """What the node says of its parameters."""
-        done = self._call(DescribeParameters, "/placerec/describe_parameters", DescribeParameters.Request(names=names))
+        request = DescribeParameters.Request(names=names)
+        done = self._call(DescribeParameters, "/placerec/describe_parameters", request, tries=TRIES)
         return {"descriptions": {one.name: one.description for one in done.descriptors}}
 
     def state(self, node: str = "placerec") -> dict[str, Any]:
         """The state of a node, and how long it took to say so."""
         began = time.monotonic()
-        done = self._call(GetState, f"/{node}/get_state", GetState.Request())
+        done = self._call(GetState, f"/{node}/get_state", GetState.Request(), tries=TRIES)
         return {"state": done.current_state.label, "seconds": time.monotonic() - began}
 
-    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE) -> Any:
+    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE, tries: int = 1) -> Any:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
         if not client.wait_for_service(patience):
             raise TimeoutError(f"no service {name}")
-        future, done = client.call_async(request), threading.Event()
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(patience):
-            raise TimeoutError(f"{name} did not answer in {patience} s")
-        return future.result()
+        for _ in range(tries):
+            future, done = client.call_async(request), threading.Event()
+            future.add_done_callback(lambda _, done=done: done.set())
+            if done.wait(patience / tries):
+                return future.result()
+        raise TimeoutError(f"{name} did not answer in {patience} s")
 
 
 def message_of(kind: str, fields: dict[str, Any]) -> Any:

@@ -18,6 +18,7 @@ from core.frames.preprocessing import Pixels
 from placerec_ros.parameters import PARAMETERS
 from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import ROOT, Server
+from tests.watch import PROXIES
 
 VENV = ROOT / ".venv-ros"
 PYTHON = VENV / "bin" / "python"
@@ -42,8 +43,9 @@ def walked_again(frames: list[Pixels]) -> list[bytes]:
 
 
 def ros_environment(**more: str) -> dict[str, str]:
-    """The environment of processes of .venv-ros: ROS keeps to this machine, and logs as it goes."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PLACEREC_", "ROS_", "RMW_"))}
+    """The environment of processes of .venv-ros: ROS keeps to this machine and logs as it goes; there is no proxy."""
+    dropped = ("PLACEREC_", "ROS_", "RMW_", *PROXIES)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(dropped)}
     own = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),  # tests that run beside these have nodes of the same name
@@ -91,7 +93,7 @@ class Node:
         """End it as launch would; the exit status."""
         self.process.send_signal(signal.SIGINT)
         try:
-            return self.process.wait(10)
+            return self.process.wait(60)
         except subprocess.TimeoutExpired:
             self.process.kill()
             raise AssertionError(f"the node does not end:\n{self.log()[-3000:]}") from None
@@ -242,7 +244,7 @@ class Robot:
     def transition(self, name: str) -> bool:
         """Ask the node for a transition, which takes no longer than a moment."""
         done = self.peer.do("transition", name=name)
-        assert done["seconds"] < 5, "the node waited for something"
+        assert done["seconds"] < 15, "the node waited for something"
         return bool(done["success"])
 
     @property
@@ -256,8 +258,9 @@ class Robot:
             assert self.transition("deactivate")
         if self.state == "inactive":
             assert self.transition("cleanup")
-        for topic in ("answer", "pose", "map_to_odom", "/diagnostics"):
+        for topic in ("answer", "pose", "map_to_odom", "annotated/compressed", "/diagnostics"):
             self.peer.do("deafen", topic=topic)
+            self.peer.take(topic)
         for topic in ("/image", "/camera_info", "/odom"):
             self.peer.do("withdraw", topic=topic)
 

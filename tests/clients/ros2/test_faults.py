@@ -33,13 +33,12 @@ def until_answered(robot: Robot, number: int) -> None:
     until(lambda: (robot.look(number=number), robot.peer.do("sleep", seconds=0.1), robot.peer.take("answer"))[-1])
 
 
-def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_was_killed_is_found_again(driving: Robot) -> None:
     robot, site = driving, driving.site
     robot.begin(deadline=5.0)
     robot.connected()
     robot.drive(0, 3)
-    port = site.server.port
-    monkeypatch.setattr("tests.service.server.free_port", lambda: port)
+    port = site.server.reservation.dup()
     site.server.kill()
     robot.look(number=3)
     status = robot.says("cannot be reached")
@@ -51,7 +50,7 @@ def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: p
     robot.peer.take("pose")
     robot.says("cannot be reached")
     assert robot.peer.take("pose") == [], "no old pose is repeated"
-    site.server = Server(site.folder / "service", key=site.keys["admin"], forked=False).wait()
+    site.server = Server(site.folder / "service", key=site.keys["admin"], forked=False, reservation=port).wait()
     until_answered(robot, 3)
     robot.says("The verdict is")
     robot.answers_settled()

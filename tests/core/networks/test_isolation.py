@@ -125,7 +125,7 @@ def test_damaged_files_harm_nobody(
     sound = write(tmp_path)
     assert all(read_it(path) for path in sound[:1])
     command = [sys.executable, "-m", "tests.core.networks.hostile", reader, str(count), str(tmp_path), *map(str, sound)]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=100)
+    done = subprocess.run(command, capture_output=True, check=True, timeout=300)
     ends = json.loads(done.stdout.splitlines()[-1])
     assert sum(ends.values()) == count and min(ends["read"], ends["refused"]) > 3, ends
     for bad in sorted(tmp_path.glob("*.bad")):

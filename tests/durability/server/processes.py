@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -12,7 +13,7 @@ from typing import Self
 import httpx
 
 from tests.service.forks import ForkedServer
-from tests.service.server import free_port
+from tests.service.server import reserved
 
 START_SECONDS = 300.0
 """The machine may be busy with other things."""
@@ -21,8 +22,9 @@ START_SECONDS = 300.0
 class ServerProcess:
     """``placerec serve`` in a process that was forked off (:mod:`tests.service.forks`)."""
 
-    def __init__(self, process: ForkedServer, port: int, log: Path) -> None:
+    def __init__(self, process: ForkedServer, reservation: socket.socket, log: Path) -> None:
         self.number, self.log = process.pid, log
+        self._reservation, port = reservation, reservation.getsockname()[1]
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=120)
         self._process = process
 
@@ -46,6 +48,7 @@ class ServerProcess:
         """Kill the server and close the connections."""
         self.kill()
         self.client.close()
+        self._reservation.close()
 
 
 class ServerProcesses:
@@ -66,7 +69,7 @@ class ServerProcesses:
         Args:
             traced: the server waits until it is traced.
         """
-        port = free_port()
-        own = {"host": "127.0.0.1", "port": port, **settings}
+        reservation = reserved()
+        own = {"host": "127.0.0.1", "port": reservation.getsockname()[1], **settings}
         environment = os.environ | {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
-        return ServerProcess(ForkedServer(environment, self._log, traced), port, self._log)
+        return ServerProcess(ForkedServer(environment, self._log, traced), reservation, self._log)

@@ -15,7 +15,7 @@ def refused(*words: object, **settings: object) -> str:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
     environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in settings.items()}
     command = [sys.executable, "-m", "service.commands", "serve", *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     return done.stderr

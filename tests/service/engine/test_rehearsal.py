@@ -21,6 +21,7 @@ CACHE = "[cache] "
 @pytest.mark.timeout(600)  # of a slow machine whose cache is empty
 def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")  # what it tells is there when a request is answered
     server = Server(tmp_path, {"rehearsal": True}, forked=False)
     try:
         server.wait(seconds=500)

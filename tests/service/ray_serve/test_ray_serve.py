@@ -30,7 +30,7 @@ from tests.service.ray_serve.robots import stays
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
-pytestmark = [pytest.mark.anyio, pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.anyio, pytest.mark.cluster]
 
 IDENTITY = EncoderCatalogue().resolve(DEFAULT_ENCODER)
 BATCH = 4

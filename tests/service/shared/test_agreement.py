@@ -20,7 +20,7 @@ from tests.service.shared.postgres import Postgres
 FAKETIME = sorted(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
 SLOW = ("env", f"LD_PRELOAD={FAKETIME[0]}", "FAKETIME=-5m", "FAKETIME_DONT_FAKE_MONOTONIC=1") if FAKETIME else ()
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 
 def test_all_that_should_be_alike_are_settings() -> None:

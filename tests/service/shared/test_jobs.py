@@ -25,7 +25,7 @@ from tests.service.jobs.test_jobs import Gate, Kinds, end_of
 from tests.service.server import ROOT
 from tests.service.shared.worker import walk
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 CONTRACT: list[Callable[..., None]] = [
     embedded.test_a_job_runs_and_is_remembered,

@@ -20,7 +20,7 @@ from tests.service.server import Server, assert_problem
 from tests.service.shared.postgres import Postgres
 from tests.service.shared.services import MAP, two_services
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 UNTIL = datetime.now(UTC) + timedelta(days=30)
 NAMES = ("ann", "bob", "eve")

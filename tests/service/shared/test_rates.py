@@ -13,7 +13,7 @@ from tests.service.server import assert_problem
 from tests.service.shared.postgres import Postgres
 from tests.service.shared.services import MAP, two_services
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 RATE = 0.01
 """So slow that no test waits for a token."""

@@ -21,7 +21,7 @@ from tests.service.sessions.test_sessions import again, begin, post, send
 from tests.service.shared.postgres import Postgres
 from tests.service.shared.services import MAP, two_services
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 LIMITS = {"max_sessions": 3, "session_expiry": 600}
 

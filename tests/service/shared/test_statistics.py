@@ -25,7 +25,7 @@ from tests.service.server import Server
 from tests.service.shared.postgres import Postgres
 from tests.service.shared.services import MAP, two_services
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 CONTRACT: list[Callable[..., None]] = [
     embedded.test_counts_survive_a_restart,

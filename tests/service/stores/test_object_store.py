@@ -14,7 +14,7 @@ from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 from tests.service.stores.door import Door
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster]
 
 
 def pictures_state(service: Server, expected: str) -> None:

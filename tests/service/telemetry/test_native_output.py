@@ -25,7 +25,7 @@ os.write(2, b"as before\\n")
 
 
 def test_lines_are_logged_cut_and_told_apart() -> None:
-    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, timeout=100, check=True)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, timeout=300, check=True)
     *said, last = done.stderr.decode().splitlines()
     said.remove("from Python")
     lines = [json.loads(line) for line in said]

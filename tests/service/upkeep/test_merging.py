@@ -133,7 +133,6 @@ def test_merging_what_cannot_be_merged(server: Server, traverse: str) -> None:
 MANY = 640
 
 
-@pytest.mark.timeout(300)  # the service is started twice
 def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     with runtime_at(tmp_path) as runtime:

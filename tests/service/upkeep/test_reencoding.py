@@ -121,7 +121,6 @@ def folder(tmp_path: Path) -> Path:
 MANY = 160
 
 
-@pytest.mark.timeout(300)  # the service is started several times
 def test_kills_and_changes_in_between(folder: Path) -> None:
     """The service is killed twice and the old map changed meanwhile: the new map is listed only when it is complete."""
     server = Server(folder).wait()

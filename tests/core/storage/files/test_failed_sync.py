@@ -25,7 +25,7 @@ def run(action: str, directory: Path, call: str, error: str, when: str) -> subpr
     inject = ["-e", f"trace={call}", "-e", f"inject={call}:error={error}:when={when}"]
     command = [sys.executable, "-m", "tests.core.storage.worker", action, str(directory)]
     traced = [strace() or "", "-f", "--seccomp-bpf", "-o", "/dev/null", *inject, *command]
-    return subprocess.run(traced, cwd=REPOSITORY, capture_output=True, timeout=60, check=False)
+    return subprocess.run(traced, cwd=REPOSITORY, capture_output=True, timeout=300, check=False)
 
 
 @pytest.mark.parametrize(

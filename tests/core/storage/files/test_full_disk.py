@@ -167,7 +167,7 @@ def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Pa
 def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
     """By the limit that a process can set on itself, so that it runs everywhere."""
     command = [sys.executable, "-m", "tests.core.storage.worker", "fill", str(directory)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True, timeout=60)
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True, timeout=300)
     answer = json.loads(finished.stdout)
     assert answer["error"] == "StorageFull"
     assert answer["places"] > 20

@@ -21,7 +21,7 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     folder = tmp_path_factory.mktemp("synced").resolve()
     command = [sys.executable, "-m", "tests.core.storage.worker", "everything", str(folder / "data")]
     traced = [*strace_arguments(folder / "trace"), *command]
-    subprocess.run(traced, cwd=REPOSITORY, check=True, capture_output=True, timeout=100)
+    subprocess.run(traced, cwd=REPOSITORY, check=True, capture_output=True, timeout=300)
     return (folder / "trace").read_text(), folder / "data"
 
 

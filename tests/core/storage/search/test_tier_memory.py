@@ -67,7 +67,7 @@ def priorities(directory: Path) -> None:
 
 def test_the_threads_that_search_are_not_as_nice_as_the_one_that_builds(directory: Path) -> None:
     command = [sys.executable, "-m", "tests.core.storage.search.test_tier_memory", str(directory)]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=100, check=True)
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=True)
     searching, of_process = finished.stdout.strip().rsplit(" ", 1)
     assert searching == f"{{{of_process}}}"
 
