@@ -195,9 +195,6 @@ def test_the_ids_of_places_are_those_of_the_service() -> None:
     assert batches.PLACE_ID.pattern == PLACE_IDS.pattern
 
 
-@pytest.mark.timeout(300)
-
-
 @pytest.mark.parametrize("moment", [9, pytest.param(20, marks=pytest.mark.thorough)])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, moment: int) -> None:
     server = Server(tmp_path / "service").wait()
