@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 from placerec_client.requests import seconds_of
 
+LEAVE_SECONDS = 1.0
+"""How long leaving a session, with the stream in it, waits for the service."""
+
 SHORTEST_PAUSE = 0.05
 """Seconds between two attempts at least, unless the rule has shorter pauses; no attempt begins later than that before
 the end of the time."""

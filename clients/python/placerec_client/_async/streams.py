@@ -17,13 +17,12 @@ from placerec_client import models, parameters, problems
 from placerec_client._async.concurrency import received, sleep
 from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.numbering import AsyncNumbering
-from placerec_client._async.sessions import LEAVE_SECONDS
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
 from placerec_client.odometry import Odometry, with_motion
 from placerec_client.requests import dumps, text_of
-from placerec_client.retry import Clock
+from placerec_client.retry import LEAVE_SECONDS, Clock
 
 CONNECT_SECONDS = 5.0
 CLOSE_SECONDS = LEAVE_SECONDS / 2

@@ -18,14 +18,11 @@ from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.odometry import Odometry, with_motion
 from placerec_client.renamed import OldNames, Subscripted
 from placerec_client.requests import path_of
-from placerec_client.retry import Retry
+from placerec_client.retry import LEAVE_SECONDS, Retry
 
 if TYPE_CHECKING:
     from placerec_client._sync.streams import Stream
 
-
-LEAVE_SECONDS = 1.0
-"""How long leaving a session, with the stream in it, waits for the service."""
 
 log = getLogger("placerec_client")
 
