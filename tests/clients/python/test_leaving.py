@@ -19,6 +19,7 @@ from placerec_client._async import concurrency as async_concurrency
 from placerec_client._async import sessions as async_sessions
 from placerec_client._async import streams as async_streams
 from placerec_client._sync import concurrency, sessions, streams
+from placerec_client.retry import LEAVE_SECONDS
 from tests.clients.python.fault_proxy import Fault, FaultProxy
 from tests.clients.python.moments import Moments
 from tests.service.refusing import refusing_server
@@ -29,8 +30,6 @@ Result = TypeVar("Result")
 
 SECONDS = 3600.0
 """How long leaving waits here, where nothing may depend on the speed of the machine."""
-
-USUAL_SECONDS = sessions.LEAVE_SECONDS, async_sessions.LEAVE_SECONDS
 
 
 @pytest.fixture(autouse=True)
@@ -194,8 +193,8 @@ def test_a_stream_and_its_session_are_left_within_one_second(
     monkeypatch.setattr(
         async_streams, "connect", lambda _, close_timeout, **options: AsyncSilent(moments, broken_off, close_timeout)
     )
-    for module, seconds in zip((sessions, async_sessions), USUAL_SECONDS, strict=True):
-        monkeypatch.setattr(module, "LEAVE_SECONDS", seconds)
+    for module in (sessions, async_sessions):
+        monkeypatch.setattr(module, "LEAVE_SECONDS", LEAVE_SECONDS)
 
     def within(seconds: float, _: object) -> None:
         waited.append(seconds)
@@ -220,7 +219,7 @@ def test_a_stream_and_its_session_are_left_within_one_second(
 
 
 def test_work_that_does_not_end_is_left() -> None:
-    assert USUAL_SECONDS == (1.0, 1.0)
+    assert LEAVE_SECONDS == 1.0
     ended = Event()
     with pytest.raises(TimeoutError):
         concurrency.within(0.01, ended.wait)
