@@ -2,6 +2,7 @@
 import { caller, checkConnection, epoch, everyMap, get, identify, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
+import { firstKey, Secret } from "./shared/secret.js";
 import { html, signal, useEffect, useState } from "./shared/view.js";
 
 const OF_MAPS = {
@@ -35,7 +36,15 @@ export function Frame() {
     identify().catch(setRefused);
   };
   useEffect(begin, []);
-  if (keyNeeded.value !== null) return html`<${KeyPage} problem=${keyNeeded.value} />`;
+  const made = firstKey.value;
+  return html`
+    ${keyNeeded.value === null ? html`<${Inside} refused=${refused} begin=${begin} />` : html`<${KeyPage} problem=${keyNeeded.value} />`}
+    ${made && html`<${Secret} made=${made} close=${() => { firstKey.value = null; }} />`}
+  `;
+}
+
+/** What there is for somebody whose key, or none, is accepted. */
+function Inside({ refused, begin }) {
   return html`
     <a class="skip" href="#content" onClick=${skip}>Skip to the content</a>
     <div class=${`frame ${menuOpen.value ? "menu-open" : ""}`}>

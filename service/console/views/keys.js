@@ -1,7 +1,8 @@
 // Keys: who may do what.  A new one is shown once; one in force can be narrowed or deleted.
 import { all, identify, pathOf, send, useKey } from "../shared/api.js";
-import { ByName, Copy, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
+import { ByName, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
 import { MapsField } from "../shared/maps_field.js";
+import { firstKey, Secret } from "../shared/secret.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { html, useState } from "../shared/view.js";
 
@@ -90,10 +91,16 @@ function Create({ first, close, changed }) {
   const create = guarded(async (query) => {
     const { name, role, maps, expires } = fields;
     const body = { name, role, maps, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
-    setMade(await (await send("POST", "/keys", { query, json: body })).json());
-    if (!first) changed();
+    const answer = await (await send("POST", "/keys", { query, json: body })).json();
+    if (!first) {
+      setMade(answer);
+      return changed();
+    }
+    firstKey.value = answer;
+    close();
+    return useKey(answer.key);
   });
-  if (made) return html`<${Secret} made=${made} first=${first} close=${close} changed=${changed} />`;
+  if (made) return html`<${Secret} made=${made} close=${close} />`;
   return html`
     <${FormDialog} title="Create a key" action="Create" ready=${fields.name !== "" && fields.maps?.length !== 0} close=${close} stay send=${create}>
       ${first && html`<p class="notice">With the first key everybody needs one, you too. Make it an admin key for all maps; it is used here at once.</p>`}
@@ -112,21 +119,6 @@ function RoleField({ roles, value, change }) {
   return html`
     <${Field} label="Role">
       <select value=${value} onChange=${(event) => change(event.target.value)}>${roles.map((one) => html`<option value=${one}>${one}: ${MEANING[one]}</option>`)}</select>
-    <//>
-  `;
-}
-
-function Secret({ made, first, close, changed }) {
-  const finish = async () => {
-    if (first) await useKey(made.key);
-    changed();
-    close();
-  };
-  return html`
-    <${Dialog} title=${`The key ${made.name}`} close=${finish}>
-      <p><strong>Copy it now.</strong> It is shown this once; the service keeps only its hash.</p>
-      <pre tabindex="0" class="secret" aria-label="The key">${made.key}</pre>
-      <footer class="row"><${Copy} text=${made.key} label="Copy the key" /><button type="button" class="primary" onClick=${finish}>Done</button></footer>
     <//>
   `;
 }

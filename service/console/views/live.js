@@ -60,13 +60,14 @@ function matches({ key, camera, place, best, session, operation, missed }, text)
  * an item says so: `missed` is how many, or null.
  */
 function useStream(map, { wanted, pictures, paused }) {
-  const [state, setState] = useState({ items: [], open: false, error: null, held: 0 });
+  const [state, setState] = useState({ items: [], open: null, error: null, held: 0 });
   const [attempt, setAttempt] = useState(0);
   const held = useRef([]);
   const stopped = useRef(paused);
   const number = useRef(0);
   const heard = useRef({});
   stopped.current = paused;
+  const asked = JSON.stringify([map, wanted, pictures, attempt, epoch.value]); // `open` is which of these is open
   const change = (changes) => setState((old) => ({ ...old, ...(typeof changes === "function" ? changes(old) : changes) }));
   useEffect(() => {
     if (paused) return;
@@ -87,18 +88,19 @@ function useStream(map, { wanted, pictures, paused }) {
     const query = { kinds: "query", pictures: pictures ? "true" : "" };
     if (wanted.length < VERDICTS.length) query.verdicts = wanted.join(",");
     if (heard.current.map !== map || heard.current.key !== key.value) heard.current = { map, key: key.value, last: null };
-    change({ error: null, open: false });
+    change({ error: null, open: null });
     if (wanted.length > 0) {
-      const options = { query, onEvent, onState: (open) => change({ open }), signal: controller.signal, heard: heard.current };
-      follow(mapPath(map, "events"), options).catch((error) => change({ error, open: false }));
+      const onState = (open) => change((old) => ({ open: open ? asked : old.open === asked ? null : old.open }));
+      const options = { query, onEvent, onState, signal: controller.signal, heard: heard.current };
+      follow(mapPath(map, "events"), options).catch((error) => change({ error, open: null }));
     }
     return () => controller.abort();
-  }, [map, wanted.join(), pictures, attempt, epoch.value]);
+  }, [asked]);
   const clear = () => {
     held.current = [];
     change({ items: [], held: 0 });
   };
-  return { ...state, clear, again: () => setAttempt((one) => one + 1) };
+  return { ...state, open: state.open === asked, clear, again: () => setAttempt((one) => one + 1) };
 }
 
 /** What stands between two answers where others may be missing. */

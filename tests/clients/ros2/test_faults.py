@@ -88,8 +88,8 @@ def test_a_service_that_is_cut_off_lets_the_node_end(driving: Robot, door: Door)
     robot.look(number=1)
     robot.peer.do("sleep", seconds=0.3)
     done = robot.peer.do("transition", name="deactivate")
-    assert done["success"] and done["seconds"] < 1
-    assert robot.peer.do("transition", name="cleanup")["seconds"] < 3
+    assert done["success"] and done["seconds"] < 20
+    assert robot.peer.do("transition", name="cleanup")["seconds"] < 20, "the deadline of the frame is a minute"
     door.open()
     robot.peer.do("sleep", seconds=0.5)
     assert robot.peer.take("answer") == [], "the answer that was under way is not published"

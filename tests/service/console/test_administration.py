@@ -75,8 +75,9 @@ def test_the_first_key_is_used_at_once(visit: Visit, tmp_path_factory: pytest.Te
         page.get_by_role("button", name="Create a key").click()
         page.get_by_role("dialog").get_by_label("Name").fill("ann")
         page.get_by_role("dialog").get_by_role("button", name="Create").click()
+        page.locator(".identity").get_by_text("ann").wait_for()  # at once: without it the page would be refused
+        assert page.get_by_label("The key", exact=True).inner_text().startswith("placerec_")
         page.get_by_role("button", name="Done").click()
-        page.locator(".identity").get_by_text("ann").wait_for()
         page.get_by_role("row").filter(has_text="yours").wait_for()
         assert server.client.get("/v1/maps").status_code == 401
         page.evaluate("sessionStorage.clear()")

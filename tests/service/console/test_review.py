@@ -13,16 +13,14 @@ from tests.service.console import world
 from tests.service.console.conftest import Operator, Visit
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server
+from tests.service.wire import eventually
 
 KEPT = {"verdicts": ["recognized", "ambiguous", "unknown"], "most_frames": 500, "most_bytes": 2**28}
 
 
 def wait_for_kept(server: Server, map_id: str, count: int) -> None:
     """Frames are written a moment after their answers."""
-    for _ in range(200):
-        if server.client.get(f"/v1/maps/{map_id}/review").json()["frames"] >= count:
-            return
-    raise AssertionError("the frames were not kept")
+    assert eventually(lambda: server.client.get(f"/v1/maps/{map_id}/review").json()["frames"] >= count)
 
 
 @pytest.fixture
@@ -104,14 +102,10 @@ def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     page.get_by_text("The frame is thrown away.").wait_for(state="detached")
     expect(queue).to_have_count(3)
     page.get_by_role("button", name="Throw away").click()
-    page.get_by_role("link", name="Places").click()  # whoever goes on means it
-    page.get_by_role("heading", name="Places").wait_for()
-    admin.settle()
-    for _ in range(100):
-        left = keyed.client.get(f"/v1/maps/{doubtful}/review").json()["frames"]
-        if left == 2:
-            break
-    assert left == 2
+    with page.expect_response(lambda answer: answer.request.method == "POST") as gone:
+        page.get_by_role("link", name="Places").click()  # whoever goes on means it
+    assert gone.value.ok
+    assert keyed.client.get(f"/v1/maps/{doubtful}/review").json()["frames"] == 2
 
 
 @pytest.mark.thorough

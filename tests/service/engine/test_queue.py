@@ -66,10 +66,9 @@ async def test_a_frame_is_decoded_and_encoded(queue: EncoderQueue) -> None:
 
 async def test_the_event_loop_goes_on(queue: EncoderQueue, busy: threading.Event) -> None:
     waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
-    start = time.monotonic()
     for _ in range(100):
         await asyncio.sleep(0)
-    assert time.monotonic() - start < 0.5 and not waiting.done()
+    assert not waiting.done()
     busy.set()
     assert (await waiting).milliseconds["wait"] > 0
 
@@ -85,10 +84,9 @@ async def test_a_full_queue_refuses(queue: EncoderQueue) -> None:
 
 
 async def test_a_late_frame_is_dropped_before_it_is_encoded(queue: EncoderQueue, busy: threading.Event) -> None:
-    start = time.monotonic()
     with pytest.raises(DeadlineExceeded):
         await queue.encode(IDENTITY, jpeg(1), deadline(0.2))
-    assert time.monotonic() - start < 5, "told at the deadline, not when the encoder is free"
+    assert not busy.is_set(), "told at the deadline, not when the encoder is free"
     with pytest.raises(DeadlineExceeded):
         await queue.encode(IDENTITY, jpeg(1), deadline(-1))
     busy.set()
