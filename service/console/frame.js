@@ -2,7 +2,7 @@
 import { caller, checkConnection, epoch, everyMap, get, identify, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
-import { firstKey, Secret } from "./shared/secret.js";
+import { Secret } from "./shared/secret.js";
 import { html, signal, useEffect, useState } from "./shared/view.js";
 
 const OF_MAPS = {
@@ -36,10 +36,9 @@ export function Frame() {
     identify().catch(setRefused);
   };
   useEffect(begin, []);
-  const made = firstKey.value;
   return html`
     ${keyNeeded.value === null ? html`<${Inside} refused=${refused} begin=${begin} />` : html`<${KeyPage} problem=${keyNeeded.value} />`}
-    ${made && html`<${Secret} made=${made} close=${() => { firstKey.value = null; }} />`}
+    <${Secret} />
   `;
 }
 

@@ -130,11 +130,14 @@ export function Dialog({ title, close, wide = false, children }) {
   const id = useId();
   useLayoutEffect(() => {
     const before = document.activeElement;
+    const replaced = document.querySelector("dialog[open]"); // if this one takes the place of another, which goes
     const shown = element.current;
+    shown.opener = replaced?.opener ?? before;
     shown.showModal();
     return () => {
       shown.close(); // while it is open, nothing behind it takes the focus
-      before?.focus?.();
+      const there = before?.isConnected && before !== document.body;
+      (there ? before : shown.opener)?.focus?.();
     };
   }, []);
   const cancelled = (event) => {
@@ -149,8 +152,8 @@ export function Dialog({ title, close, wide = false, children }) {
   `;
 }
 
-/** A form in a dialog: it is sent once at a time, and shows what went wrong; with `stay` it does not close by itself. */
-export function FormDialog({ title, action, danger = false, ready = true, stay = false, close, send, wide, children }) {
+/** A form in a dialog: it is sent once at a time, shows what went wrong, and closes when nothing did. */
+export function FormDialog({ title, action, danger = false, ready = true, close, send, wide, children }) {
   const [error, setError] = useState(null);
   const [busy, setBusy] = useState(false);
   const submit = async (event) => {
@@ -160,7 +163,7 @@ export function FormDialog({ title, action, danger = false, ready = true, stay =
     setError(null);
     try {
       await send();
-      if (!stay) close();
+      close();
     } catch (problem) {
       setError(problem);
     }

@@ -1,9 +1,9 @@
 // Keys: who may do what.  A new one is shown once; one in force can be narrowed or deleted.
 import { all, identify, pathOf, send, useKey } from "../shared/api.js";
-import { ByName, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
+import { ByName, complain, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
 import { MapsField } from "../shared/maps_field.js";
-import { firstKey, Secret } from "../shared/secret.js";
 import { Shown, useResource } from "../shared/resource.js";
+import { newKey } from "../shared/secret.js";
 import { html, useState } from "../shared/view.js";
 
 const ROLES = ["query", "enrol", "admin"];
@@ -87,22 +87,15 @@ function Create({ first, close, changed }) {
   const [fields, setFields] = useState({ name: "", role: first ? "admin" : "query", maps: null, expires: "" });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const { guarded, box } = useLocking();
-  const [made, setMade] = useState(null);
   const create = guarded(async (query) => {
     const { name, role, maps, expires } = fields;
     const body = { name, role, maps, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
-    const answer = await (await send("POST", "/keys", { query, json: body })).json();
-    if (!first) {
-      setMade(answer);
-      return changed();
-    }
-    firstKey.value = answer;
-    close();
-    return useKey(answer.key);
+    newKey.value = await (await send("POST", "/keys", { query, json: body })).json();
+    if (first) useKey(newKey.value.key).catch(complain);
+    changed();
   });
-  if (made) return html`<${Secret} made=${made} close=${close} />`;
   return html`
-    <${FormDialog} title="Create a key" action="Create" ready=${fields.name !== "" && fields.maps?.length !== 0} close=${close} stay send=${create}>
+    <${FormDialog} title="Create a key" action="Create" ready=${fields.name !== "" && fields.maps?.length !== 0} close=${close} send=${create}>
       ${first && html`<p class="notice">With the first key everybody needs one, you too. Make it an admin key for all maps; it is used here at once.</p>`}
       <${Field} label="Name"><input required maxlength="64" value=${fields.name} onInput=${(event) => change({ name: event.target.value })} autofocus autocomplete="off" spellcheck=${false} /><//>
       <${RoleField} roles=${ROLES} value=${fields.role} change=${(role) => change({ role })} />

@@ -67,7 +67,7 @@ function useStream(map, { wanted, pictures, paused }) {
   const number = useRef(0);
   const heard = useRef({});
   stopped.current = paused;
-  const asked = JSON.stringify([map, wanted, pictures, attempt, epoch.value]); // `open` is which of these is open
+  const subscription = JSON.stringify([map, wanted, pictures, attempt, epoch.value]); // `open` is the one that is open
   const change = (changes) => setState((old) => ({ ...old, ...(typeof changes === "function" ? changes(old) : changes) }));
   useEffect(() => {
     if (paused) return;
@@ -88,19 +88,19 @@ function useStream(map, { wanted, pictures, paused }) {
     const query = { kinds: "query", pictures: pictures ? "true" : "" };
     if (wanted.length < VERDICTS.length) query.verdicts = wanted.join(",");
     if (heard.current.map !== map || heard.current.key !== key.value) heard.current = { map, key: key.value, last: null };
-    change({ error: null, open: null });
+    change({ error: null });
     if (wanted.length > 0) {
-      const onState = (open) => change((old) => ({ open: open ? asked : old.open === asked ? null : old.open }));
+      const onState = (open) => change({ open: open ? subscription : null });
       const options = { query, onEvent, onState, signal: controller.signal, heard: heard.current };
       follow(mapPath(map, "events"), options).catch((error) => change({ error, open: null }));
     }
     return () => controller.abort();
-  }, [asked]);
+  }, [subscription]);
   const clear = () => {
     held.current = [];
     change({ items: [], held: 0 });
   };
-  return { ...state, open: state.open === asked, clear, again: () => setAttempt((one) => one + 1) };
+  return { ...state, open: state.open === subscription, clear, again: () => setAttempt((one) => one + 1) };
 }
 
 /** What stands between two answers where others may be missing. */

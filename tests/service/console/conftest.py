@@ -17,6 +17,9 @@ from tests.service.server import Server
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
+PATIENCE = 15_000
+"""Milliseconds for which a test waits for what it expects of a page."""
+
 OUT_OF_PANEL = """[...document.querySelectorAll("main .panel")].flatMap((panel) => {
   const { right } = panel.getBoundingClientRect();
   return [...panel.querySelectorAll("*")]
@@ -53,7 +56,7 @@ class Operator:
         """Wait until the view is there and nothing is being read."""
         path = "" if view is None else f"[data-view='{view.partition('?')[0]}']"
         self.page.locator(f"main .view{path} h1").wait_for()
-        expect(self.page.locator("main .loading")).to_have_count(0, timeout=15_000)
+        expect(self.page.locator("main .loading")).to_have_count(0)
 
     def foresee(self, *texts: str) -> None:
         """Complaints that contain one of these are part of the test."""
@@ -83,6 +86,7 @@ def browser() -> Iterator[Browser]:
     """Chromium without a window; the tests are skipped where there is none."""
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    expect.set_options(timeout=PATIENCE)
     with sync_playwright() as playwright:
         options = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
         running = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
@@ -134,7 +138,7 @@ def desk(browser: Browser) -> Iterator[BrowserContext]:
 
 def new_context(browser: Browser) -> BrowserContext:
     context = browser.new_context(permissions=["clipboard-write", "camera"])
-    context.set_default_timeout(15_000)
+    context.set_default_timeout(PATIENCE)
     return context
 
 

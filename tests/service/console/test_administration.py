@@ -29,6 +29,7 @@ def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed
     expect(shown).to_have_text(re.compile(r"^placerec_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"))
     secret = shown.inner_text()
     page.get_by_role("button", name="Done").click()
+    expect(page.get_by_role("button", name="Create a key")).to_be_focused()
     row = page.get_by_role("row").filter(has_text="fleet-7")
     row.wait_for()
     assert secret not in page.content()
@@ -78,6 +79,7 @@ def test_the_first_key_is_used_at_once(visit: Visit, tmp_path_factory: pytest.Te
         page.locator(".identity").get_by_text("ann").wait_for()  # at once: without it the page would be refused
         assert page.get_by_label("The key", exact=True).inner_text().startswith("placerec_")
         page.get_by_role("button", name="Done").click()
+        expect(page.get_by_role("button", name="Create a key")).to_be_focused()
         page.get_by_role("row").filter(has_text="yours").wait_for()
         assert server.client.get("/v1/maps").status_code == 401
         page.evaluate("sessionStorage.clear()")

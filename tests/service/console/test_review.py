@@ -105,6 +105,8 @@ def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     with page.expect_response(lambda answer: answer.request.method == "POST") as gone:
         page.get_by_role("link", name="Places").click()  # whoever goes on means it
     assert gone.value.ok
+    page.get_by_role("heading", name="Places").wait_for()
+    admin.settle()
     assert keyed.client.get(f"/v1/maps/{doubtful}/review").json()["frames"] == 2
 
 

@@ -82,6 +82,8 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     with page.expect_response(lambda answer: answer.request.method == "PATCH") as undone:
         page.get_by_role("button", name="Undo").click()
     assert undone.value.ok
+    page.get_by_role("status").get_by_role("button", name="Undo").wait_for(state="detached")
+    admin.settle()
     after = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
     assert after["threshold"] == pytest.approx(before["threshold"])
 
@@ -134,6 +136,7 @@ def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> No
     for number in range(2):
         keyed.enrol("short", f"s{number}", world.frame(number), sequence=f"walk-{number}")
     page = admin.go("maps/short/traverses")
+    expect(page.locator(".picture.waiting")).to_have_count(0)
     page.get_by_role("button", name="Delete walk-0").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("walk-0")
     page.get_by_role("button", name="Delete the traverse").click()
