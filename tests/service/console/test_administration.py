@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import APIResponse, Route, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
-from playwright.sync_api import expect
 
 from service.access.keys import KeyStore
 from tests.service.console.conftest import Operator, Visit
@@ -86,6 +86,34 @@ def test_the_first_key_is_used_at_once(visit: Visit, tmp_path_factory: pytest.Te
         operator.foresee("401")
         page.reload()
         page.get_by_text("The service asks for a key.").wait_for()
+    finally:
+        assert server.stop() == 0
+
+
+def test_the_first_key_is_not_lost_with_the_page_that_made_it(
+    visit: Visit, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """A request without a key is refused between the creation of the first one and the arrival of the answer."""
+    server = Server(tmp_path_factory.mktemp("open")).wait("/livez")
+    held: list[tuple[Route, APIResponse]] = []
+    try:
+        operator = visit(None, server=server)
+        operator.foresee("401")
+        page = operator.go("keys")
+        page.route("**/v1/keys", lambda route: held.append((route, route.fetch())))
+        page.get_by_role("button", name="Create a key").click()
+        page.get_by_role("dialog").get_by_label("Name").fill("ann")
+        page.get_by_role("dialog").get_by_role("button", name="Create").click()
+        while not held:
+            page.wait_for_timeout(20)
+        page.goto(f"{operator.root}/console#/jobs")
+        page.get_by_text("The service asks for a key.").wait_for()
+        for route, answer in held:
+            route.fulfill(response=answer)
+        secret = page.get_by_role("dialog").get_by_label("The key", exact=True).inner_text()
+        page.get_by_role("dialog").get_by_role("button", name="Done").click()
+        page.locator(".identity").get_by_text("ann").wait_for()
+        assert server.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"}).status_code == 200
     finally:
         assert server.stop() == 0
 
