@@ -15,8 +15,6 @@ import torch
 import typer
 
 from benchmarks.report import report, verdict
-from core.evaluation.samples import jpeg, sample_frame
-from core.evaluation.timing import better_forward, encoding_runs, medians
 from core.frames.images import decode
 from core.frames.preprocessing import contrast, prepare
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -24,6 +22,8 @@ from core.method.encoder import Encoder
 from core.method.vlad import aggregate
 from core.threads import cores, share_cores, use_threads
 from service.commands.malloc import configure_malloc
+from service.commands.timing.samples import jpeg, sample_frame
+from service.commands.timing.stages import better_forward, encoding_runs, medians
 
 LIMIT = 1.3
 TOGETHER = 8

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.fleet import Fleet, Plan, Scene, Seen
 from benchmarks.process import service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import jpeg, sample_frame
+from service.commands.timing.samples import jpeg, sample_frame
 
 MAP = "endurance"
 SAMPLE_SECONDS = 5.0

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.frames.traverses import find_images
 from core.method.encoder import Encoder, Encoding
+from service.commands.timing.samples import jpeg, sample_frame
 
 WIDTH, HEIGHT = 640, 480
 BATCH = 8

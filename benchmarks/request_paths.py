@@ -22,7 +22,7 @@ from types import FrameType
 import typer
 
 from benchmarks.report import report
-from core.evaluation.samples import jpeg, sample_frame
+from service.commands.timing.samples import jpeg, sample_frame
 
 ROOT = Path(__file__).parents[1]
 PLACES = 6

@@ -27,8 +27,6 @@ import typer
 from benchmarks.frames import camera_frames
 from benchmarks.process import median, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map
-from core.evaluation.timing import encode_batch
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -37,6 +35,8 @@ from core.storage import Atlas, Map
 from core.threads import cores, share_cores
 from service.commands.load import measure
 from service.commands.malloc import configure_malloc
+from service.commands.timing.samples import fill_map
+from service.commands.timing.stages import encode_batch
 
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query?verify=never"

@@ -17,7 +17,7 @@ import typer
 
 from benchmarks.process import Process, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import jpeg, sample_frame
+from service.commands.timing.samples import jpeg, sample_frame
 
 READY_LIMIT = 6.0
 MEMORY_LIMIT = 800.0

@@ -1,6 +1,6 @@
 """Install the packages of a lock file into the environment of the Python that runs this.
 
-    .venv/bin/python scripts/packages.py service|development
+    .venv/bin/python scripts/packages.py service|lab|development
     .venv-ros/bin/python scripts/packages.py ros        # without torch
     .venv-cluster/bin/python scripts/packages.py cluster
     .venv/bin/python scripts/packages.py --settings     # prints uv's variables for pip's configuration

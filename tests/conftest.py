@@ -26,11 +26,11 @@ LONGEST = (
     "tests/core/storage/files/test_failed_sync.py",
     "tests/service/sessions/test_sessions.py",
     "tests/service/upkeep/",
-    "tests/core/evaluation/report/",
+    "tests/lab/evaluation/report/",
     "tests/clients/",
     "tests/service/engine/",
     "tests/benchmarks/",
-    "tests/training/",
+    "tests/lab/training/",
 )
 """Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end."""
 

@@ -24,9 +24,9 @@ import typer
 from benchmarks.frames import camera_frames
 from benchmarks.process import median, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from service.commands.load import measure
+from service.commands.timing.samples import fill_map
 
 MAP = "benchmark"
 ROBOTS_PROGRAM = Path(__file__).parent / "robots.py"

@@ -29,7 +29,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields
 from core.recognition.recognition import Answer, describe, locate
 from core.threads import cores, share_cores
-from training.map_sizes import corridor_and_lip6
+from lab.training.map_sizes import corridor_and_lip6
 
 MOST_APART = 0.002
 AT_ONCE = 64

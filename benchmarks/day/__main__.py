@@ -18,8 +18,8 @@ from benchmarks.day.situations import SITUATIONS, moments
 from benchmarks.day.table import Row, show
 from benchmarks.day.walks import WALKS
 from benchmarks.process import service
+from lab.training.photographs import find_photographs
 from placerec_client import Client
-from training.photographs import find_photographs
 
 SHORT = 0.5
 USUAL = "*:auto:small"

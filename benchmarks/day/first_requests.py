@@ -21,7 +21,7 @@ import typer
 
 from benchmarks.process import Process, median, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import jpeg, sample_frame
+from service.commands.timing.samples import jpeg, sample_frame
 
 PLACES = 12
 """Of each traverse."""

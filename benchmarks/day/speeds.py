@@ -36,8 +36,8 @@ from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import Whereabouts
-from training.map_sizes import corridor_and_lip6
-from training.validation import TraverseTask, describe
+from lab.training.map_sizes import corridor_and_lip6
+from lab.training.validation import TraverseTask, describe
 
 DRAWN = 10
 """So many frames at ten times the rate for one."""

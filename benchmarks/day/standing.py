@@ -44,8 +44,8 @@ from core.recognition.stages import neighborhood_of
 from core.recognition.verification import Verifier, Verify
 from core.storage import Atlas
 from core.threads import cores, share_cores
-from training.map_sizes import corridor_and_lip6
-from training.validation import TraverseTask
+from lab.training.map_sizes import corridor_and_lip6
+from lab.training.validation import TraverseTask
 
 Poses = Literal["none", "radius", "coarse"]
 Environment = Literal["corridor", "lip6"]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.process import ROOT
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels
-from training.ground_truth import corrected_truth
-from training.photographs import MIXED_CAMERAS, find_photographs
+from lab.training.ground_truth import corrected_truth
+from lab.training.photographs import MIXED_CAMERAS, find_photographs
 
 METRES = 2.0
 """Between two frames of a map, so that the default radius of one place, 5 m, is two frames, as the truth tolerates."""

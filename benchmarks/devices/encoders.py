@@ -22,7 +22,6 @@ import typer
 from benchmarks.frames import camera_frames
 from benchmarks.process import Process, median, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import write_map
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -30,6 +29,7 @@ from core.recognition.stages import agree
 from core.storage import Atlas, Map
 from core.threads import share_cores
 from service.commands.malloc import configure_malloc
+from service.commands.timing.samples import write_map
 
 FIRST_DEFAULT = "m-region-vlad@9584cde69ac83864efd2ddb560b29b7cf88ea4e9e0c148d190beb8e55a8cde9e"
 """The default encoder of 0.1.0."""

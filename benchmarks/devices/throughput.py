@@ -20,7 +20,6 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import processor, report
-from core.evaluation.samples import sample_frame
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -28,6 +27,7 @@ from core.method.encoder import Encoder
 from core.networks.forward import Device
 from core.threads import cores, share_cores
 from service.commands.malloc import configure_malloc
+from service.commands.timing.samples import sample_frame
 
 ON_A_GPU = 4
 """Threads to a core where the forward pass is on a GPU, for a thread sleeps while it is computed there."""

@@ -19,7 +19,6 @@ import torch
 import typer
 
 from benchmarks.report import report, verdict
-from core.evaluation.samples import sample_frame
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, second_look
 from core.frames.traverses import SUPPORTED_SUFFIXES
@@ -29,6 +28,7 @@ from core.geometry.verification import fitting_plane, fitting_scene, mutual_matc
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
 from core.threads import cores, each, share_cores
+from service.commands.timing.samples import sample_frame
 
 CANDIDATES = 10
 MILLISECONDS = 60

@@ -29,7 +29,6 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import report
-from core.evaluation.samples import write_map
 from core.frames.images import decode
 from core.frames.intrinsics import Intrinsics
 from core.frames.preprocessing import Pixels
@@ -46,7 +45,8 @@ from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas
-from training.views.augmentation import augment
+from lab.training.views.augmentation import augment
+from service.commands.timing.samples import write_map
 
 Array = NDArray[np.float64]
 FITTED = ("train/camvid", "train/facades", "train/tower")

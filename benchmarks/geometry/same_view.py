@@ -32,8 +32,8 @@ from core.geometry.pose import FOCAL
 from core.geometry.verification import LEAST_MATCHES, chance_of, evidence, fitting_scene, points_of, verify
 from core.networks.xfeat import XFeat, load_xfeat
 from core.threads import cores, each, share_cores
-from training.photographs import find_photographs, read
-from training.validation import load_traverses
+from lab.training.photographs import find_photographs, read
+from lab.training.validation import load_traverses
 
 Array = NDArray[np.float64]
 View = Callable[[Pixels, np.random.Generator], Pixels]

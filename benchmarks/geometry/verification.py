@@ -37,9 +37,9 @@ from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
 from core.recognition.stages import score_matrix
 from core.threads import cores, each, share_cores
-from training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs
-from training.validation import DAYLIGHT, DISTRACTORS, Encodings, describe, load_traverses, with_corrected_truth
-from training.views.augmentation import augment
+from lab.training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs
+from lab.training.validation import DAYLIGHT, DISTRACTORS, Encodings, describe, load_traverses, with_corrected_truth
+from lab.training.views.augmentation import augment
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -34,14 +34,14 @@ from core.method.regions import Regions
 from core.places import PlaceFields
 from core.recognition.recognition import locate
 from core.threads import share_cores
+from lab.training.calibration_quality import widened
+from lab.training.map_sizes import STRETCHES, corridor_and_lip6
+from lab.training.photographs import find_photographs, read
+from lab.training.validation import Encodings, TraverseTask, describe
 from service.app.runtime import Runtime
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.upkeep import alignment
-from training.calibration_quality import widened
-from training.map_sizes import STRETCHES, corridor_and_lip6
-from training.photographs import find_photographs, read
-from training.validation import Encodings, TraverseTask, describe
 
 Truth = NDArray[np.bool_]
 Positions = NDArray[np.int64]

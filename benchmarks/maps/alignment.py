@@ -26,7 +26,7 @@ from benchmarks.report import report
 from core.judgement.alignment import of_matrix, shared_stretches
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import share_cores
-from training.calibration_quality import widened
+from lab.training.calibration_quality import widened
 
 Truth = NDArray[np.bool_]
 Scores = NDArray[np.float32]

@@ -24,13 +24,13 @@ import typer
 from benchmarks.maps.opening import built
 from benchmarks.process import median
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map, sample_descriptors, sample_frame
 from core.maps.selection import Selection
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
 from core.storage import Atlas, Map
+from service.commands.timing.samples import fill_map, sample_descriptors, sample_frame
 from service.queries.parameters import FilterParameters
 
 MAP = "filtered"

@@ -28,7 +28,7 @@ import typer
 
 from benchmarks.process import service
 from benchmarks.report import report
-from core.evaluation.data.datasets import find_dataset, open_dataset
+from lab.evaluation.data.datasets import find_dataset, open_dataset
 
 FOLDERS = {"corridor": "corridor", "lip6": "lip6_outdoor"}
 KEPT: Mapping[str, Sequence[str]] = {

@@ -29,7 +29,6 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
-from core.evaluation.map_sizes import balanced_error
 from core.geometry.keypoints import keypoints_of
 from core.geometry.pairs import Pairs
 from core.judgement.curves import auc_roc
@@ -38,7 +37,8 @@ from core.judgement.verdict import Calibration
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.threads import share_cores
-from training.map_sizes import (
+from lab.evaluation.map_sizes import balanced_error
+from lab.training.map_sizes import (
     SMALL,
     Cut,
     Judged,
@@ -51,7 +51,7 @@ from training.map_sizes import (
     trials_of_halves,
     trials_of_size,
 )
-from training.validation import describe
+from lab.training.validation import describe
 
 SIZES = (*SMALL, 100)
 MOST_STRANGERS, LEAST_RIGHT = 0.05, {"corridor": 0.3, "lip6": 0.7}

@@ -25,10 +25,10 @@ import typer
 
 from benchmarks.process import ROOT, median, memory, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map, jpeg, sample_frame
 from core.maps import Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.storage import Atlas, Map
+from service.commands.timing.samples import fill_map, jpeg, sample_frame
 
 MAP = "large"
 FIRST_SECONDS = 10.0

@@ -18,13 +18,13 @@ import typer
 
 from benchmarks.frames import encode_folder
 from benchmarks.report import report
-from core.evaluation.samples import write_map
 from core.frames.traverses import read_ground_truth
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import Answer, locate
 from core.storage import Atlas
+from service.commands.timing.samples import write_map
 
 REACH = 15
 

@@ -3,8 +3,8 @@
     python -m benchmarks.maps.sequences --data ../shared/datasets/eval
 
 Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
-training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
-bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
+lab/training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames;
+the bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
 Nothing is told of the motion, and no map has poses.  As in a service, the positions of references count views
 (``core.maps.views``), and a run sees how much the view has changed.  Beside it, over 5 000 places with poses, the time
 that one frame's belief takes, against encoding a frame in the same minute.
@@ -35,8 +35,6 @@ from core.belief import (
     sighted,
     view_of,
 )
-from core.evaluation.samples import jpeg, sample_frame
-from core.evaluation.timing import medians
 from core.frames.images import decode
 from core.judgement.verdict import judge
 from core.maps import MapSettings
@@ -45,9 +43,11 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import METRIC, Neighborhood, Whereabouts
 from core.recognition.stages import examine, second_stage
-from training.ground_truth import corrected_truth
-from training.photographs import find_photographs, read
-from training.validation import Encodings, describe
+from lab.training.ground_truth import corrected_truth
+from lab.training.photographs import find_photographs, read
+from lab.training.validation import Encodings, describe
+from service.commands.timing.samples import jpeg, sample_frame
+from service.commands.timing.stages import medians
 
 Truth = NDArray[np.bool_]
 
@@ -193,7 +193,7 @@ def main(
     data: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets/eval"),
     encoder: str = DEFAULT_ENCODER,
     models: Annotated[
-        Path | None, typer.Option(help="Folder of further encoders, such as training.vocabularies keeps.")
+        Path | None, typer.Option(help="Folder of further encoders, such as lab.training.vocabularies keeps.")
     ] = None,
     dataset: Annotated[list[str] | None, typer.Option(help="One of them alone; more than once for several.")] = None,
     places: Annotated[int, typer.Option(min=1000)] = 5000,

@@ -45,8 +45,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import Whereabouts
 from core.recognition.stages import examine, second_stage
-from training.map_sizes import APART, corridor_and_lip6
-from training.validation import Encodings, describe
+from lab.training.map_sizes import APART, corridor_and_lip6
+from lab.training.validation import Encodings, describe
 
 Truth = NDArray[np.bool_]
 

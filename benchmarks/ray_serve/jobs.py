@@ -19,12 +19,12 @@ import typer
 
 from benchmarks.frames import camera_frames
 from benchmarks.report import report
-from core.evaluation.samples import sample_descriptors, write_map
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.places import PlaceFields
 from core.recognition.calibration import queries_from_map, run_trials
 from core.storage import Atlas
+from service.commands.timing.samples import sample_descriptors, write_map
 from service.upkeep.alignment import _shared
 
 

@@ -23,10 +23,10 @@ import typer
 from benchmarks.frames import camera_frames
 from benchmarks.process import descendants, median, processor_time, service
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import cores
 from service.commands.load import measure
+from service.commands.timing.samples import fill_map
 
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query?verify=never"

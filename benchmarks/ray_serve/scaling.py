@@ -24,10 +24,10 @@ from benchmarks.frames import camera_frames
 from benchmarks.process import descendants, median, processor_time, service
 from benchmarks.ray_serve.waiting import WAIT, WaitingReplica, prepare
 from benchmarks.report import report, verdict
-from core.evaluation.samples import fill_map
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from service.commands.load import measure
+from service.commands.timing.samples import fill_map
 from service.ray_serve.cluster import APPLICATION, Cluster
 from service.ray_serve.encoders import WATCH
 from service.settings import Settings

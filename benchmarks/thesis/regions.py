@@ -12,11 +12,11 @@ import typer
 
 from benchmarks.report import report, verdict
 from benchmarks.thesis.reference_regions import reference_regions
-from core.evaluation.samples import sample_frame
-from core.evaluation.timing import medians
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.features import FeatureExtractor
 from core.method.regions import extract_regions
+from service.commands.timing.samples import sample_frame
+from service.commands.timing.stages import medians
 
 LIMIT = 500.0
 

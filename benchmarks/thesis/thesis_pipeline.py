@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
 from benchmarks.thesis.reference_pipeline import reference_encode
-from core.evaluation.samples import jpeg, sample_frame
-from core.evaluation.timing import medians
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.regions import extract_regions
 from core.method.vlad import aggregate
+from service.commands.timing.samples import jpeg, sample_frame
+from service.commands.timing.stages import medians
 
 LIMIT = 40.0
 THESIS = "m-region-vlad-thesis"

@@ -79,7 +79,7 @@ class GeometryTerms(BaseModel):
 
 
 TERMS = GeometryTerms(support=0.5, slope=1.925, intercept=-7.533)
-"""Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m training.map_sizes``)."""
+"""Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m lab.training.map_sizes``)."""
 
 
 def final_values(scores: NDArray[np.floating], share: Values) -> Values:

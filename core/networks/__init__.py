@@ -1,1 +1,1 @@
-"""Networks: definitions, forward passes, identities, and the import of networks trained with other software."""
+"""Networks: definitions, files, forward passes and identities."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from core.errors import InvalidModel
 from core.networks.backbone import Backbone
-from core.networks.imported.onnx_network import is_onnx_network, load_onnx_network, read_onnx_description
 from core.networks.network import load_network, read_definition
+from core.networks.onnx_network import is_onnx_network, load_onnx_network, read_onnx_description
 
 
 def open_network(path: Path, outputs: tuple[str, ...]) -> Backbone:

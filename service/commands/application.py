@@ -7,14 +7,12 @@ import typer
 from service.commands.bench import bench
 from service.commands.calibrate import calibrate
 from service.commands.console import Commands
-from service.commands.encoders.vocabulary import vocabulary
 from service.commands.enroll import enroll
-from service.commands.evaluation.evaluate import evaluate
 from service.commands.jobs import jobs
 from service.commands.keys import keys
+from service.commands.laboratory import add_laboratory
 from service.commands.maps.backup import backup
 from service.commands.maps.maps import maps
-from service.commands.model import model
 from service.commands.query import query
 from service.commands.ray import ray
 from service.commands.serve import serve
@@ -27,12 +25,11 @@ application = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (serve, enroll, query, evaluate, calibrate, bench, settings):
+for command in (serve, enroll, query, calibrate, bench, settings):
     application.command()(command)
 application.add_typer(maps, name="maps")
 application.add_typer(backup, name="backup")
 application.add_typer(jobs, name="jobs")
 application.add_typer(keys, name="keys")
-application.add_typer(vocabulary, name="vocabulary")
-application.add_typer(model, name="model")
 application.add_typer(ray, name="ray")
+add_laboratory(application)

@@ -13,7 +13,7 @@ import typer
 from service.commands.connection.client import Target, ask, path_of, read_bytes
 from service.commands.connection.credentials import given_key
 from service.commands.console import Failure, number, progress, show, table, write_file
-from service.commands.model import ModelsDir, default_encoder, open_catalogue
+from service.commands.models import ModelsDir, default_encoder, open_catalogue
 
 if TYPE_CHECKING:
     from core.method.encoder import Encoder
@@ -63,9 +63,9 @@ def _measure_here(
     # Imported here because they take a second.
     import torch
 
-    from core.evaluation.samples import jpeg, sample_frame
-    from core.evaluation.timing import better_forward, encode_batch, encoding_runs, medians, search_run
     from core.threads import share_cores
+    from service.commands.timing.samples import jpeg, sample_frame
+    from service.commands.timing.stages import better_forward, encode_batch, encoding_runs, medians, search_run
 
     share_cores(threads or torch.get_num_threads())
     chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
@@ -97,8 +97,8 @@ def _measure_service(
 ) -> dict[str, Any]:
     import subprocess
 
-    from core.evaluation.samples import jpeg, sample_frame
     from service.commands.load import measure
+    from service.commands.timing.samples import jpeg, sample_frame
 
     path = path_of("encode") if map_id is None else path_of("maps", map_id, "query")
     version = ask(Target(url, None), "GET", "/version").json()

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.process import service
-from core.evaluation.samples import fill_map, jpeg, sample_frame
 from core.method.catalogue import EncoderCatalogue
+from service.commands.timing.samples import fill_map, jpeg, sample_frame
 
 
 @pytest.mark.thorough

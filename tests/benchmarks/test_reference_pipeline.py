@@ -7,10 +7,10 @@ import pytest
 
 from benchmarks.thesis.reference_pipeline import reference_vlad
 from benchmarks.thesis.thesis_pipeline import THESIS, literal, ours
-from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.method.catalogue import EncoderCatalogue
 from core.method.vlad import aggregate
+from service.commands.timing.samples import jpeg, sample_frame
 
 
 def test_the_literal_vlad_is_the_compiled_one() -> None:

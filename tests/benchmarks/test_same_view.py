@@ -18,8 +18,8 @@ from benchmarks.geometry.same_view import (
 )
 from core.geometry.detection import find_keypoints
 from core.networks.xfeat import XFeat, load_xfeat
+from lab.training.photographs import read
 from tests.service.scenes import scene, stranger
-from training.photographs import read
 
 DATASETS = Path(__file__).parents[3] / "shared/datasets"
 PICTURES, EVERY = 200, 14

@@ -17,7 +17,7 @@ from benchmarks.geometry.verification import (
     figures_of,
     with_share,
 )
-from training.validation import Encodings
+from lab.training.validation import Encodings
 
 NOTHING = Pictures(Encodings(np.zeros((0, 1), np.float32), np.zeros((0, 1, 1), np.int8)), [])
 

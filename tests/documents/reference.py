@@ -15,8 +15,8 @@ from typing import Any
 
 import typer.main
 
-from core.evaluation.data.presets import DATASETS
-from core.evaluation.data.published import PUBLISHED, RECALLS
+from lab.evaluation.data.presets import DATASETS
+from lab.evaluation.data.published import PUBLISHED, RECALLS
 from service.commands.application import application
 from service.errors.problems import BY_STATUS, KINDS, TYPE_PREFIX
 from service.settings import PREFIX, Settings

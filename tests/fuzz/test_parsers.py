@@ -22,9 +22,9 @@ from core.maps.archives.manifest import read_manifest
 from core.maps.archives.tar_layout import manifest_size
 from core.maps.pagination import decode_name, decode_number, encode_cursor
 from core.method.catalogue import load_encoder
-from core.networks.checkpoints import read_checkpoint
 from core.networks.network import load_network, read_definition
 from core.storage.files.array_files import StaleArrays, read_arrays, write_arrays
+from lab.conversion.checkpoints import read_checkpoint
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
 from service.http.schemas import validated

@@ -11,7 +11,7 @@ CLIENT = ROOT / "clients" / "python"
 OF_CLIENT = "clients/python/placerec_client"
 NODE = ROOT / "clients" / "ros2"
 OF_NODE = "clients/ros2/placerec_ros"
-FOLDERS = ("core", "service", "training", "benchmarks", OF_CLIENT, OF_NODE, "examples", "scripts", "tests")
+FOLDERS = ("core", "service", "lab", "benchmarks", OF_CLIENT, OF_NODE, "examples", "scripts", "tests")
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 

@@ -75,17 +75,17 @@ def test_no_folder_is_crowded() -> None:
 
 def test_examples_know_nothing_of_the_project() -> None:
     """They show what users write, who have the service's address and none of its code."""
-    assert forbidden_imports("examples", {"benchmarks", "core", "service", "tests", "training"}) == []
+    assert forbidden_imports("examples", {"benchmarks", "core", "lab", "service", "tests"}) == []
 
 
 def test_the_client_knows_nothing_of_the_project() -> None:
     """It is installed where nothing else of the project is."""
-    forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
+    forbidden = {"benchmarks", "core", "examples", "lab", "service", "tests"}
     assert forbidden_imports("clients/python/placerec_client", forbidden) == []
 
 
 def test_the_node_knows_nothing_of_the_project_but_the_client() -> None:
-    forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
+    forbidden = {"benchmarks", "core", "examples", "lab", "service", "tests"}
     assert forbidden_imports("clients/ros2/placerec_ros", forbidden) == []
 
 
@@ -109,13 +109,12 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py"}
 """What runs in .venv-ros, whose packages are not here."""
 
 EXTRAS = {
-    "core/evaluation/report": {"report"},
     "core/milvus": {"milvus"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
+    "lab": {"lab"},
     "service/ray_serve": {"ray"},
     "service/shared": {"milvus"},
-    "training": {"report"},
 }
 """Folders that may import what an extra brings; tests and benchmarks may import all."""
 

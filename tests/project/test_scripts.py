@@ -46,7 +46,7 @@ class Checkout:
             (folder / name).mkdir()
         (folder / "scripts/environment").write_text((ROOT / "scripts/environment").read_text())
         (folder / "pyproject.toml").write_text("[project]\n")
-        for name in ("torch", "service", "development"):
+        for name in ("torch", "service", "lab", "development"):
             (folder / f"requirements/{name}.lock").write_text(f"{name}\n")
         self.python = folder / "python"
         self.python.write_text(STUB.replace("REAL", sys.executable))
@@ -82,6 +82,12 @@ def test_nothing_is_installed_twice(checkout: Checkout) -> None:
 
 def test_development_serves_too(checkout: Checkout) -> None:
     assert checkout.prepare("development") == ["venv", "development", "cpu", "."]
+    assert checkout.prepare("service") == checkout.prepare("lab") == []
+
+
+def test_the_laboratory_serves_and_a_service_has_none(checkout: Checkout) -> None:
+    assert checkout.prepare("service") == ["venv", "service", "cpu", "."]
+    assert checkout.prepare("lab") == ["lab", "cpu", "."]
     assert checkout.prepare("service") == []
 
 

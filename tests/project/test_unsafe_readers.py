@@ -34,13 +34,13 @@ RUNNING = {
 """Calls by which bytes that were read could run, end the process, or be laid out as files."""
 
 ISOLATED = {
-    ("core/networks/checkpoints.py", "torch.load(path, map_location='cpu', weights_only=True)"),
-    ("core/networks/matfiles.py", "loadmat(path, struct_as_record=False)"),
+    ("lab/conversion/checkpoints.py", "torch.load(path, map_location='cpu', weights_only=True)"),
+    ("lab/conversion/matfiles.py", "loadmat(path, struct_as_record=False)"),
 }
 """Calls in readers that run in a child process with limits."""
 
 
-@pytest.mark.parametrize("folder", ["core", "service", "training"])
+@pytest.mark.parametrize("folder", ["core", "service", "lab"])
 def test_nothing_runs_what_it_reads(folder: str) -> None:
     """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""
     calls, isolated = [], set()

@@ -19,7 +19,7 @@ from uuid import uuid4
 from tests.service.forks import context
 
 MODULES = (
-    "core.evaluation.report",
+    "lab.evaluation.report",
     "onnx",
     "rosbags.highlevel",
     "service.commands.bench",

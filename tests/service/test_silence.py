@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from core.silence import SWITCHES
-from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
+from tests.lab.conversion.onnx_writer import MAPS, onnx_network
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
 from tests.watch import CACHES, PROXIES, Watch, missing

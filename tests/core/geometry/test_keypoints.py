@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import InvalidKeypoints
-from core.evaluation.samples import sample_frame
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints, shown_size
 from core.geometry.keypoints import LENGTH, MOST, RESOLUTION, SHARES, Keypoints, keypoints_of, record_bytes
 from core.networks.xfeat import XFeat, load_xfeat
+from service.commands.timing.samples import sample_frame
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.evaluation.samples import sample_frame
 from core.frames.preprocessing import Pixels, second_look
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import RESOLUTION, Keypoints
 from core.geometry.verification import Verification, evidence, fitting, mutual_matches, verify
 from core.networks.xfeat import LENGTH, XFeat, load_xfeat
 from core.threads import use_threads
+from service.commands.timing.samples import sample_frame
 
 Points = NDArray[np.float64]
 

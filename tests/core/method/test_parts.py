@@ -17,11 +17,12 @@ from core.method.explanation import Shown, explain
 from core.method.parts import cells, pooled
 from core.method.vlad import aggregate
 from core.method.whitening import Whitening, fit_whitening
-from core.networks.imported.description import NetworkDescription, checked
-from core.networks.imported.onnx_network import OnnxNetwork, save_onnx_network
+from core.networks.description import NetworkDescription, checked
+from core.networks.onnx_network import OnnxNetwork, save_onnx_network
 from core.places import Neighborhood, Whereabouts
-from core.recognition.encoder_making import make_encoder, measure_calibration
-from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
+from core.recognition.encoder_calibration import measure_calibration
+from lab.conversion.encoder_making import make_encoder
+from tests.lab.conversion.onnx_writer import MAPS, onnx_network
 from tests.service.scenes import scene, seen_again, stranger
 
 SCENES = [scene(seed, 96, 72) for seed in range(30)]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
 from core.errors import InvalidModel
-from core.evaluation.samples import sample_frame
 from core.frames.preprocessing import Pixels
 from core.networks.xfeat import CELL, LENGTH, PACKAGED_XFEAT, XFeat, load_xfeat, tensor_shapes
+from service.commands.timing.samples import sample_frame
 
 BRIGHTEST = [(132, 179), (134, 22), (70, 19), (86, 54), (2, 176), (55, 60), (86, 106), (86, 58)]
 """Rows and columns of some pixels that are likely keypoints."""

@@ -1,1 +1,0 @@
-"""Networks in the ONNX format that others trained: what they are, how they are imported, and as backbones."""

@@ -1,0 +1,1 @@
+"""Networks that several of the compared systems are built on."""

@@ -1,0 +1,165 @@
+"""``placerec evaluate``: its tables, JSON and CSV files, and remarks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+
+from lab.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
+from lab.evaluation.data.published import RECALLS, Published
+from lab.evaluation.protocol.results import results_csv
+from service.commands.console import number, remark, show, table, write_file
+from service.commands.models import name_of
+
+RULES = {"mean_of_negatives": "mean of true negatives", "full_precision": "best wrong match"}
+
+
+def show_figures(figures: Sequence[Evaluation], title: str, verified: Sequence[str | None] | None = None) -> None:
+    """A row of accuracy for each encoder; matches of one class only get a word in place of AUC-PR.
+
+    Args:
+        verified: when each verified its matches, as of :func:`verify_of`; None: it is known of none.
+    """
+    columns = ("#AUC-PR", "#AUC-ROC", *(f"#recall@{depth}" for depth in DEPTHS), "#recall at full precision")
+    names = ("encoder",) if verified is None else ("encoder", "verified")
+    shown = table(*names, *columns, "#extended precision", "#right", title=title)
+    for row, when in zip(figures, verified or [None] * len(figures), strict=True):
+        values = [row.auc_roc, *(row.recall_at[str(depth)] for depth in DEPTHS)]
+        shown.add_row(
+            escape(name_of(row.encoder)),
+            *([] if verified is None else [when or "–"]),
+            row.one_class or number(row.auc_pr),
+            *map(number, values),
+            number(row.recall_at_full_precision),
+            number(row.extended_precision),
+            f"{row.right} of {row.queries}",
+        )
+    show(shown)
+
+
+def verify_of(run: Run) -> str | None:
+    """When a system verified the geometry of its matches: auto, always or never; None if others have computed it."""
+    return None if run.elsewhere else str(run.about.configuration.get("verification.verify", "never"))
+
+
+def show_costs(figures: Sequence[Evaluation]) -> None:
+    """A row of times and memory for each encoder; medians per query."""
+    stages = list(dict.fromkeys(stage for row in figures for stage in row.milliseconds if stage != "match"))
+    shown = table("encoder", *(f"#{stage} ms" for stage in stages), "#described ms", "#match ms", "#KB a place")
+    for row in figures:
+        place = None if row.bytes_per_place is None else row.bytes_per_place / 1000
+        shown.add_row(
+            escape(name_of(row.encoder)),
+            *(number(row.milliseconds.get(stage), 2) for stage in stages),
+            number(row.describe_milliseconds, 2),
+            number(row.milliseconds["match"], 3),
+            number(place, 1),
+        )
+    show(shown)
+
+
+def show_thresholds(figures: Sequence[Evaluation]) -> None:
+    """A table of what thresholds do to right and wrong answers; nothing without a true negative."""
+    counts = ("true_positives", "false_positives", "false_negatives", "true_negatives")
+    heads = ("TP", "FP", "FN", "TN")
+    shown = table("encoder", "threshold", "#at", *(f"#{head}" for head in heads), title="Thresholds, before → after")
+    for row in figures:
+        for one in row.thresholds if row.negatives else []:
+            before, after = one.before.model_dump(), one.after.model_dump()
+            changes = [f"{before[name]} → {after[name]}" for name in counts]
+            shown.add_row(escape(name_of(row.encoder)), RULES[one.rule], number(one.threshold), *changes)
+    if shown.row_count:
+        show(shown)
+
+
+def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Sequence[str]) -> None:
+    """Remarks: why figures are missing, what is special about the data, and which figures are cached."""
+    for note in notes:
+        remark(note)
+    reasons = dict.fromkeys((name, reason) for row in figures for name, reason in row.notes.items())
+    told: dict[str, list[str]] = {}
+    for name, reason in reasons:
+        told.setdefault(reason, []).append(name)
+    for reason, names in told.items():
+        remark(f"{', '.join(names)}: {reason}")
+    if cached:
+        remark(f"Taken from the cache, times included: {', '.join(cached)}.")
+
+
+def show_published(published: Sequence[Published]) -> None:
+    """A table of what others have published of the protocol; nothing where nobody has."""
+    heads = (f"#recall@{depth}" for depth in RECALLS)
+    title = "Published by others of this protocol; not measured here"
+    shown = table("system", *heads, "#year", "source", title=title)
+    for one in published:
+        recalls = [*one.recall_at, *(None for _ in RECALLS[len(one.recall_at) :])]
+        shown.add_row(escape(one.system), *map(number, recalls), str(one.year), escape(one.source))
+    if shown.row_count:
+        show(shown)
+
+
+def show_trends(comparison: Comparison) -> None:
+    """Tables of growing traverses and of disturbed queries, where they were measured."""
+    if comparison.scalability:
+        shown = table(
+            "encoder", "#references", "#queries", "#AUC-PR", "#recall@1", "#match ms", title="Growing traverses"
+        )
+        for point in comparison.scalability:
+            counts = (str(point.references), str(point.queries))
+            figures = (number(point.auc_pr), number(point.recall_at_1), number(point.milliseconds, 3))
+            shown.add_row(escape(point.system), *counts, *figures)
+        show(shown)
+    if comparison.severity:
+        steps = [f"step {step}" for step in range(1, max(len(curve.levels) for curve in comparison.severity))]
+        columns = ("encoder", "disturbance", "undisturbed", *steps, "unit of the levels")
+        shown = table(*columns, title="Disturbed queries, level: AUC-PR and recall@1")
+        for curve in comparison.severity:
+            levels = zip(curve.levels, curve.auc_pr, curve.recall_at_1, strict=True)
+            cells = [f"{level:g}: {area:.3f} {recall:.3f}" for level, area, recall in levels]
+            shown.add_row(escape(curve.system), curve.disturbance, *cells, curve.unit)
+        show(shown)
+
+
+def run_json(run: Run) -> dict[str, Any]:
+    """The figures of a run and its system."""
+    about = {"title": run.about.title, "paper": run.about.paper, "configuration": dict(run.about.configuration)}
+    marks = {"verify": verify_of(run), "cached": run.cached, **({"elsewhere": True} if run.elsewhere else {})}
+    return {**run.evaluation.model_dump(), **about, **marks}
+
+
+def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, Any]:
+    """The first run's figures on the top level, those of all in ``encoders``, and what else was measured.
+
+    Args:
+        runs: in the order of the command line.
+    """
+    every = [run_json(run) for run in runs]
+    trends: dict[str, Any] = {}
+    if comparison.scalability is not None:
+        trends["scalability"] = [asdict(point) for point in comparison.scalability]
+    if comparison.map_sizes is not None:
+        trends["map_sizes"] = [asdict(point) for point in comparison.map_sizes]
+    if comparison.severity is not None:
+        trends["severity"] = [asdict(curve) for curve in comparison.severity]
+    if comparison.published:
+        trends["published"] = [asdict(one) for one in comparison.published]
+    if comparison.notes:
+        trends["remarks"] = comparison.notes
+    return {**every[0], "encoders": every, **trends}
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write figures whole or not at all."""
+    write_file(path, json.dumps(value, indent=2) + "\n")
+
+
+def write_results(path: Path, outcomes: Sequence[tuple[str, Sequence[Outcome]]]) -> None:
+    """A CSV file for each encoder: the first at ``path``, the others beside it with their names."""
+    for index, (name, rows) in enumerate(outcomes):
+        further = path.with_suffix(f".{name_of(name)}{path.suffix}")
+        write_file(path if index == 0 else further, results_csv(rows))

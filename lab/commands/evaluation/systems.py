@@ -1,0 +1,99 @@
+"""``placerec evaluate``: choosing the systems, and listing all of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.box import HEAVY_HEAD
+from rich.markup import escape
+
+from service.commands.console import output, show, table
+from service.commands.models import default_encoder, name_of
+
+if TYPE_CHECKING:
+    from core.method.catalogue import EncoderCatalogue
+    from core.recognition.verification import Verify
+    from lab.baselines.system import About, System
+
+
+def parse_weights(given: list[str]) -> dict[str, Path]:
+    """``NAME=FILE`` by name.
+
+    Raises:
+        typer.BadParameter: one is something else, or a name stands twice.
+    """
+    files: dict[str, Path] = {}
+    for text in given:
+        found = re.fullmatch(r"([^=]+)=(.+)", text)
+        if found is None or found[1] in files:
+            raise typer.BadParameter(f"--weights {text!r} is not NAME=FILE, each name once")
+        files[found[1]] = Path(found[2])
+    return files
+
+
+def build_systems(
+    names: list[str], every: bool, weights: dict[str, Path], models: EncoderCatalogue, verify: Verify = "auto"
+) -> list[System]:
+    """The systems that the options name, each once, in that order.
+
+    Args:
+        names: of systems or encoders; if empty, the default encoder.
+        every: add all systems that run without a file, or whose file is given.
+        verify: when encoders that are asked as the service asks them verify.
+
+    Raises:
+        MissingWeights, UnknownEncoder, InvalidModel: one cannot be made.
+        typer.BadParameter: a file is given for a system that is not among them.
+    """
+    from lab.baselines.registry import build, systems
+
+    asked = list(names)
+    if every:
+        damaged = {summary.name for summary in models.describe() if summary.damaged is not None}
+        asked += [
+            about.name
+            for about in systems(models)
+            if about.name not in damaged and (about.weights is None or about.name in weights)
+        ]
+    asked = list(dict.fromkeys(asked or [default_encoder()]))
+    idle = weights.keys() - {name_of(name) for name in asked}
+    if idle:
+        raise typer.BadParameter(f"--weights for {', '.join(sorted(idle))}, which --encoder does not name")
+    built: dict[str, System] = {}
+    for name in asked:
+        system = build(name, models=models, weights=weights.get(name), verify=verify)
+        built.setdefault(system.about.name, system)
+    return list(built.values())
+
+
+def show_list(models: EncoderCatalogue) -> None:
+    """Write name, paper, configuration and weights of all systems, then the data sets."""
+    from lab.baselines.registry import systems
+    from lab.evaluation.data.presets import DATASETS
+
+    shown = table("name", "system and paper", "configuration", "weights", title="Systems, for --encoder")
+    if output.is_terminal:  # there a system takes many lines; elsewhere one, which can be searched
+        shown.box, shown.show_lines, shown.pad_edge = HEAVY_HEAD, True, True
+    for column in shown.columns:
+        column.overflow, column.no_wrap = "fold", column.header == "name"
+    for about in systems(models):
+        needed = "none" if about.weights is None else f"--weights {about.name}=FILE: {about.weights}"
+        shown.add_row(*map(escape, (about.name, f"{about.title}. {about.paper}", _configuration(about), needed)))
+    show(shown)
+    columns = ("name", "data set", "references", "queries", "true", "left out", "protocol of")
+    sets = table(*columns, title="Data sets, for --dataset")
+    for dataset in DATASETS:
+        sides = [names[0] if names else "the frames" for names in (dataset.references, dataset.queries)]
+        sets.add_row(dataset.name, dataset.title, *sides, dataset.truth, dataset.excluded, dataset.source)
+    show(sets)
+
+
+def _configuration(about: About) -> str:
+    return ", ".join(f"{name} {_value(value)}" for name, value in about.configuration.items())
+
+
+def _value(value: object) -> str:
+    return "/".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,0 +1,33 @@
+"""How well systems recognize one traverse by another: the thesis's protocol, data sets, and report."""
+
+from lab.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
+from lab.evaluation.protocol.figures import (
+    DEPTHS,
+    STAGES,
+    Evaluation,
+    extended_precision,
+    recall_at_full_precision,
+    recall_at_k,
+    summarize,
+)
+from lab.evaluation.protocol.outcomes import Outcome, judge, judge_ranking
+from lab.evaluation.protocol.results import results_csv
+
+__all__ = [
+    "DEPTHS",
+    "STAGES",
+    "Comparison",
+    "Evaluation",
+    "Outcome",
+    "Run",
+    "ScalePoint",
+    "SeverityCurve",
+    "SizePoint",
+    "extended_precision",
+    "judge",
+    "judge_ranking",
+    "recall_at_full_precision",
+    "recall_at_k",
+    "results_csv",
+    "summarize",
+]

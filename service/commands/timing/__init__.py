@@ -1,0 +1,1 @@
+"""How long recognition takes on this machine, and frames and maps to time it with."""

@@ -1,0 +1,163 @@
+"""Maps cut from traverses, and what is fitted to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.geometry import verification
+from core.geometry.keypoints import Keypoints
+from core.geometry.pairs import Pairs
+from core.judgement.background import Environment
+from core.judgement.geometry import TERMS
+from core.judgement.probability import Curve
+from core.judgement.verdict import Calibration
+from lab.training.map_sizes import (
+    APART,
+    CANDIDATES,
+    SMALL,
+    STRANGERS,
+    Traverse,
+    cut,
+    fit_geometry,
+    fit_small_maps,
+    trials_of_halves,
+    trials_of_size,
+    widened,
+)
+
+CALIBRATION = Calibration(
+    source="test",
+    threshold=0.09,
+    margin=0.004,
+    background_mean=0.07,
+    background_deviation=0.014,
+    curve=Curve(slope=37, intercept=-3.5),
+    environment=Environment(mean=0.13, deviation=0.034, mean_weight=0.66, deviation_weight=6.6),
+)
+COUNT = 80
+
+
+def traverse(mean: float, seed: int, gain: float = 0.1) -> Traverse:
+    """Places that score ``mean`` with each other, and ``gain`` more where they are the same."""
+    random = np.random.default_rng(seed)
+    apart = np.abs(np.arange(COUNT)[:, None] - np.arange(COUNT))
+    truth = apart <= 2
+    both = (random.normal(mean, 0.02, (COUNT, COUNT)) + gain * truth).astype(np.float32)
+    return Traverse(both / 4, both, both, truth, 30)
+
+
+def test_a_stranger_is_far_from_every_place_of_the_map() -> None:
+    one = traverse(0.1, 0)
+    assert one.strangers(np.arange(20, 30)).tolist() == [
+        query for query in range(COUNT) if query + 2 < 20 - APART or query - 2 > 29 + APART
+    ]
+
+
+def test_a_map_is_a_run_or_drawn() -> None:
+    generator = np.random.default_rng(0)
+    run, drawn = (cut(traverse(0.1, 0), 10, how, generator) for how in ("run", "spread"))
+    assert (np.diff(run) == 1).all() and len(run) == 10
+    assert (np.diff(drawn) > 0).all() and len(drawn) == 10 and (np.diff(drawn) > 1).any()
+
+
+@pytest.mark.parametrize("size", SMALL)
+def test_trials_are_of_known_places_and_of_strangers(size: int) -> None:
+    trials, judgements = trials_of_size(traverse(0.1, 0), size, "run", CALIBRATION, 4)
+    assert len(trials) == len(judgements)
+    assert trials.known.any() and not trials.known.all()
+    assert not trials.right[~trials.known].any()
+    assert ((trials.imagined > 0) & (trials.imagined <= 1)).all()
+
+
+@pytest.mark.thorough
+def test_what_is_fitted_makes_probabilities_of_small_maps_honest() -> None:
+    """On traverses of other seeds; in half of the environments strangers score as known places do in the others."""
+    fitted = [(f"made {seed}", traverse(mean, seed)) for seed, mean in enumerate((0.1, 0.14, 0.18, 0.22))]
+    curve = fit_small_maps(CALIBRATION, fitted, repeats=4)
+    assert (curve.slope, curve.intercept) == (37, -3.5), "full maps keep theirs"
+    better = CALIBRATION.model_copy(update={"curve": curve})
+    errors = []
+    for calibration in (CALIBRATION, better):
+        off = []
+        for size in SMALL:
+            for seed, mean in enumerate((0.11, 0.15, 0.19, 0.23)):
+                trials, _ = trials_of_size(traverse(mean, 10 + seed), size, "run", calibration, 4)
+                p, known = trials.probabilities(calibration), trials.known
+                loss = np.square(p - trials.right)
+                off.append((loss[known].mean() + loss[~known].mean()) / 2)
+        errors.append(np.mean(off))
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_an_environment_is_widened_until_strangers_of_small_maps_are_refused() -> None:
+    """Of two kinds of traverses, one whose places score much alike."""
+    alike = [("plain 0", traverse(0.12, 0)), ("alike 0", traverse(0.25, 1))]
+    found = widened(CALIBRATION, alike, repeats=1)
+    assert CALIBRATION.environment is not None and found.deviation > CALIBRATION.environment.deviation
+    assert found.model_copy(update={"deviation": CALIBRATION.environment.deviation}) == CALIBRATION.environment
+    better = CALIBRATION.model_copy(update={"environment": found})
+    shares = []
+    for size in SMALL:
+        trials, _ = trials_of_size(alike[1][1], size, "run", better, 1)
+        shares.append(float(trials.recognized(better)[~trials.known].mean()))
+    assert np.mean(shares) <= 4 * STRANGERS, "the other kind and drawn maps, which count as much, have none"
+    assert widened(CALIBRATION, alike[:1], repeats=1) == CALIBRATION.environment, "nothing has to be refused"
+
+
+def verifiable(mean: float, seed: int) -> Traverse:
+    """A traverse of which true pairs have much evidence, and the nearest one the most."""
+    random = np.random.default_rng(100 + seed)
+    plain = traverse(mean, seed, gain=0.05)
+    apart = np.abs(np.arange(COUNT)[:, None] - np.arange(COUNT))
+    share = np.where(plain.truth, 0.3 - 0.1 * apart, random.uniform(0, 0.03, (COUNT, COUNT)))
+    evidence = np.where(plain.truth, random.gamma(2, 60, (COUNT, COUNT)), random.gamma(2, 12, (COUNT, COUNT)))
+    blank = [Keypoints(8, 8, np.zeros((0, 2), np.uint16), np.zeros((0, 64), np.int8))] * COUNT
+    return Traverse(plain.first, plain.both, plain.among, plain.truth, 30, Pairs(blank, blank, evidence, share))
+
+
+def test_a_pair_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def verify(query: Keypoints, candidates: list[Keypoints]) -> list[verification.Verification]:
+        asked.append(len(candidates))
+        nothing = np.zeros((0, 2), np.int64)
+        return [verification.Verification((0, 0), nothing, np.zeros(0, np.bool_), 7.0, 0.0) for _ in candidates]
+
+    monkeypatch.setattr(verification, "verify", verify)
+    blank = [Keypoints(8, 8, np.zeros((0, 2), np.uint16), np.zeros((0, 64), np.int8))] * 4
+    pairs = Pairs(blank, blank)
+    assert pairs.verified(1, np.array([3, 0]))[0].tolist() == [7.0, 7.0]
+    assert pairs.verified(1, np.array([0, 2, 3]))[1].tolist() == [0.0, 0.0, 0.0]
+    assert asked == [2, 1]
+
+
+def test_verification_puts_the_candidates_into_another_order() -> None:
+    one, kept, sequence = verifiable(0.1, 0), np.arange(COUNT), np.zeros(COUNT, np.int64)
+    calibration = CALIBRATION.model_copy(update={"geometry": TERMS})
+    never, always = (
+        [one.judged(query, kept, calibration, sequence, how) for query in range(COUNT)] for how in ("never", "always")
+    )
+    assert all(found.verified == 0 and found.judgement.evidence is None for found in never)
+    assert all(found.verified == CANDIDATES for found in always)
+    right = [sum(found.best == query for query, found in enumerate(made)) for made in (never, always)]
+    assert right[0] < 0.6 * COUNT < 0.8 * COUNT < right[1]
+
+
+def test_auto_verifies_where_two_stages_leave_doubt() -> None:
+    one, calibration = verifiable(0.1, 0), CALIBRATION.model_copy(update={"geometry": TERMS})
+    _, small = trials_of_size(one, 2, "run", calibration, 4, verify="auto")
+    assert {found.verified for found in small} <= {1, 2}, "two stages know nothing of a map of two places"
+    whole = [one.judged(query, np.arange(COUNT), calibration, np.zeros(COUNT, np.int64), "auto") for query in range(20)]
+    assert any(found.verified == 0 for found in whole)
+    assert {found.verified for found in whole} <= {0, 1, CANDIDATES}
+
+
+def test_terms_that_are_fitted_to_some_traverses_hold_on_others() -> None:
+    terms = fit_geometry(CALIBRATION, [("made 0", verifiable(0.1, 0)), ("made 1", verifiable(0.18, 1))], repeats=2)
+    assert terms.slope > 0 > terms.intercept
+    three = CALIBRATION.model_copy(update={"geometry": terms})
+    plain, _ = trials_of_halves(verifiable(0.14, 7), CALIBRATION)
+    verified, _ = trials_of_halves(verifiable(0.14, 7), three, "always")
+    loss = [np.square(trials.probabilities(three) - trials.right).mean() for trials in (plain, verified)]
+    assert loss[1] < 0.85 * loss[0]
