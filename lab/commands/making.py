@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.commands.console import progress, remark
-from service.commands.pictures import MOST_HELD_OUT, measured, read_images
+from service.commands.encoders.pictures import MOST_HELD_OUT, measured, read_images
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels

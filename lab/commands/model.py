@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, cast
 
 import typer
 
 from core.disk.files import replacing
 from service.commands.console import Commands, Failure, output, remark, show, table
-from service.commands.models import ModelsDir, models_directory
+from service.commands.encoders.models import ModelsDir, models_directory
 
 model = typer.Typer(cls=Commands, help="Import networks that were trained elsewhere.", no_args_is_help=True)
 
@@ -26,7 +25,7 @@ def _group() -> None:
 def import_model(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help=".onnx, .caffemodel, or a checkpoint.", show_default=False),
+        typer.Argument(metavar="FILE", help=".onnx or .caffemodel.", show_default=False),
     ],
     name: Annotated[
         str | None, typer.Option(help="Name to install the network under. Default: the preset's.", show_default=False)
@@ -63,15 +62,14 @@ def import_model(
 ) -> None:
     """Install a network that was trained elsewhere; its weights are kept as they are.
 
-    A .caffemodel becomes a network that vocabularies can be trained for.  An .onnx file with a preset or a description,
-    or the checkpoint of a preset's network, becomes an encoder as well; at once if nothing has to be learned for it,
-    else with --images.
+    A .caffemodel becomes a network that vocabularies can be trained for.  An .onnx file with a preset or a description
+    becomes an encoder as well; at once if nothing has to be learned for it, else with --images.
     """
     # Imported here because they take a second.
-    from lab.conversion.published import PUBLISHED
+    from lab.conversion.presets import PRESETS
 
-    if preset is not None and preset not in PUBLISHED:
-        raise typer.BadParameter(f"--preset {preset!r} is not one of {', '.join(PUBLISHED)}")
+    if preset is not None and preset not in PRESETS:
+        raise typer.BadParameter(f"--preset {preset!r} is not one of {', '.join(PRESETS)}")
     if preset is not None and description is not None:
         raise typer.BadParameter("give --preset or --description")
     if (named := name or preset) is None:
@@ -106,23 +104,16 @@ def _import_described(
     from core.networks.onnx_network import save_onnx_network
     from lab.commands.making import MOST_IMAGES, install_described, split
     from lab.conversion.checkpoints import is_checkpoint
-    from lab.conversion.layouts.checkpoints import export_checkpoint
     from lab.conversion.onnx_import import import_onnx
-    from lab.conversion.published import PUBLISHED
-    from service.commands.pictures import FEWEST_IMAGES, find_images
+    from lab.conversion.presets import PRESETS
+    from service.commands.encoders.pictures import FEWEST_IMAGES, find_images
 
-    described = PUBLISHED[preset] if preset is not None else read_description(cast(Path, description))
+    described = PRESETS[preset] if preset is not None else read_description(cast(Path, description))
     described = described if size is None else described.at(*size)
     chosen = None if images is None else split(find_images(images, FEWEST_IMAGES), MOST_IMAGES, seed)
-    if not is_checkpoint(file):
-        graph = import_onnx(file, described)
-    elif preset is None:
-        raise Failure(f"{file} is a checkpoint, whose network only a preset tells; else export it to the ONNX format.")
-    else:
-        with TemporaryDirectory(prefix="placerec-import-") as temporary_folder:
-            exported = Path(temporary_folder) / f"{name}.onnx"
-            export_checkpoint(file, preset, described, exported)
-            graph = import_onnx(exported, described)
+    if is_checkpoint(file):
+        raise Failure(f"{file} is a checkpoint: its authors' code has to export the network to the ONNX format first.")
+    graph = import_onnx(file, described)
     path = folder / f"{name}{NETWORK_SUFFIX}"
     _written(path, lambda temporary: save_onnx_network(temporary, name, graph, described))
     shown = described.input

@@ -15,8 +15,8 @@ from core.disk.files import replacing
 from lab.commands.making import MOST_IMAGES, install_described, split
 from lab.commands.model import check_free_name
 from service.commands.console import Commands, Failure, output, progress
-from service.commands.models import ModelsDir, models_directory
-from service.commands.pictures import FEWEST_IMAGES, find_images, measured, read_images
+from service.commands.encoders.models import ModelsDir, models_directory
+from service.commands.encoders.pictures import FEWEST_IMAGES, find_images, measured, read_images
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels

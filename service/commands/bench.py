@@ -13,7 +13,7 @@ import typer
 from service.commands.connection.client import Target, ask, path_of, read_bytes
 from service.commands.connection.credentials import given_key
 from service.commands.console import Failure, number, progress, show, table, write_file
-from service.commands.models import ModelsDir, default_encoder, open_catalogue
+from service.commands.encoders.models import ModelsDir, default_encoder, open_catalogue
 
 if TYPE_CHECKING:
     from core.method.encoder import Encoder

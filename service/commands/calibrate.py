@@ -13,9 +13,9 @@ import typer
 from core.errors import InvalidImage, InvalidRecording
 from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of
 from service.commands.console import Failure, number, output, remark, show, show_json, table
+from service.commands.encoders.models import ModelsDir, models_directory, open_catalogue
+from service.commands.encoders.pictures import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
 from service.commands.jobs import submit
-from service.commands.models import ModelsDir, models_directory, open_catalogue
-from service.commands.pictures import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
 from service.commands.recordings import RecordingOptions, Topic
 
 SHOWN_POINTS = 9

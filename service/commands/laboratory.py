@@ -19,11 +19,19 @@ ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 def add_laboratory(application: typer.Typer) -> None:
     """Add the laboratory's commands; where it is not installed, they say how to get it and are not listed."""
-    if all(find_spec(name) for name in NEEDED):
+    if is_installed():
         import_module("lab.commands.application").add_commands(application)
         return
     for name in COMMANDS:
         application.command(name, add_help_option=False, context_settings=ANYTHING, hidden=True)(_missing(name))
+
+
+def is_installed() -> bool:
+    """Whether the laboratory and what its extra brings can be imported."""
+    try:
+        return all(find_spec(name) for name in NEEDED)
+    except ModuleNotFoundError:  # of an import system that says so itself
+        return False
 
 
 def _missing(name: str) -> Callable[[], None]:

@@ -193,7 +193,7 @@ def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
 
     from core.errors import InvalidImage, InvalidRecording
     from core.frames.images import decode
-    from service.commands.models import default_encoder, open_catalogue
+    from service.commands.encoders.models import default_encoder, open_catalogue
 
     used = open_catalogue(None).get(encoder or default_encoder())
 

@@ -56,7 +56,12 @@ def test_the_packages_of_ros_are_locked_within_their_ranges() -> None:
 
 @pytest.mark.parametrize(
     ("name", "extras"),
-    [("service", []), ("replica", ["milvus", "ray"]), ("development", ["dev", "milvus", "ray", "report"])],
+    [
+        ("service", []),
+        ("lab", ["lab"]),
+        ("replica", ["milvus", "ray"]),
+        ("development", ["dev", "lab", "milvus", "ray"]),
+    ],
 )
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:
     texts = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"]

@@ -27,7 +27,7 @@ from lab.commands.evaluation.systems import build_systems, parse_weights, show_l
 from lab.commands.evaluation.traverses import TraverseOptions, TruthOptions, choose_training
 from lab.evaluation import Comparison
 from service.commands.console import progress, remark
-from service.commands.models import ModelsDir, load_image, open_catalogue
+from service.commands.encoders.models import ModelsDir, load_image, open_catalogue
 from service.commands.recordings import (
     PANEL,
     EveryChange,

@@ -14,7 +14,7 @@ from lab.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
 from lab.evaluation.data.published import RECALLS, Published
 from lab.evaluation.protocol.results import results_csv
 from service.commands.console import number, remark, show, table, write_file
-from service.commands.models import name_of
+from service.commands.encoders.models import name_of
 
 RULES = {"mean_of_negatives": "mean of true negatives", "full_precision": "best wrong match"}
 

@@ -11,7 +11,7 @@ from rich.box import HEAVY_HEAD
 from rich.markup import escape
 
 from service.commands.console import output, show, table
-from service.commands.models import default_encoder, name_of
+from service.commands.encoders.models import default_encoder, name_of
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderCatalogue

@@ -11,6 +11,7 @@ from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from core.frames.preprocessing import InputDefinition
 from core.networks.description import Aggregation, NetworkDescription, Output
+from lab.conversion.presets import PRESETS
 
 SIDE = 32
 SHOWN = InputDefinition(height=SIDE, width=SIDE, mean=(128.0, 128.0, 128.0), scale=(0.01, 0.01, 0.01))
@@ -49,3 +50,21 @@ def onnx_network(
     )
     imports = [helper.make_opsetid("", 17), *(helper.make_opsetid(domain, 1) for domain in domains)]
     return helper.make_model(graph, opset_imports=imports, ir_version=8)
+
+
+def published_network(preset: str, side: int | None = None) -> ModelProto:
+    """A small network of random weights that takes and gives what the network of a preset does; 6 values.
+
+    Args:
+        side: of its input, in pixels; default: the preset's.
+    """
+    side = side or PRESETS[preset].input.height
+    shape = (1, 3, side, side)
+    if PRESETS[preset].output.kind == "descriptor":
+        mean = node("GlobalAveragePool", ["maps"], "mean")
+        return onnx_network([CONVOLUTION, mean, node("Flatten", ["mean"], "values")], "values", shape=shape)
+    patches = node("Conv", ["images", "w"], "maps", strides=[14, 14], pads=[0, 0, 0, 0], dilations=[1, 1])
+    rows = node("Reshape", ["maps", "shape"], "rows")
+    tokens = node("Transpose", ["rows"], "tokens", perm=[0, 2, 1])
+    count = numpy_helper.from_array(np.array([1, 6, (side // 14) ** 2]), "shape")
+    return onnx_network([patches, rows, tokens], "tokens", shape=shape, tensors=[count])
