@@ -30,6 +30,7 @@ from benchmarks.report import report, verdict
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.recognition.question import Query
 from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
@@ -53,7 +54,7 @@ def encode_and_search(encoder: Encoder, map_: Map, frames: list[bytes], seconds:
     while time.perf_counter() < until:
         began = time.perf_counter()
         encoding = encoder.encode(decode(frames[len(times) % len(frames)]))
-        locate(map_, encoder, [encoding], 5)
+        locate(map_, encoder, [Query(encoding)])
         times.append(1e3 * (time.perf_counter() - began))
     return times
 

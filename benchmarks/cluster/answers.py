@@ -27,6 +27,7 @@ from core.maps.records import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields
+from core.recognition.question import Query
 from core.recognition.recognition import Answer, describe, locate
 from core.threads import cores, share_cores
 from lab.training.map_sizes import corridor_and_lip6
@@ -84,7 +85,7 @@ def main(
                     f"{name}-answers", encoder.identity, encoder.dimension, settings, encoder.local_shape
                 )
                 fill(map_, task.references, references)
-                answers = [locate(map_, encoder, [query], 5)[0] for query in queries]
+                answers = [locate(map_, encoder, [Query(query)])[0] for query in queries]
                 found[kind] = figures(answers, np.asarray(task.truth))
                 store.delete(f"{name}-answers")
             ours, theirs = found["embedded"], found["milvus"]

@@ -39,9 +39,9 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.recognition.verification import Verifier, Verify
 from core.storage import Atlas
 from core.threads import cores, share_cores
 from lab.training.map_sizes import corridor_and_lip6
@@ -170,10 +170,10 @@ def fill(atlas: Atlas, name: str, encoder: Encoder, shots: Sequence[tuple[int, S
 
 def asked(map_: Map, encoder: Encoder, shots: Sequence[Shot], verify: Verify) -> list[Answer]:
     """The answers to frames, each asked alone."""
-    verifiers = [Verifier(verify, partial(getattr, shot, "keypoints")) for shot in shots]
+    question = Question(k=1, verify=verify)
     return [
-        locate(map_, encoder, [shot.encoding], 1, verifiers=[verifier])[0]
-        for shot, verifier in zip(shots, verifiers, strict=True)
+        locate(map_, encoder, [Query(shot.encoding, question, partial(getattr, shot, "keypoints"))])[0]
+        for shot in shots
     ]
 
 

@@ -42,6 +42,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import XFeat, load_xfeat
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas
@@ -264,7 +265,7 @@ def estimates(encoder: Encoder, network: XFeat, traverse: Traverse) -> Iterator[
         write_map(Path(folder), "poses", encoder, enrolments, fields=lambda index: PlaceFields(pose=poses[index]))
         atlas = Atlas(Path(folder))
         map_ = atlas.get("poses")
-        answers = locate(map_, encoder, [encoder.encode(frame) for frame in traverse.queries], 1)
+        answers = locate(map_, encoder, [Query(encoder.encode(frame), Question(k=1)) for frame in traverse.queries])
         reach = neighborhood_of(map_).radius
         for frame, answer, true in zip(traverse.queries, answers, traverse.true, strict=True):
             candidates = answer.candidates

@@ -32,6 +32,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields
+from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.threads import share_cores
 from lab.training.calibration_quality import widened
@@ -129,7 +130,8 @@ def verdicts(
     for start in range(0, len(asked), 16):
         some = asked[start : start + 16].tolist()
         encodings = [Encoding(frames.descriptors[one], frames.local[one], NO_REGIONS, {}) for one in some]
-        for number, answer in zip(some, locate(map_, encoder, encodings, 1), strict=True):
+        queries = [Query(one, Question(k=1)) for one in encodings]
+        for number, answer in zip(some, locate(map_, encoder, queries), strict=True):
             kind: str = answer.judgement.verdict
             if kind == "recognized":
                 assert answer.place is not None

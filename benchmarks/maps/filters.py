@@ -28,6 +28,7 @@ from core.maps.selection import Selection
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from service.commands.timing.samples import fill_map, sample_descriptors, sample_frame
@@ -96,7 +97,7 @@ def measured(map_: Map, encoder: Encoder, rounds: int) -> dict[str, dict[str, fl
                 began = time.perf_counter()
                 scope = map_.scope(selection)
                 chosen = time.perf_counter()
-                locate(map_, encoder, [encoding], 5, selection)
+                locate(map_, encoder, [Query(encoding, Question(5, selection))])
                 tries[name].append((1e3 * (time.perf_counter() - chosen), 1e3 * (chosen - began)))
                 shares[name] = 1.0 if scope.allowed is None else float(scope.allowed.mean())
         for name, found in tries.items():

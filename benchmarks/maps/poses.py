@@ -22,6 +22,7 @@ from core.frames.traverses import read_ground_truth
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
 from core.storage import Atlas
 from service.commands.timing.samples import write_map
@@ -35,7 +36,7 @@ def answers(encoder: Encoder, queries: list[Encoding], places: list[Encoding]) -
         described = ((place.descriptor, place.local) for place in places)
         write_map(Path(folder), "poses", encoder, described, fields=lambda index: PlaceFields(pose=Pose(x=index, y=0)))
         atlas = Atlas(Path(folder))
-        found = locate(atlas.get("poses"), encoder, queries, 1)
+        found = locate(atlas.get("poses"), encoder, [Query(query, Question(k=1)) for query in queries])
         atlas.close()
     return found
 

@@ -26,19 +26,13 @@ from core.geometry.pose import RelativeView
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
-from core.maps import Enrolment, Map, Selection
+from core.maps import Enrolment, Map
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
-from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, rank_places
-from core.recognition.verification import (
-    NOT_VERIFIED,
-    ThirdStage,
-    Verifier,
-    Verify,
-    relative_views,
-    third_stage,
-)
+from core.recognition.question import Query, Question
+from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, no_candidates, rank_places
+from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, third_stage
 
 ATTEMPTS = 3
 """How often a query is searched for if places that it finds are deleted in the meantime."""
@@ -70,7 +64,7 @@ class Answer:
     weights: the prior weight of each match, in (0, 1]; None if the query had no prior.
     calibration: the calibration by which the query was judged.
     search: milliseconds spent on the first two stages of the search, the judgement and the look-up of the places; for
-        several queries that were searched for together, the mean.
+        several queries that were searched for together, the mean; 0 for a blank frame.
     pose: the estimated pose of the query, from the poses of the best match and its neighbours, and from the geometry
         where they were verified; None if they have none.
     note: why the camera's intrinsics were not used for the pose; None if they were, or if there are none.
@@ -93,6 +87,11 @@ class Answer:
     note: str | None = None
 
     @property
+    def blank(self) -> bool:
+        """Whether the frame has no region of interest, so that it could not be searched for."""
+        return len(self.encoding.regions) == 0
+
+    @property
     def place(self) -> Place | None:
         """The place that the query shows if the verdict is ``recognized``, else None."""
         return self.matches[0][1] if self.judgement.verdict == "recognized" else None
@@ -103,38 +102,27 @@ class Answer:
         return self.judgement.probability
 
 
-def recognize(
-    map_: Map,
-    picture: bytes,
-    encoder: Encoder,
-    k: int = 5,
-    selection: Selection | None = None,
-    camera: str | None = None,
-    verify: Verify = "auto",
-) -> Answer:
+def recognize(map_: Map, picture: bytes, encoder: Encoder, question: Question | None = None) -> Answer:
     """Find where a picture was taken.
 
     Args:
         picture: the bytes of a JPEG, PNG or WebP file.
         encoder: the map's encoder (``EncoderCatalogue().get(map_.record.encoder)``).
-        k: how many matches to list.
-        selection: what is known of the place; None: nothing.
-        camera: the name of the map's camera that took the picture, whose mask is applied; None: no mask.
-        verify: whether the geometry of the best candidates is verified; ``auto``: where the scores leave doubt.
+        question: None: five matches, anywhere in the map, verified where the scores leave doubt.
 
     Raises:
         InvalidImage: the picture cannot be decoded.
-        NoRegions: the picture is blank, or nearly so.
         UnknownCamera: the map has no such camera.
         StorageFailure: the map's files cannot be read.
     """
     pixels = decode(picture)  # uint8 [H, W, 3]
-    mask = _mask(map_, camera)
+    question = question or Question()
+    mask = _mask(map_, question.camera)
     encoding = encoder.encode(pixels, mask)  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
-        raise NoRegions("The picture has no region of interest: it is blank, or nearly so.")
-    verifier = Verifier(verify, lambda: find_keypoints(packaged_xfeat(), pixels, mask), camera)
-    (answer,) = locate(map_, encoder, [encoding], k, selection, [verifier])
+        return answer_to_blank(map_, encoder, encoding)
+    query = Query(encoding, question, lambda: find_keypoints(packaged_xfeat(), pixels, mask))
+    (answer,) = locate(map_, encoder, [query])
     return answer
 
 
@@ -225,22 +213,18 @@ def describe(
     )
 
 
-def locate(
-    map_: Map,
-    encoder: Encoder,
-    encodings: Sequence[Encoding],
-    k: int,
-    selection: Selection | None = None,
-    verifiers: Sequence[Verifier | None] | None = None,
-) -> list[Answer]:
+def answer_to_blank(map_: Map, encoder: Encoder, encoding: Encoding) -> Answer:
+    """The answer to a frame without regions, which cannot be searched for: ``unknown``, without a match."""
+    judgement = Judgement("unknown", None, None, None, None)
+    return Answer(judgement, [], None, calibration_of(map_, encoder), 0.0, None, encoding, no_candidates(map_))
+
+
+def locate(map_: Map, encoder: Encoder, queries: Sequence[Query]) -> list[Answer]:
     """Search a map for queries that are encoded already, and judge each.
 
     Args:
         encoder: the map's encoder.
-        encodings: the queries, encoded by it, each with at least one region; at least one query.
-        k: how many matches to list.
-        selection: what is known of the places; None: nothing.
-        verifiers: for each query when to verify its candidates, and its keypoints; None: never.
+        queries: at least one; their questions have the same selection.
 
     Returns:
         One answer for each query, in order.
@@ -250,25 +234,15 @@ def locate(
         InvalidModel: the network of keypoints cannot be loaded.
     """
     began = time.perf_counter()
-    ranked = rank_places(map_, encoder, encodings, selection)  # both stages of the search
-    answers = [
-        _answer(map_, encoder, encoding, candidates, k, selection, verifier)
-        for encoding, candidates, verifier in zip(encodings, ranked, verifiers or [None] * len(encodings), strict=True)
-    ]
+    selection = queries[0].question.selection
+    ranked = rank_places(map_, encoder, [query.encoding for query in queries], selection)  # both stages of the search
+    answers = [_answer(map_, encoder, query, candidates) for query, candidates in zip(queries, ranked, strict=True)]
     verifying = sum(answer.third_stage.milliseconds for answer in answers)
-    milliseconds = (1e3 * (time.perf_counter() - began) - verifying) / len(encodings)
+    milliseconds = (1e3 * (time.perf_counter() - began) - verifying) / len(queries)
     return [replace(answer, search=milliseconds) for answer in answers]
 
 
-def _answer(
-    map_: Map,
-    encoder: Encoder,
-    encoding: Encoding,
-    candidates: Candidates,
-    k: int,
-    selection: Selection | None,
-    verifier: Verifier | None,
-) -> Answer:
+def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -> Answer:
     """Verify and judge the candidates, and look up the best places; again if one was deleted since the search."""
 
     def judged(candidates: Candidates) -> Judgement:
@@ -282,10 +256,11 @@ def _answer(
             candidates.geometry,
         )
 
+    k, verifier = query.question.k, query.verifier
     ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
     attempt = 1
     while None in (places := _places(map_, ranked, k)) and attempt < ATTEMPTS:
-        (candidates,) = rank_places(map_, encoder, [encoding], selection)
+        (candidates,) = rank_places(map_, encoder, [query.encoding], query.question.selection)
         ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
         attempt += 1
     if None in places:  # places are being deleted all the time: go on without those that are gone
@@ -294,22 +269,21 @@ def _answer(
         ranked = ranked.take(np.flatnonzero(present))
         judgement = judged(ranked)
     found = [place for place in places if place is not None]
-    return _told(map_, encoder, encoding, ranked, found, judgement, stage, verifier)
+    return _put_together(map_, encoder, query, ranked, found, judgement, stage)
 
 
 def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
     return map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
 
 
-def _told(
+def _put_together(
     map_: Map,
     encoder: Encoder,
-    encoding: Encoding,
+    query: Query,
     candidates: Candidates,
     places: list[Place],
     judgement: Judgement,
     stage: ThirdStage,
-    verifier: Verifier | None,
 ) -> Answer:
     """The answer by the judged candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
@@ -320,11 +294,11 @@ def _told(
     views: list[RelativeView | None] = []
     note = None
     if judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE:
-        views, note = relative_views(map_, candidates, stage, verifier)
+        views, note = relative_views(map_, candidates, stage, query.verifier)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     rivals = _rivals(map_, candidates, judgement)
-    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, stage, rivals, note)
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
 
 
 def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalGroup, ...]:

@@ -11,44 +11,39 @@ import numpy as np
 from core.judgement.fusion import Fused, View, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
-from core.maps import Map, Selection
-from core.method.encoder import Encoder, Encoding
+from core.maps import Map
+from core.method.encoder import Encoder
+from core.recognition.question import Query
 from core.recognition.recognition import ATTEMPTS, Answer, locate
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
-from core.recognition.verification import Verifier
 
 
 def locate_rig(
     map_: Map,
     encoder: Encoder,
-    encodings: Sequence[Encoding],
-    k: int,
-    selection: Selection | None = None,
-    verifiers: Sequence[Verifier | None] | None = None,
+    queries: Sequence[Query],
 ) -> Answer:
     """Search one snapshot of a map for the frames of a rig, and judge them as one query.
 
     Args:
         encoder: the map's encoder.
-        encodings: the rig's frames that have regions, encoded by it; at least one.
-        k: how many matches to list.
-        selection: what is known of the place; None: nothing.
-        verifiers: for each frame when to verify its candidates; None: never.  Several frames are never verified.
+        queries: the rig's frames that have regions, with one question; at least one.  Several are never verified.
 
     Raises:
         StorageFailure: the map's files cannot be read.
     """
-    if len(encodings) == 1:
-        return locate(map_, encoder, encodings, k, selection, verifiers)[0]
+    if len(queries) == 1:
+        return locate(map_, encoder, queries)[0]
+    question, encodings = queries[0].question, [query.encoding for query in queries]
     began = time.perf_counter()
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     for _attempt in range(ATTEMPTS):  # again, if places were deleted during the search
-        ranked = rank_places(map_, encoder, encodings, selection)
+        ranked = rank_places(map_, encoder, encodings, question.selection)
         if not len(ranked[0].rows):
-            return locate(map_, encoder, encodings[:1], k, selection)[0]  # no place is allowed, or there is none
+            return locate(map_, encoder, queries[:1])[0]  # no place is allowed, or there is none
         views = [View(one.rows, one.scores, one.whereabouts, one.examined, one.weights) for one in ranked]
         fused = fuse(views, calibration, neighborhood)
-        places = map_.places_at(fused.rows[:k].tolist())
+        places = map_.places_at(fused.rows[: question.k].tolist())
         if None not in places:
             break
     # A place that is deleted all the same is not listed; the verdict stands unless it was the best one.

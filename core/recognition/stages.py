@@ -205,6 +205,14 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
     return candidates
 
 
+def no_candidates(map_: Map) -> Candidates:
+    """Those of a frame that is not searched for."""
+    snapshot, none = map_.snapshot(), np.zeros(0, np.float32)
+    rows = np.zeros(0, np.int64)
+    examined = np.zeros(0, np.bool_)
+    return Candidates(rows, none, none, snapshot.whereabouts_at(rows), examined, None, none, len(snapshot))
+
+
 def likeness(map_: Map, encoder: Encoder, candidates: Candidates, positions: Positions) -> Array:
     """The scores of the best candidate, as if it were the query, at the candidates ``positions``, int64 [k].
 

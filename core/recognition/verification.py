@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -24,10 +23,8 @@ from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.places import NO_POSE
+from core.recognition.question import Verifier
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of
-
-Verify = Literal["auto", "always", "never"]
-"""When a query's candidates are verified."""
 
 VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 """Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if no candidate has any, or the
@@ -38,25 +35,6 @@ MOST_VIEWS = 2
 
 CANDIDATES = 10
 """How many places are verified at most: five lose 0.027 of the recall@1 on lip6, and fifteen gain 0.002."""
-
-
-class Verifier:
-    """When to verify a query, and its keypoints, which are found when they are first needed.
-
-    Args:
-        when: see :data:`Verify`.
-        find: finds the keypoints of the query's frame.
-        camera: the name of the map's camera that took it, whose intrinsics tell the pose; None: not known.
-    """
-
-    def __init__(self, when: Verify, find: Callable[[], Keypoints], camera: str | None = None) -> None:
-        self.when, self.camera = when, camera
-        self._find = find
-
-    @cached_property
-    def keypoints(self) -> Keypoints:
-        """The keypoints of the query's frame."""
-        return self._find()
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from core.errors import InvalidModel, MissingWeights, UnknownEncoder
 from core.method.catalogue import EncoderCatalogue, EncoderSummary
 from core.networks.files import open_network
-from core.recognition.verification import Verify
+from core.recognition.question import Verify
 from lab.baselines import (
     calc,
     compact,

@@ -26,8 +26,9 @@ from core.method.features import FeatureExtractor
 from core.method.vocabulary import Vocabulary
 from core.networks.backbone import Backbone
 from core.networks.xfeat import load_xfeat
+from core.recognition.question import Verifier, Verify
 from core.recognition.stages import Candidates, Positions, likeness_of_first, traverse_candidates, traverse_neighborhood
-from core.recognition.verification import CANDIDATES, Verifier, Verify, verify_candidates
+from core.recognition.verification import CANDIDATES, verify_candidates
 from lab.baselines.encoders import LOCAL_AGREEMENT, EncoderSystem, local_of
 from lab.baselines.system import About, Array, Description, Index, InnerProducts, stack
 

@@ -24,6 +24,7 @@ from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
+from core.recognition.question import Query, Question
 from service.errors.faults import DeadlineExceeded
 from service.telemetry.metrics import Metrics
 
@@ -66,6 +67,10 @@ class Encoded:
     def find_keypoints(self) -> Keypoints:
         """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
         return keypoints_in(packaged_xfeat(), self.scaled) if self.keypoints is None else self.keypoints
+
+    def query(self, question: Question) -> Query:
+        """A question about the frame, which has regions."""
+        return Query(self.encoding, question, self.find_keypoints)
 
     def without_pixels(self, keep_scaled: bool = False) -> Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.

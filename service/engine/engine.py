@@ -24,16 +24,15 @@ from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
 from core.maps import Map, MapRecord, Store
-from core.maps.selection import Selection
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
-from core.recognition.verification import Verify
+from core.recognition.question import Question
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.rehearsal import rehearse
 from service.engine.review_keeper import ReviewKeeper
-from service.engine.searches import Recognized, Searches, search_ahead
+from service.engine.searches import Answered, Searches, search_ahead
 from service.engine.stores import OpenStore
 from service.errors.faults import EncoderNotInstalled
 from service.events.events import Events
@@ -257,40 +256,25 @@ class Engine:
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
-    async def recognize(
-        self,
-        map_: Map,
-        data: bytes,
-        deadline: RequestDeadline,
-        k: int,
-        selection: Selection | None = None,
-        mask: Mask | None = None,
-        verify: Verify = "never",
-        camera: str | None = None,
-        features: bool = False,
-    ) -> Recognized:
+    async def ask(self, map_: Map, data: bytes, question: Question, deadline: RequestDeadline) -> Answered:
         """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, verify, judge.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
-            k: how many matches to list.
-            selection: what is known of the place; None: nothing.
-            mask: the part of the frame that is ignored.
-            verify: when the geometry of the best candidates is verified.
-            camera: the name of the camera that took the frame; None: not known.
-            features: whether the features of its regions are wanted, too.
 
         Raises:
+            UnknownCamera: the map has no camera of the question's name.
             QueueFull: too many requests are waiting.
             StorageFailure: the map's files cannot be read.
             Others: see ``encode_for``.
         """
+        mask = await camera_mask(map_, question.camera)
         with self.queue.place():
-            encoded = await self.encode_for(
-                map_, data, deadline, mask, search_ahead(map_, k, selection, verify, camera), features=features
+            frame = await self.encode_for(
+                map_, data, deadline, mask, search_ahead(map_, question), features=question.explain
             )
-        (recognized,) = await self.searches.recognize(map_, [encoded], k, selection, verify, camera)
-        return recognized
+        (answered,) = await self.searches.answer(map_, [frame], question)
+        return answered
 
     async def encode_many(
         self,

@@ -28,6 +28,7 @@ from core.method.encoder import Encoder, canary_frame
 from core.method.regions import box_sums
 from core.places import PlaceFields, Pose
 from core.recognition import Answer, enrol, recognize
+from core.recognition.question import Question
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas
 from core.storage.files.row_formats import COMPRESSED, inner_products, pack_descriptors
@@ -80,7 +81,7 @@ def _rehearse_in(map_: Map, encoder: Encoder) -> None:
         fields = PlaceFields(pose=pose, timestamp=taken, sequence=f"traverse-{traverse}")
         enrol(map_, f"place-{number}", _file(frame), encoder, fields)
     seen = frames[:FRAMES]
-    _follow(map_, seen, [recognize(map_, _file(frame), encoder, verify="always") for frame in seen])
+    _follow(map_, seen, [recognize(map_, _file(frame), encoder, Question(verify="always")) for frame in seen])
 
 
 def _follow(map_: Map, frames: Sequence[Pixels], answers: Sequence[Answer]) -> None:

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from anyio import to_thread
 
 from core.maps import Map
-from core.maps.selection import Selection
-from core.method.encoder import Encoder, Encoding
-from core.recognition.recognition import Answer, locate
-from core.recognition.verification import Verifier, Verify
+from core.method.encoder import Encoder
+from core.recognition.question import Query, Question
+from core.recognition.recognition import Answer, answer_to_blank, locate
 from core.threads import cores
 from service.engine.encoders import Encoded
 
@@ -36,11 +35,11 @@ MOST_AHEAD = 4000
 
 
 @dataclass(frozen=True)
-class Recognized:
-    """An encoded frame and the answer of the map, which is None for a frame without regions."""
+class Answered:
+    """An encoded frame and the answer of the map."""
 
-    encoded: Encoded
-    answer: Answer | None
+    frame: Encoded
+    answer: Answer
 
 
 @dataclass(frozen=True)
@@ -48,31 +47,21 @@ class SearchAhead:
     """A search of a map that is done in the encoder's thread."""
 
     map_: Map
-    k: int
-    verify: Verify = "never"
-    camera: str | None = None
+    question: Question
 
-    def __call__(self, encoded: Encoded) -> Answer | None:
-        """The answer for a frame; None for a frame that is left to :meth:`Searches.recognize`."""
-        if not len(encoded.encoding.regions) or not self.map_.held:  # it would have to read from the disk
+    def __call__(self, frame: Encoded) -> Answer | None:
+        """The answer for a frame; None for a frame that is left to :meth:`Searches.answer`."""
+        if not len(frame.encoding.regions) or not self.map_.held:  # it would have to read from the disk
             return None
-        verifiers = _verifiers([encoded], self.verify, self.camera)
-        (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k, None, verifiers)
+        (answer,) = locate(self.map_, frame.encoder, [frame.query(self.question)])
         return answer
 
 
-def _verifiers(frames: Sequence[Encoded], verify: Verify, camera: str | None) -> list[Verifier | None]:
-    """What ``locate`` needs to verify the candidates of each frame."""
-    return [None if verify == "never" else Verifier(verify, frame.find_keypoints, camera) for frame in frames]
-
-
-def search_ahead(
-    map_: Map, k: int, selection: Selection | None, verify: Verify = "never", camera: str | None = None
-) -> SearchAhead | None:
+def search_ahead(map_: Map, question: Question) -> SearchAhead | None:
     """The search to do in the encoder's thread, or None if other frames would wait too long for it."""
-    if selection is not None or not map_.held or map_.count_places() > MOST_AHEAD:
+    if question.selection is not None or not map_.held or map_.count_places() > MOST_AHEAD:
         return None
-    return SearchAhead(map_, k, verify, camera)
+    return SearchAhead(map_, question)
 
 
 @dataclass(frozen=True)
@@ -81,13 +70,11 @@ class _SearchKey:
 
     map_: Map
     encoder: Encoder
-    k: int
 
 
 @dataclass
 class _Waiting:
-    encodings: Sequence[Encoding]
-    verifiers: Sequence[Verifier | None]
+    queries: Sequence[Query]
     answer: asyncio.Future[list[Answer]]
 
 
@@ -103,64 +90,47 @@ class Searches:
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_once = max(1, cores() // CORES_A_SEARCH)
 
-    async def recognize(
-        self,
-        map_: Map,
-        frames: Sequence[Encoded],
-        k: int,
-        selection: Selection | None = None,
-        verify: Verify = "never",
-        camera: str | None = None,
-    ) -> list[Recognized]:
-        """Search a map for frames that its encoder has encoded; a result of ``SearchAhead`` is taken as it is.
+    async def answer(self, map_: Map, frames: Sequence[Encoded], question: Question) -> list[Answered]:
+        """Answer a question about frames that the map's encoder has encoded, as :class:`SearchAhead` may have done.
 
         Args:
-            k: how many matches to list.
-            selection: what is known of the place; None: nothing.
-            verify: when the candidates are verified; the frames have their pixels then, or are kept scaled.
-            camera: the name of the camera that took the frames; None: not known.
+            frames: they have their pixels, or are kept scaled, where they may be verified.
 
         Raises:
             StorageFailure: the map's files cannot be read.
         """
         seen = [frame for frame in frames if len(frame.encoding.regions)]
         if len(seen) == 1 and seen[0].search_result is not None:
-            answers: list[Answer] = [seen[0].search_result]
+            found: list[Answer] = [seen[0].search_result]
         else:
-            encodings = [frame.encoding for frame in seen]
-            verifiers = _verifiers(seen, verify, camera)
-            answers = await self.locate(map_, seen[0].encoder, encodings, k, selection, verifiers) if seen else []
-        remaining = iter(answers)
-        return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]
+            queries = [frame.query(question) for frame in seen]
+            found = await self.locate(map_, seen[0].encoder, queries) if seen else []
+        answers = iter(found)
+        return [
+            Answered(
+                frame,
+                next(answers) if len(frame.encoding.regions) else answer_to_blank(map_, frame.encoder, frame.encoding),
+            )
+            for frame in frames
+        ]
 
-    async def locate(
-        self,
-        map_: Map,
-        encoder: Encoder,
-        encodings: Sequence[Encoding],
-        k: int,
-        selection: Selection | None = None,
-        verifiers: Sequence[Verifier | None] | None = None,
-    ) -> list[Answer]:
+    async def locate(self, map_: Map, encoder: Encoder, queries: Sequence[Query]) -> list[Answer]:
         """Call :func:`core.recognition.recognition.locate` in a thread, for these and other waiting queries at once.
 
         Args:
-            encodings: queries that have regions.
-            verifiers: for each query when to verify its candidates; None: never.
+            queries: of one question.
 
         Raises:
             StorageFailure: the map's files cannot be read.
         """
-        looks = verifiers or [None] * len(encodings)
-        if selection is not None:
-            return await to_thread.run_sync(locate, map_, encoder, encodings, k, selection, looks)
+        question = queries[0].question
+        if question.selection is not None:
+            return await to_thread.run_sync(locate, map_, encoder, queries)
         loop = asyncio.get_running_loop()
-        key = _SearchKey(map_, encoder, k)
+        key = _SearchKey(map_, encoder)
         parts = [
-            _Waiting(
-                encodings[start : start + MOST_TOGETHER], looks[start : start + MOST_TOGETHER], loop.create_future()
-            )
-            for start in range(0, len(encodings), MOST_TOGETHER)
+            _Waiting(queries[start : start + MOST_TOGETHER], loop.create_future())
+            for start in range(0, len(queries), MOST_TOGETHER)
         ]
         self._waiting.setdefault(key, deque()).extend(parts)
         if self._running[key] < self._at_once:
@@ -191,21 +161,20 @@ class Searches:
     def _take(self, key: _SearchKey) -> list[_Waiting]:
         """The queries of the next search: an equal share for each thread that the map may use."""
         waiting = self._waiting.get(key, deque())
-        most = min(MOST_TOGETHER, -(-sum(len(one.encodings) for one in waiting) // self._at_once))
+        most = min(MOST_TOGETHER, -(-sum(len(one.queries) for one in waiting) // self._at_once))
         taken: list[_Waiting] = []
         count = 0
-        while waiting and (not taken or count + len(waiting[0].encodings) <= most):
+        while waiting and (not taken or count + len(waiting[0].queries) <= most):
             one = waiting.popleft()
             if not one.answer.done():  # else its request was cancelled
                 taken.append(one)
-                count += len(one.encodings)
+                count += len(one.queries)
         return taken
 
     async def _answer(self, key: _SearchKey, together: Sequence[_Waiting]) -> None:
-        encodings = [encoding for one in together for encoding in one.encodings]
-        verifiers = [verifier for one in together for verifier in one.verifiers]
+        queries = [query for one in together for query in one.queries]
         try:
-            answers = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k, None, verifiers)
+            answers = await to_thread.run_sync(locate, key.map_, key.encoder, queries)
         except Exception as error:
             if len(together) > 1:  # search for each alone, so that only the faulty ones fail
                 for one in together:
@@ -215,6 +184,6 @@ class Searches:
             return
         remaining = iter(answers)
         for one in together:
-            answer = [next(remaining) for _ in one.encodings]
+            answer = [next(remaining) for _ in one.queries]
             if not one.answer.done():
                 one.answer.set_result(answer)

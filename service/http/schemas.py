@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.places import Camera
-from core.recognition.verification import Verify
+from core.recognition.question import Verify
 from service.errors.faults import InvalidRequest
 from service.errors.problems import invalid_request
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import Depends
 
@@ -12,10 +12,10 @@ from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
 from core.maps import Map
 from core.recognition.recognition import Answer
-from core.recognition.stages import Candidates, calibration_of
+from core.recognition.stages import Candidates
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
-from service.engine.searches import Recognized
+from service.engine.searches import Answered
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
 from service.queries.recent_answers import AskedFrame
@@ -26,13 +26,10 @@ StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
 
 
 def counted_answer(
-    engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized, frame: AskedFrame
+    engine: Engine, statistics: QueryStatistics, map_: Map, answered: Answered, frame: AskedFrame
 ) -> QueryAnswer:
     """The JSON answer to a frame; it is counted in the service's metrics and in the statistics of the map."""
-    if recognized.answer is None:
-        answer = blank_answer(map_, recognized.encoded)
-    else:
-        answer = answer_of(map_, recognized.encoded, recognized.answer)
+    answer = answer_of(map_, answered.frame, answered.answer)
     count_answer(engine, statistics, map_, answer, frame)
     return answer
 
@@ -59,7 +56,7 @@ def count_for_map(
 
 
 def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
-    """The JSON answer to a frame that was searched for in a map."""
+    """The JSON answer to a frame."""
     judgement = found.judgement
     weights: Sequence[float | None] = found.weights or [None] * len(found.matches)
     matches = [
@@ -78,7 +75,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         margin=judgement.margin,
         decision=judgement.decision,
         threshold=found.calibration.threshold,
-        reason=None if matches else "no-place-allowed" if found.candidates.places else "empty-map",
+        reason=None if matches else _why_nothing(found),
         matches=matches,
         rivals=[
             RivalGroup(places=list(group.places), score=group.score, same_place=group.same_place)
@@ -87,14 +84,22 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         verification=verification_view(found) if matches else None,
         revision=map_.record.revision,
         encoder=encoded.encoder.identity,
-        milliseconds=rounded({**encoded.milliseconds, "search": found.search, **_verifying(found)}),
+        milliseconds=rounded({**encoded.milliseconds, **_searching(found)}),
     )
 
 
-def _verifying(found: Answer) -> dict[str, float]:
-    """The time of the third stage, if it did anything."""
+def _why_nothing(found: Answer) -> Literal["no-regions", "no-place-allowed", "empty-map"]:
+    """Why there is no match."""
+    if found.blank:
+        return "no-regions"
+    return "no-place-allowed" if found.candidates.places else "empty-map"
+
+
+def _searching(found: Answer) -> dict[str, float]:
+    """The times of the search and of the third stage, if there were any."""
     stage = found.third_stage
-    return {"verify": stage.milliseconds} if stage.state == "verified" else {}
+    times = {} if found.blank else {"search": found.search}
+    return times | ({"verify": stage.milliseconds} if stage.state == "verified" else {})
 
 
 def score_parts(candidates: Candidates, at: int) -> ScoreParts | None:
@@ -141,23 +146,4 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView, note: str | N
         source=estimate.source,
         note=note,
         covariance=estimate.covariance.ravel().tolist(),
-    )
-
-
-def blank_answer(map_: Map, encoded: Encoded) -> QueryAnswer:
-    """The JSON answer to a frame without regions, which cannot be searched for."""
-    return QueryAnswer(
-        verdict="unknown",
-        place=None,
-        probability=None,
-        pose=None,
-        score=None,
-        margin=None,
-        decision=None,
-        threshold=calibration_of(map_, encoded.encoder).threshold,
-        reason="no-regions",
-        matches=[],
-        revision=map_.record.revision,
-        encoder=encoded.encoder.identity,
-        milliseconds=rounded(encoded.milliseconds),
     )

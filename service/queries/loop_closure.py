@@ -13,8 +13,8 @@ from core.belief import view_of
 from core.maps import Map
 from core.maps.selection import Selection
 from core.places import Place, check_place_id
-from core.recognition.recognition import Answer, locate
-from core.recognition.verification import Verifier, Verify
+from core.recognition.question import Question
+from core.recognition.recognition import Answer, answer_to_blank, locate
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.errors.faults import (
@@ -39,7 +39,7 @@ from service.http.uploads import parse_metadata
 from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
 from service.places.place_events import tell_enrolment
 from service.places.schemas import PlaceView
-from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
+from service.queries.answers import StatisticsDep, answer_of, count_answer
 from service.queries.following import follow_answer
 from service.queries.parameters import ClosureParameters
 from service.queries.recent_answers import AskedFrame
@@ -66,9 +66,7 @@ def close_loop(
     map_: Map,
     frame: FrameToEnrol,
     encoded: Encoded,
-    k: int,
-    selection: Selection | None,
-    verify: Verify,
+    question: Question,
 ) -> Closure:
     """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
 
@@ -79,9 +77,6 @@ def close_loop(
 
     Args:
         encoded: the frame, encoded; it has regions.
-        k: how many matches to list.
-        selection: what is known of the place; None: nothing.
-        verify: when the geometry of the best candidates is verified.
 
     Raises:
         PlaceTaken: a place of the frame's id exists, and has another frame.
@@ -94,9 +89,9 @@ def close_loop(
         if known is not None and known != digest:
             raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
-            selection = replace(selection or Selection(), excluded=frame.id)
-        verifier = Verifier(verify, encoded.find_keypoints, frame.fields.camera)
-        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection, [verifier])
+            selection = replace(question.selection or Selection(), excluded=frame.id)
+            question = replace(question, selection=selection)
+        (answer,) = locate(map_, encoded.encoder, [encoded.query(question)])
         if known is not None:
             return Closure(answer, map_.place(frame.id), created=False)
         if answer.judgement.verdict != "unknown" or view_of(encoded.pixels, frame.mask).uniform:
@@ -144,7 +139,7 @@ async def query_or_enrol(
     regions is not enrolled, nor is one that shows hardly anything, as behind a covered lens.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
-    selection = options.selection()
+    question = options.question()
     check_place_id(options.id)
     metadata = {} if options.metadata is None else parse_metadata(options.metadata)
     fields = options.fields(metadata, engine.settings)
@@ -154,10 +149,10 @@ async def query_or_enrol(
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:
-        answer = blank_answer(map_, encoded)
+        answer = answer_of(map_, encoded, answer_to_blank(map_, encoded.encoder, encoded.encoding))
     else:
         frame = FrameToEnrol(options.id, fields, data, mask)
-        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection, options.verify)
+        closure = await in_thread(close_loop, engine, map_, frame, encoded, question)
         answer = answer_of(map_, encoded, closure.answer)
         enrolled = closure.enrolled
         if enrolled is not None:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from core import errors
 from core.frames.masks import Mask
+from core.geometry.keypoints import Keypoints
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Verdict
 from core.maps import Map
-from core.maps.selection import Selection
+from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
-from core.recognition.verification import Verifier, Verify
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -84,15 +85,13 @@ async def locate_in_maps(
     engine: Engine,
     map_ids: Sequence[str],
     frames: Sequence[RigFrame],
-    k: int,
-    selection: Selection | None,
+    question: Question,
     deadline: RequestDeadline,
-    verify: Verify = "never",
 ) -> list[MapReport]:
     """Locate the frames of a rig in each of several maps; call it within ``queue.place``.
 
     Args:
-        verify: when the geometry of the best candidates is verified; that of several frames never is.
+        question: its camera does not count; each frame has its own.  Several frames are never verified.
 
     Returns:
         One report for each map, in the order of the ids.
@@ -109,8 +108,8 @@ async def locate_in_maps(
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
         except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=verify != "never")
-    verifiers: dict[str, Verifier] = {}  # by mask: the keypoints of one frame are the same for every encoder
+    encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=question.verify != "never")
+    finders: dict[str, Callable[[], Keypoints]] = {}  # by mask, the same for every encoder
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
         if isinstance(outcome, Exception):
@@ -120,14 +119,13 @@ async def locate_in_maps(
         failure = next((one for one in outcome if isinstance(one, MAP_ERRORS)), None)
         report = MapReport(map_id, map_, error=failure, frames=tuple(outcome))
         if seen and failure is None:
-            encodings = [one.encoding for one in seen]
             try:
-                looks = None
-                if verify != "never" and len(seen) == 1:
+                queries = [one.query(question) for one in seen]
+                if len(seen) == 1:
                     camera = frames[outcome.index(seen[0])].camera
-                    made = Verifier(verify, seen[0].find_keypoints, camera)
-                    looks = [verifiers.setdefault(_key(seen[0].mask), made)]
-                answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection, looks)
+                    find = finders.setdefault(_key(seen[0].mask), cache(seen[0].find_keypoints))
+                    queries = [Query(seen[0].encoding, replace(question, camera=camera), find)]
+                answer = await in_thread(locate_rig, map_, seen[0].encoder, queries)
                 report = replace(report, answer=answer)
             except MAP_ERRORS as error:
                 report = replace(report, error=error)

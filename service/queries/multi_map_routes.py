@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from core import errors
 from core.judgement.probability import sigmoid
 from core.maps import Map
+from core.recognition.recognition import answer_to_blank
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.errors.faults import (
@@ -32,7 +33,7 @@ from service.http.routing import (
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
-from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
+from service.queries.answers import StatisticsDep, answer_of, count_for_map, estimated_pose
 from service.queries.following import follow_answer
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
@@ -71,13 +72,13 @@ async def query_maps(
     """
     engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
-    selection = options.selection()
+    question = options.question()
     map_ids = options.map_ids()
     if map_ids is None:
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
     with engine.queue.place():
-        reports = await locate_in_maps(engine, map_ids, frames, options.k, selection, deadline, options.verify)
+        reports = await locate_in_maps(engine, map_ids, frames, question, deadline)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
@@ -206,9 +207,8 @@ def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return None
-    if report.answer is None:
-        return report.map_, blank_answer(report.map_, seen)
-    return report.map_, answer_of(report.map_, seen, report.answer)
+    answer = report.answer or answer_to_blank(report.map_, seen.encoder, seen.encoding)
+    return report.map_, answer_of(report.map_, seen, answer)
 
 
 def _tell(

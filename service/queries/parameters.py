@@ -12,6 +12,7 @@ from core.judgement.priors import Box, Constraint, Disc, Facing, Period
 from core.maps.place_filter import Scalar
 from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
 from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
+from core.recognition.question import Question
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
@@ -231,6 +232,10 @@ class QueryParameters(LocateParameters):
     explain: bool = Field(default=False, description="Explain the score of the best match.")
     encoder: EncoderAssertion = None
 
+    def question(self) -> Question:
+        """The question; see ``selection`` for errors."""
+        return Question(self.k, self.selection(), self.verify, self.camera, self.explain)
+
 
 class ClosureParameters(FilterParameters):
     """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
@@ -240,6 +245,10 @@ class ClosureParameters(FilterParameters):
     k: Matches = 5
     verify: Verification = "auto"
     encoder: EncoderAssertion = None
+
+    def question(self) -> Question:
+        """The question; see ``selection`` for errors."""
+        return Question(self.k, self.selection(), self.verify, self.camera)
 
 
 class MultiMapParameters(LocateParameters):
@@ -259,6 +268,10 @@ class MultiMapParameters(LocateParameters):
     )
     k: Matches = 5
     verify: Verification = "auto"
+
+    def question(self) -> Question:
+        """The question about a rig, of whose frames each has a camera of its own; see ``selection`` for errors."""
+        return Question(self.k, self.selection(), self.verify)
 
     def map_ids(self) -> list[str] | None:
         """The ids of the maps that are named; None: all maps.

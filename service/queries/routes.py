@@ -77,15 +77,12 @@ async def query(
     verdict. A place that was never enrolled is `unknown`, which is an answer and no error.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
-    mask = await camera_mask(map_, options.camera)
-    recognized = await engine.recognize(
-        map_, data, deadline, options.k, options.selection(), mask, options.verify, options.camera, options.explain
-    )
+    answered = await engine.ask(map_, data, options.question(), deadline)
     asked = AskedFrame(options.camera)
-    answer = counted_answer(engine, statistics, map_, recognized, asked)
-    if options.explain and recognized.answer is not None and recognized.answer.matches:
-        encoded = await in_thread(scaled_for_drawing, recognized.encoded)
-        answer.explanation = await explain_match(engine, pictures, map_, encoded, recognized.answer, deadline)
+    answer = counted_answer(engine, statistics, map_, answered, asked)
+    if options.explain and answered.answer.matches:
+        encoded = await in_thread(scaled_for_drawing, answered.frame)
+        answer.explanation = await explain_match(engine, pictures, map_, encoded, answered.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     follow_answer(engine, map_, answer, data, asked)
@@ -110,7 +107,7 @@ async def query_batch(
     map_ = await engine.map(map_id)
     files, fields = split_form(await read_many(request, engine.settings))
     options = options.joined(fields)
-    selection = options.selection()
+    question = options.question()
     engine.assert_encoder(map_, options.encoder)
     if options.explain:
         raise InvalidRequest("explain: a batch cannot be explained; send the frame as a single query.")
@@ -126,7 +123,7 @@ async def query_batch(
             [part.data for part in files],
             deadline,
             [mask] * len(files),
-            keep_scaled=options.verify != "never",
+            keep_scaled=question.verify != "never",
         )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:
@@ -137,11 +134,9 @@ async def query_batch(
             except Exception as error:
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
-    recognized = await engine.searches.recognize(
-        map_, list(encoded.values()), options.k, selection, options.verify, options.camera
-    )
+    answered = await engine.searches.answer(map_, list(encoded.values()), question)
     asked = AskedFrame(options.camera)
-    for index, one in zip(encoded, recognized, strict=True):
+    for index, one in zip(encoded, answered, strict=True):
         answer = items[index].answer = counted_answer(engine, statistics, map_, one, asked)
         follow_answer(engine, map_, answer, files[index].data, asked, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}

@@ -8,9 +8,10 @@ from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Run, Step, View, evidence_of, view_of
 from core.maps import Map
+from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
-from service.engine.engine import Engine, camera_mask
+from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.events.schemas import SessionEvent
@@ -60,7 +61,7 @@ async def process_frame(
         InvalidRequest: the frame lacks a parameter that the session needs, or has one that it cannot use.
         WrongEncoder: the map is bound to another encoder than ``options.encoder``.
         UnknownSession, SessionExpired: the session ended while the frame waited.
-        Others: see ``Engine.recognize``.
+        Others: see ``Engine.ask``.
     """
     began = time.monotonic()
     engine.assert_encoder(map_, options.encoder)
@@ -69,19 +70,16 @@ async def process_frame(
         run = await in_thread(_found_run, sessions, map_, session)
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
-        mask = await camera_mask(map_, session.options.camera)
-        verify = session.options.verify
-        recognized = await engine.recognize(
-            map_, data, deadline, options.k, session.selection, mask, verify, session.options.camera
-        )
+        question = Question(options.k, session.selection, session.options.verify, session.options.camera)
+        answered = await engine.ask(map_, data, question, deadline)
         asked = AskedFrame(session.options.camera, session.id, options.frame)
-        single = counted_answer(engine, statistics, map_, recognized, asked)
+        single = counted_answer(engine, statistics, map_, answered, asked)
         try:
-            view = await in_thread(view_of, recognized.encoded.pixels, mask)
+            view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
             while True:
                 try:
                     answer = await in_thread(
-                        _advance, sessions, map_, session, run, recognized.answer, view, single, options, request_id,
+                        _advance, sessions, map_, session, run, answered.answer, view, single, options, request_id,
                         began,
                     )  # fmt: skip
                     break
@@ -156,7 +154,7 @@ def _advance(
     map_: Map,
     session: Session,
     run: Run,
-    answered: Answer | None,
+    answered: Answer,
     view: View,
     single: QueryAnswer,
     options: FrameParameters,
@@ -166,7 +164,7 @@ def _advance(
     """Update the belief, save the session, and answer."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    seen = NOTHING if answered is None else evidence_of(answered, neighborhood_of(map_))
+    seen = NOTHING if answered.blank else evidence_of(answered, neighborhood_of(map_))
     run.advance(seen, step, view, options.odometry_pose())
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)

@@ -21,6 +21,7 @@ from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
 from core.places import check_place_id
+from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
 from service.engine.engine import Engine
@@ -388,9 +389,12 @@ def measure_overlap(engine: Engine, context: JobContext, map_: Map, other: Map) 
         some = chosen[first : first + TOGETHER]
         rows = np.array([place.row for place in some], np.int64)
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
-        encodings = [Encoding(d, cells, _NO_REGIONS, {}) for d, cells in zip(descriptors, local, strict=True)]
+        queries = [
+            Query(Encoding(d, cells, _NO_REGIONS, {}), Question(k=1))
+            for d, cells in zip(descriptors, local, strict=True)
+        ]
         stored = other.transfer.find([place.id for place in some])
-        for place, located in zip(some, locate(map_, encoder, encodings, 1), strict=True):
+        for place, located in zip(some, locate(map_, encoder, queries), strict=True):
             verdicts[located.judgement.verdict] += 1
             if located.judgement.verdict != "recognized" or place.id not in stored:
                 continue

@@ -15,7 +15,7 @@ from service.commands.encoders.models import default_encoder, name_of
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderCatalogue
-    from core.recognition.verification import Verify
+    from core.recognition.question import Verify
     from lab.baselines.system import About, System
 
 

@@ -16,6 +16,7 @@ from torch import nn
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, prepare
 from core.method.encoder import Encoder, Encoding
+from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.storage import Atlas
 from core.threads import each
@@ -93,12 +94,12 @@ def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
 
     The map has so many sample places and lies in a temporary folder until the block ends.
     """
-    query = encoder.encode(sample_frame(0))
+    query = Query(encoder.encode(sample_frame(0)), Question(MATCHES))
     with tempfile.TemporaryDirectory() as folder:
         fill_map(Path(folder), "sample", encoder, places)
         atlas = Atlas(Path(folder))
         try:
             map_ = atlas.get("sample")
-            yield lambda: locate(map_, encoder, [query], MATCHES)
+            yield lambda: locate(map_, encoder, [query])
         finally:
             atlas.close()

@@ -25,6 +25,7 @@ from core.milvus.snapshot import SHORTLIST
 from core.milvus.store import MilvusStore
 from core.places import Neighborhood, Pose
 from core.recognition import enrol, recognize
+from core.recognition.question import Question
 from core.storage import Atlas
 from tests.core.milvus.servers import Servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of, stored_of
@@ -99,7 +100,7 @@ def test_a_map_answers_as_one_in_a_data_directory_does(store: MilvusStore, tmp_p
             enrol(map_, f"p{number}", jpeg(number), encoder)
     for number in (3, 5, 99):
         picture = encode_png(seen_again(scene(number)))
-        here, there = (recognize(map_, picture, encoder, k=8, verify="always") for map_ in maps)
+        here, there = (recognize(map_, picture, encoder, Question(k=8, verify="always")) for map_ in maps)
         assert there.judgement.verdict == here.judgement.verdict
         assert [place.id for _, place in there.matches] == [place.id for _, place in here.matches]
         assert np.allclose([score for score, _ in there.matches], [score for score, _ in here.matches], atol=1e-5)

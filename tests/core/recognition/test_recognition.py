@@ -18,6 +18,7 @@ from core.maps import Enrolment, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question
 from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
 from core.recognition.stages import likeness, rank_places
 from core.storage import Atlas, Map, Snapshot
@@ -78,7 +79,7 @@ def test_neighbours_that_fill_the_shortlist_do_not_hide_rivals(
         time.sleep(0.01)
     rows, _ = crowded.snapshot().search(query.descriptor)
     assert len(rows) == 20 and {place and place.id[:5] for place in crowded.places_at(rows.tolist())} <= {"p3", "again"}
-    (found,) = locate(crowded, encoder, [query], 5)
+    (found,) = locate(crowded, encoder, [Query(query)])
     assert found.judgement.rival is not None and found.judgement.margin is not None
     others = [place for place in both_stages(encoder, seen, query) if place != "p3"]
     assert found.candidates.rows[found.judgement.rival] == int(others[0][1:])
@@ -105,7 +106,7 @@ def assert_matches(matches: list[tuple[float, str]], expected: dict[str, float])
 
 
 def found(lab: Map, encoder: Encoder, query: Encoding, k: int = PLACES) -> list[tuple[float, str]]:
-    (located,) = locate(lab, encoder, [query], k)
+    (located,) = locate(lab, encoder, [Query(query, Question(k))])
     assert located.search > 0
     assert located.judgement.score == (located.matches[0][0] if located.matches else None)
     return [(score, place.id) for score, place in located.matches]
@@ -122,7 +123,9 @@ def test_only_the_best_places_gain_by_the_second_stage(
 
 def test_queries_together_have_the_same_answers_as_alone(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
     queries = [encoder.encode(seen_again(scene(seed))) for seed in (1, 5, 6)]
-    for one, located in zip(queries, locate(lab, encoder, queries, PLACES), strict=True):
+    for one, located in zip(
+        queries, locate(lab, encoder, [Query(query, Question(PLACES)) for query in queries]), strict=True
+    ):
         matches = [(score, place.id) for score, place in located.matches]
         assert_matches(matches, both_stages(encoder, seen, one))
 
@@ -209,24 +212,26 @@ def test_an_empty_map(lab: Map, encoder: Encoder, query: Encoding) -> None:
 def test_a_picture_is_enrolled_and_recognized(lab: Map, encoder: Encoder) -> None:
     place = enrol(lab, "here", jpeg(40), encoder, PlaceFields(pose=Pose(x=500, y=0), metadata={"floor": 1}))
     assert place.id == "here" and lab.place("here") == place and lab.count_places() == PLACES + 1
-    answer = recognize(lab, jpeg(40), encoder, k=2)
+    answer = recognize(lab, jpeg(40), encoder, Question(k=2))
     assert answer.matches[0][1] == place and len(answer.matches) == 2
     assert answer.place == (place if answer.judgement.verdict == "recognized" else None)
-    (located,) = locate(lab, encoder, [encoder.encode(decode(jpeg(40)))], 2)
+    (located,) = locate(lab, encoder, [Query(encoder.encode(decode(jpeg(40))), Question(2))])
     assert located.judgement == answer.judgement and located.matches == answer.matches
 
 
 def test_a_blank_picture_shows_no_place(lab: Map, encoder: Encoder) -> None:
     blank = encode_png(np.zeros((64, 64, 3), np.uint8))
-    for attempt in (lambda: recognize(lab, blank, encoder), lambda: enrol(lab, "blank", blank, encoder)):
-        with pytest.raises(NoRegions, match="blank"):
-            attempt()
+    answer = recognize(lab, blank, encoder)
+    assert answer.blank and answer.judgement.verdict == "unknown" and answer.matches == []
+    assert (answer.place, answer.probability, answer.pose) == (None, None, None)
+    with pytest.raises(NoRegions, match="blank"):
+        enrol(lab, "blank", blank, encoder)
     assert lab.count_places() == PLACES
 
 
 def test_a_camera_must_be_known(lab: Map, encoder: Encoder) -> None:
     with pytest.raises(UnknownCamera):
-        recognize(lab, jpeg(40), encoder, camera="rear")
+        recognize(lab, jpeg(40), encoder, Question(camera="rear"))
     with pytest.raises(UnknownCamera):
         enrol(lab, "here", jpeg(40), encoder, PlaceFields(camera="rear"))
 

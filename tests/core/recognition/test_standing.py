@@ -16,6 +16,7 @@ from core.judgement.verdict import Calibration
 from core.maps import Enrolment, MapSettings
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
+from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
 from core.storage import Atlas, Map
@@ -90,7 +91,7 @@ def with_stop(walk: Sequence[Encoding], looks: Sequence[Encoding]) -> list[tuple
 
 
 def ask(map_: Map, encoder: Encoder, encoding: Encoding) -> Answer:
-    (answer,) = locate(map_, encoder, [encoding], 1)
+    (answer,) = locate(map_, encoder, [Query(encoding, Question(k=1))])
     return answer
 
 

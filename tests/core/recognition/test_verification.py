@@ -19,8 +19,9 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.places import PlaceFields
+from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
-from core.recognition.verification import CANDIDATES, Verifier, Verify
+from core.recognition.verification import CANDIDATES
 from core.storage import Atlas, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -57,14 +58,14 @@ def ask(map_: Map, encoder: Encoder, seed: int, verify: Verify, looked: list[int
             looked.append(seed)
         return find_keypoints(packaged_xfeat(), pixels)
 
-    (answer,) = locate(map_, encoder, [encoder.encode(pixels)], PLACES, None, [Verifier(verify, find)])
+    (answer,) = locate(map_, encoder, [Query(encoder.encode(pixels), Question(PLACES, verify=verify), find)])
     return answer
 
 
 def test_never_is_the_answer_of_two_stages(lab: Map, encoder: Encoder) -> None:
     looked: list[int] = []
     asked = ask(lab, encoder, 3, "never", looked)
-    (plain,) = locate(lab, encoder, [encoder.encode(seen_again(scene(3)))], 5)
+    (plain,) = locate(lab, encoder, [Query(encoder.encode(seen_again(scene(3))))])
     assert asked.judgement == plain.judgement and not looked
     assert asked.third_stage.state == plain.third_stage.state == "never"
     assert asked.candidates.geometry is None and asked.judgement.evidence is None
@@ -125,21 +126,21 @@ def test_a_frame_with_hardly_any_keypoints_is_judged_by_its_scores(lab: Map, enc
     pixels = seen_again(scene(3))
     few = find_keypoints(packaged_xfeat(), pixels)
     few = Keypoints(few.width, few.height, few.positions[:7].copy(), few.descriptors[:7].copy())
-    (answer,) = locate(lab, encoder, [encoder.encode(pixels)], 5, None, [Verifier("always", lambda: few)])
+    (answer,) = locate(lab, encoder, [Query(encoder.encode(pixels), Question(verify="always"), lambda: few)])
     assert answer.third_stage.state == "no-keypoints"
     assert answer.judgement == ask(lab, encoder, 3, "never").judgement
 
 
 def test_recognize_verifies_by_itself(lab: Map, encoder: Encoder, tmp_path: Path) -> None:
-    answer = recognize(lab, jpeg(5), encoder, verify="always")
+    answer = recognize(lab, jpeg(5), encoder, Question(verify="always"))
     assert answer.third_stage.state == "verified" and answer.place is not None and answer.place.id == "p5"
-    assert recognize(lab, jpeg(5), encoder, verify="never").third_stage.state == "never"
+    assert recognize(lab, jpeg(5), encoder, Question(verify="never")).third_stage.state == "never"
 
 
 def test_twins_are_ambiguous_however_well_they_fit(atlas: Atlas, encoder: Encoder) -> None:
     twins = atlas.create("twins", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for place in ("here", "there"):
         enrol(twins, place, jpeg(5), encoder)
-    answer = recognize(twins, jpeg(5), encoder, verify="always")
+    answer = recognize(twins, jpeg(5), encoder, Question(verify="always"))
     assert answer.judgement.verdict == "ambiguous" and answer.judgement.evidence is not None
     assert {place for group in answer.rivals for place in group.places} <= {"here", "there"} and answer.rivals

@@ -13,8 +13,9 @@ from core.judgement.geometry import WEIGHT
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.places import PlaceFields
+from core.recognition.question import Question, Verify
 from core.recognition.recognition import enrol, recognize
-from core.recognition.verification import CANDIDATES, Verify
+from core.recognition.verification import CANDIDATES
 from core.storage import Atlas
 from lab.baselines.encoders import EncoderSystem
 from lab.baselines.registry import build, systems
@@ -108,7 +109,7 @@ def test_a_default_encoder_is_judged_by_what_the_service_answers(
     lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for number, picture in enumerate(places):
         enrol(lab, f"p{number}", picture, encoder, PlaceFields(sequence="walk"))
-    answers = [recognize(lab, query, encoder, verify=verify) for query in queries]
+    answers = [recognize(lab, query, encoder, Question(verify=verify)) for query in queries]
     described = [[system.describe(decode(one)) for one in pictures] for pictures in (places, queries)]
     scores = system.index(described[0]).score(described[1])
     for row, answer in zip(scores, answers, strict=True):

@@ -15,6 +15,7 @@ from core.frames.images import Limits, decode
 from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.recognition.question import Question
 from core.storage import Map
 from service.engine import searches
 from service.engine.encoder_threads import EncoderThreads
@@ -44,11 +45,11 @@ def encoded(encoder: Encoder, pixels: Pixels) -> Encoded:
 
 @pytest.mark.parametrize("seed", range(3))
 async def test_a_search_ahead_has_the_answers_of_an_ordinary_search(map_: Map, encoder: Encoder, seed: int) -> None:
-    search = search_ahead(map_, 3, None)
+    search = search_ahead(map_, Question(3))
     assert search is not None
     shown = encoded(encoder, seen_again(scene(seed), seed))
     ahead = search(shown)
-    (expected,) = await Searches().locate(map_, encoder, [shown.encoding], 3)
+    (expected,) = await Searches().locate(map_, encoder, [shown.query(Question(3))])
     assert ahead is not None and ahead.judgement == expected.judgement
     assert [(score, place.id) for score, place in ahead.matches] == [
         (score, place.id) for score, place in expected.matches
@@ -60,14 +61,14 @@ async def test_a_search_ahead_has_the_answers_of_an_ordinary_search(map_: Map, e
 def test_searches_that_may_take_long_are_not_done_ahead(
     map_: Map, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert search_ahead(map_, 3, QueryParameters(sequences="monday").selection()) is None
-    search, now = search_ahead(map_, 3, None), map_.snapshot()
+    assert search_ahead(map_, QueryParameters(sequences="monday").question()) is None
+    search, now = search_ahead(map_, Question(3)), map_.snapshot()
     assert search is not None
     with monkeypatch.context() as patched:
         patched.setattr(map_, "_snapshot", replace(now, holds=False))
         assert search(encoded(encoder, scene(0))) is None, "what is on the disk may take long"
     monkeypatch.setattr(searches, "MOST_AHEAD", 3)
-    assert search_ahead(map_, 3, None) is None
+    assert search_ahead(map_, Question(3)) is None
 
 
 # Where frames are encoded
