@@ -46,7 +46,7 @@ from service.maps.schemas import (
     ReviewChanges,
 )
 from service.queries.answers import StatisticsDep
-from service.queries.recent_answers import MapKey
+from service.queries.given_answers import MapKey
 from service.queries.statistics import QueryStatistics, VerdictCounts, map_key
 
 router = APIRouter(

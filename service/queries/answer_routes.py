@@ -16,7 +16,7 @@ from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, MapId, PlaceId, PrincipalDep, single_values
 from service.http.schemas import Parameters
 from service.queries.answers import StatisticsDep
-from service.queries.recent_answers import MOST_OF_MAP, RecentAnswer
+from service.queries.given_answers import MOST_OF_MAP, GivenAnswer
 from service.queries.schemas import EstimatedPose
 from service.queries.statistics import HourCount, map_key
 
@@ -80,7 +80,7 @@ class RecentAnswerView(BaseModel):
     client: str | None
 
     @classmethod
-    def fields_of(cls, answer: RecentAnswer, principal: Principal) -> dict[str, Any]:
+    def fields_of(cls, answer: GivenAnswer, principal: Principal) -> dict[str, Any]:
         """The fields of an answer, as a caller may see them."""
         asker, sees_all = answer.asker, principal.role == "admin"
         return {
@@ -137,7 +137,7 @@ class LatestParameters(Parameters):
     camera: str | None = Field(default=None, max_length=128, description="Only answers to frames of this camera.")
     session: str | None = Field(default=None, max_length=128, description="Only answers to frames of this session.")
 
-    def wants(self, answer: RecentAnswer) -> bool:
+    def wants(self, answer: GivenAnswer) -> bool:
         """Whether an answer is to be listed."""
         frame = answer.frame
         return self.camera in (None, frame.camera) and self.session in (None, frame.session)
@@ -148,7 +148,7 @@ class AnswerParameters(LatestParameters):
 
     verdict: Verdict | None = Field(default=None, description="Only answers with this verdict.")
 
-    def wants(self, answer: RecentAnswer) -> bool:
+    def wants(self, answer: GivenAnswer) -> bool:
         """Whether an answer is to be listed."""
         return self.verdict in (None, answer.verdict) and super().wants(answer)
 

@@ -1,58 +1,23 @@
-"""The JSON answer to a query, from the answer of :mod:`core.recognition`; answers are counted for the metrics."""
+"""The JSON answer to a query, from the answer of :mod:`core.recognition`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Annotated, Literal
 
 from fastapi import Depends
 
-from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
 from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import Candidates
 from service.engine.encoders import Encoded
-from service.engine.engine import Engine
-from service.engine.searches import Answered
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
-from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup, ScoreParts, VerificationView
-from service.queries.statistics import QueryStatistics, map_key
+from service.queries.statistics import QueryStatistics
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
-
-
-def counted_answer(
-    engine: Engine, statistics: QueryStatistics, map_: Map, answered: Answered, frame: AskedFrame
-) -> QueryAnswer:
-    """The JSON answer to a frame; it is counted in the service's metrics and in the statistics of the map."""
-    answer = answer_of(map_, answered.frame, answered.answer)
-    count_answer(engine, statistics, map_, answer, frame)
-    return answer
-
-
-def count_answer(
-    engine: Engine, statistics: QueryStatistics, map_: Map, answer: QueryAnswer, frame: AskedFrame
-) -> None:
-    """Count an answer in the service's metrics and in the statistics of its map."""
-    engine.metrics.observe_answer(map_.record.id, answer.verdict, answer.score)
-    if "search" in answer.milliseconds:
-        engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
-    count_for_map(engine, statistics, map_.record.id, answer, frame)
-
-
-def count_for_map(
-    engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer, frame: AskedFrame
-) -> None:
-    """Count an answer in the statistics of its map, and keep it for a while, if the map still exists."""
-    with suppress(PlacerecError):  # the map was deleted in the meantime
-        key = map_key(engine.maps.find(map_id))
-        best = answer.matches[0].place.id if answer.matches else None
-        statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
-        statistics.recent.add(key, answer, frame)
 
 
 def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:

@@ -39,10 +39,10 @@ from service.http.uploads import parse_metadata
 from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
 from service.places.place_events import tell_enrolment
 from service.places.schemas import PlaceView
-from service.queries.answers import StatisticsDep, answer_of, count_answer
+from service.queries.answers import StatisticsDep, answer_of
 from service.queries.following import follow_answer
+from service.queries.given_answers import AskedFrame
 from service.queries.parameters import ClosureParameters
-from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import ClosureAnswer
 from service.worker_threads import in_thread
 
@@ -157,11 +157,9 @@ async def query_or_enrol(
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"
-    asked = AskedFrame(options.camera)
-    count_answer(engine, statistics, map_, answer, asked)
     response.status_code = 201 if change == "created" else 200
     request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
-    follow_answer(engine, map_, answer, data, asked)
+    follow_answer(engine, statistics, map_, answer, data, AskedFrame(options.camera))
     shown = None if enrolled is None else PlaceView.of(enrolled)
     return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)

@@ -10,7 +10,6 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
-from core.maps import Map
 from core.recognition.recognition import answer_to_blank
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
@@ -33,13 +32,12 @@ from service.http.routing import (
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
-from service.queries.answers import StatisticsDep, answer_of, count_for_map, estimated_pose
+from service.queries.answers import StatisticsDep, answer_of, estimated_pose
 from service.queries.following import follow_answer
+from service.queries.given_answers import AskedFrame
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
-from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
-from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -82,17 +80,21 @@ async def query_maps(
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
-    answers = [_map_answer(request, engine, report) for report in reports]
-    asked = AskedFrame(frames[0].camera)
-    for report in reports:
-        # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
-        if report is recognized or len(reports) == 1:
-            _count_for_health(engine, statistics, report, asked)
+    wholes = [_whole_answer(report) for report in reports]
+    answers = [_map_answer(request, report, whole) for report, whole in zip(reports, wholes, strict=True)]
+    asked, data = AskedFrame(frames[0].camera), frames[0].data
     total = rounded({"total": milliseconds_since(started(request))})
-    for report in reports:
+    for report, whole in zip(reports, wholes, strict=True):
+        if report.map_ is None or whole is None:
+            continue
+        # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
+        counts = report is recognized or len(reports) == 1
         # A frame whose place is recognized is in no doubt for the maps that do not know the place.
         in_doubt_here = together.verdict != "recognized" or report is recognized
-        _tell(engine, report, frames[0].data, asked, total, in_doubt_here)
+        follow_answer(
+            engine, statistics, report.map_, whole, data, asked,
+            milliseconds=total, count=counts, review=in_doubt_here,
+        )  # fmt: skip
     matches = _matches(reports, options.k)
     place = pose = None
     if recognized is not None and recognized.answer is not None:
@@ -167,19 +169,14 @@ def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequen
     return found
 
 
-def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswer:
+def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None) -> MapAnswer:
+    """What a map answered, of which ``answer`` is the whole; None if it did not."""
     encoder = None if report.map_ is None else report.map_.record.encoder
     if report.error is not None:
         problem = request_problem(request, report.error)
         return MapAnswer(map=report.map_id, status=problem.status, encoder=encoder, problem=problem)
-    if report.answer is None:
-        engine.metrics.observe_answer(report.map_id, "unknown", None)
+    if report.answer is None or answer is None:
         return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason="no-regions", encoder=encoder)
-    seen = next(one for one in report.frames if isinstance(one, Encoded) and len(one.encoding.regions))
-    assert report.map_ is not None
-    answer = answer_of(report.map_, seen, report.answer)
-    engine.metrics.observe_answer(report.map_id, answer.verdict, answer.score)
-    engine.metrics.searches.observe(report.answer.search / 1e3)
     return MapAnswer(
         map=report.map_id,
         status=200,
@@ -196,29 +193,13 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
     )
 
 
-def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport, asked: AskedFrame) -> None:
-    """Count an answer in the statistics of its map."""
-    if (found := _whole_answer(report)) is not None:
-        count_for_map(engine, statistics, report.map_id, found[1], asked)
-
-
-def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
-    """The map of a report, and its answer as one query of that map would give it; None if it did not answer."""
-    seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
+def _whole_answer(report: MapReport) -> QueryAnswer | None:
+    """The answer of a report as one query of its map would give it; None if the map did not answer."""
+    frames = [one for one in report.frames if isinstance(one, Encoded)]
+    seen = next((one for one in frames if len(one.encoding.regions)), frames[0] if frames else None)
     if report.map_ is None or report.error is not None or seen is None:
         return None
-    answer = report.answer or answer_to_blank(report.map_, seen.encoder, seen.encoding)
-    return report.map_, answer_of(report.map_, seen, answer)
-
-
-def _tell(
-    engine: Engine, report: MapReport, frame: bytes, asked: AskedFrame, milliseconds: dict[str, float], review: bool
-) -> None:
-    """Tell the listeners of a map how it answered, and keep the frame for review; of a rig it is the first frame."""
-    keeps = review and report.map_ is not None and report.map_.record.review is not None
-    if (keeps or engine.events.heard(report.map_id)) and (found := _whole_answer(report)) is not None:
-        map_, answer = found
-        follow_answer(engine, map_, answer, frame, asked, milliseconds=milliseconds, review=review)
+    return answer_of(report.map_, seen, report.answer or answer_to_blank(report.map_, seen.encoder, seen.encoding))
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

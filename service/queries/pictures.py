@@ -15,7 +15,7 @@ import numpy as np
 from core.frames.images import encode_png
 from core.frames.preprocessing import Pixels
 from service.errors.faults import UnknownExplanation
-from service.queries.recent_answers import MapKey
+from service.queries.given_answers import MapKey
 
 HEIGHT = 360
 """The height of each frame in a picture, in pixels."""

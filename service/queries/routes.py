@@ -33,12 +33,12 @@ from service.http.routing import (
 )
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
-from service.queries.answers import StatisticsDep, counted_answer
+from service.queries.answers import StatisticsDep, answer_of
 from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.following import follow_answer
+from service.queries.given_answers import AskedFrame
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
-from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
 from service.queries.statistics import map_key
 from service.worker_threads import in_thread
@@ -78,14 +78,13 @@ async def query(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     answered = await engine.ask(map_, data, options.question(), deadline)
-    asked = AskedFrame(options.camera)
-    answer = counted_answer(engine, statistics, map_, answered, asked)
+    answer = answer_of(map_, answered.frame, answered.answer)
     if options.explain and answered.answer.matches:
         encoded = await in_thread(scaled_for_drawing, answered.frame)
         answer.explanation = await explain_match(engine, pictures, map_, encoded, answered.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
-    follow_answer(engine, map_, answer, data, asked)
+    follow_answer(engine, statistics, map_, answer, data, AskedFrame(options.camera))
     return answer
 
 
@@ -137,8 +136,8 @@ async def query_batch(
     answered = await engine.searches.answer(map_, list(encoded.values()), question)
     asked = AskedFrame(options.camera)
     for index, one in zip(encoded, answered, strict=True):
-        answer = items[index].answer = counted_answer(engine, statistics, map_, one, asked)
-        follow_answer(engine, map_, answer, files[index].data, asked, file=files[index].name)
+        answer = items[index].answer = answer_of(map_, one.frame, one.answer)
+        follow_answer(engine, statistics, map_, answer, files[index].data, asked, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)

@@ -27,7 +27,7 @@ from core.maps import Map
 from core.places import Timestamp
 from core.upkeep.drift import SCORE_BINS, Week
 from service.engine.engine import Engine
-from service.queries.recent_answers import MapKey, RecentAnswers
+from service.queries.given_answers import MapKey, RecentAnswers
 
 FILE = "statistics.sqlite"
 

@@ -17,9 +17,9 @@ from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.events.schemas import SessionEvent
 from service.http.routing import rounded
 from service.places.schemas import PlaceView
-from service.queries.answers import counted_answer
+from service.queries.answers import answer_of
 from service.queries.following import follow_answer
-from service.queries.recent_answers import AskedFrame
+from service.queries.given_answers import AskedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -73,7 +73,7 @@ async def process_frame(
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
         asked = AskedFrame(session.options.camera, session.id, options.frame)
-        single = counted_answer(engine, statistics, map_, answered, asked)
+        single = answer_of(map_, answered.frame, answered.answer)
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
             while True:
@@ -91,7 +91,7 @@ async def process_frame(
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
     total = {"total": answer.milliseconds["total"]}
-    follow_answer(engine, map_, single, data, asked, milliseconds=total)
+    follow_answer(engine, statistics, map_, single, data, asked, milliseconds=total)
     tell_belief(engine, map_, session, answer)
     return answer
 

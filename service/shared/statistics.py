@@ -18,8 +18,7 @@ from pydantic import TypeAdapter
 
 from core.upkeep.drift import Week
 from service.engine.engine import Engine
-from service.queries.recent_answers import MOST, MOST_OF_MAP, AskedFrame, MapKey, RecentAnswer, RecentAnswers
-from service.queries.schemas import QueryAnswer
+from service.queries.given_answers import MOST, MOST_OF_MAP, GivenAnswer, MapKey, RecentAnswers
 from service.queries.statistics import (
     HOURS,
     MOST_WEEKS,
@@ -37,7 +36,7 @@ from service.shared.database import SharedDatabase
 LONGEST_SECONDS = 2.0
 """Counts and answers are added to the common ones at least so often."""
 
-_ANSWER = TypeAdapter(RecentAnswer)
+_ANSWER = TypeAdapter(GivenAnswer)
 
 
 class SharedAnswers(RecentAnswers):
@@ -46,13 +45,13 @@ class SharedAnswers(RecentAnswers):
     def __init__(self, database: SharedDatabase) -> None:
         super().__init__()
         self._database = database
-        self._waiting: deque[tuple[MapKey, RecentAnswer]] = deque(maxlen=MOST)
+        self._waiting: deque[tuple[MapKey, GivenAnswer]] = deque(maxlen=MOST)
         self._writing = threading.Lock()
 
-    def add(self, key: MapKey, answer: QueryAnswer, frame: AskedFrame) -> None:
-        self._waiting.append((key, RecentAnswer.of(answer, frame)))
+    def add(self, key: MapKey, answer: GivenAnswer) -> None:
+        self._waiting.append((key, answer))
 
-    def of_map(self, key: MapKey) -> list[RecentAnswer]:
+    def of_map(self, key: MapKey) -> list[GivenAnswer]:
         """The answers of a map, the latest first.
 
         Raises:

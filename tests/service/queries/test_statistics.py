@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from core.upkeep.drift import Week
 from service.queries import statistics
-from service.queries.recent_answers import MapKey
+from service.queries.given_answers import MapKey
 from service.queries.statistics import (
     _LATER,
     _TABLES,

@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from service.queries.recent_answers import MOST_OF_MAP, AskedFrame
+from service.queries.given_answers import MOST_OF_MAP, AskedFrame, GivenAnswer
 from service.shared.database import SharedDatabase
 from service.shared.statistics import SharedAnswers, SharedStatistics
 from tests.service.queries import test_statistics as embedded
-from tests.service.queries.test_recent_answers import ANSWER
+from tests.service.queries.test_given_answers import ANSWER
 from tests.service.queries.test_statistics import Maps
 from tests.service.scenes import blank, encoded, jpeg
 from tests.service.server import Server
@@ -135,8 +135,8 @@ def _counted(server: Server, count: int) -> bool:
 def test_the_latest_answers_are_bounded(database: SharedDatabase) -> None:
     one, other = SharedAnswers(database), SharedAnswers(database)
     for number in range(MOST_OF_MAP + 20):
-        (one, other)[number % 2].add(("lab", "2026"), ANSWER, AskedFrame(number=number))
-    other.add(("hall", "2026"), ANSWER, AskedFrame("front", "s-1", 7))
+        (one, other)[number % 2].add(("lab", "2026"), GivenAnswer.of(ANSWER, AskedFrame(number=number)))
+    other.add(("hall", "2026"), GivenAnswer.of(ANSWER, AskedFrame("front", "s-1", 7)))
     other.flush()
     kept = one.of_map(("lab", "2026"))
     assert len(kept) == MOST_OF_MAP and {answer.reason for answer in kept} == {ANSWER.reason}

@@ -8,8 +8,8 @@ import httpx
 import pytest
 
 from service.access.keys import KeyStore
-from service.queries import recent_answers
-from service.queries.recent_answers import AskedFrame, MapKey, RecentAnswers
+from service.queries import given_answers
+from service.queries.given_answers import AskedFrame, GivenAnswer, MapKey, RecentAnswers
 from service.queries.schemas import QueryAnswer
 from tests.service.scenes import blank, encoded, jpeg, stranger
 from tests.service.server import Server, assert_problem
@@ -139,18 +139,18 @@ ANSWER = QueryAnswer(
 
 
 def test_the_answers_of_all_maps_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recent_answers, "MOST_OF_MAP", 10)
-    monkeypatch.setattr(recent_answers, "MOST", 25)
+    monkeypatch.setattr(given_answers, "MOST_OF_MAP", 10)
+    monkeypatch.setattr(given_answers, "MOST", 25)
     kept = RecentAnswers()
     maps: list[MapKey] = [(f"map-{number}", "then") for number in range(4)]
     for one in (maps[0], maps[1], maps[0]):
         for _ in range(20):
-            kept.add(one, ANSWER, AskedFrame())
+            kept.add(one, GivenAnswer.of(ANSWER, AskedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [10, 10, 0, 0]
     for _ in range(6):
-        kept.add(maps[2], ANSWER, AskedFrame())
+        kept.add(maps[2], GivenAnswer.of(ANSWER, AskedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [10, 0, 6, 0], "those of the map asked least recently went"
     for _ in range(100):
-        kept.add(maps[3], ANSWER, AskedFrame())
+        kept.add(maps[3], GivenAnswer.of(ANSWER, AskedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [0, 0, 6, 10]
     assert kept._count == sum(len(kept.of_map(one)) for one in maps)

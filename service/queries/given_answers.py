@@ -1,4 +1,4 @@
-"""The latest answers of each map, in memory: what an operator looks through to see how queries fare."""
+"""Answers as they were given: what is told, counted, listed and kept for review; and the latest ones of each map."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from core.judgement.verdict import Verdict
 from service.access.audit import ASKER, Asker
+from service.events.schemas import QueryEvent
 from service.queries.schemas import EstimatedPose, QueryAnswer
 
 MOST_OF_MAP = 500
@@ -37,12 +38,13 @@ class AskedFrame(NamedTuple):
     number: int | None = None
 
 
-class RecentAnswer(NamedTuple):
-    """What is kept of an answer: no frame and no metadata, whose size nobody bounds.
+class GivenAnswer(NamedTuple):
+    """An answer without the frame and without metadata, whose size nobody bounds.
 
     frame: whose frame it was.
     matches: ids and scores of the best matches, best first.
-    milliseconds: of the answer; its request adds the total when it is done.
+    milliseconds: of the answer and of its request.
+    revision: of the map that answered.
     asker: who asked, with which request.
     """
 
@@ -59,11 +61,16 @@ class RecentAnswer(NamedTuple):
     reason: str | None
     matches: tuple[tuple[str, float], ...]
     milliseconds: Mapping[str, float]
+    revision: int | None
     asker: Asker
 
     @classmethod
-    def of(cls, answer: QueryAnswer, frame: AskedFrame) -> RecentAnswer:
-        """What is kept of an answer that is being given now."""
+    def of(cls, answer: QueryAnswer, frame: AskedFrame, milliseconds: Mapping[str, float] | None = None) -> GivenAnswer:
+        """An answer that is being given now.
+
+        Args:
+            milliseconds: of the whole request, where the answer does not say it.
+        """
         return cls(
             datetime.now(UTC),
             frame,
@@ -77,26 +84,67 @@ class RecentAnswer(NamedTuple):
             answer.threshold,
             answer.reason,
             tuple((match.place.id, match.score) for match in answer.matches[:MOST_MATCHES]),
-            answer.milliseconds,
+            {**answer.milliseconds, **(milliseconds or {})},
+            answer.revision,
             ASKER.get(),
         )
+
+    @property
+    def best(self) -> str | None:
+        """The id of the best match, with any verdict."""
+        return self.matches[0][0] if self.matches else None
+
+    def event(self, map_id: str, file: str | None = None, explanation: str | None = None) -> QueryEvent:
+        """What the listeners of the map are told.
+
+        Args:
+            file: the name of the file part that the frame was.
+            explanation: the path of the picture that explains the answer.
+        """
+        same = {name: getattr(self, name) for name in _SAME}
+        return QueryEvent(
+            **same,
+            map=map_id,
+            request_id=self.asker.request_id,
+            key=self.asker.principal if self.asker.key is not None else None,
+            operation=self.asker.operation,
+            pose=None if self.pose is None else self.pose.model_dump(exclude_none=True),
+            camera=self.frame.camera,
+            session=self.frame.session,
+            frame=self.frame.number,
+            file=file,
+            milliseconds=dict(self.milliseconds),
+            explanation=explanation,
+        )
+
+    def for_review(self, event: QueryEvent) -> dict[str, Any]:
+        """What is kept of the answer with a frame for review, as JSON values."""
+        told = event.model_dump(mode="json", include=REVIEWED)
+        return told | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
 
     def rank_of(self, place_id: str) -> int | None:
         """The rank of a place among the matches; None if it is not among those that are kept."""
         return next((rank for rank, (found, _) in enumerate(self.matches, start=1) if found == place_id), None)
 
 
+_SAME = ("at", "verdict", "probability", "place", "best", "score", "decision", "threshold", "reason", "revision")
+
+REVIEWED = {
+    "request_id", "key", "operation", "verdict", "probability", "best", "score", "decision", "threshold", "reason",
+    "camera", "session", "frame", "file", "revision",
+}  # fmt: skip
+
+
 class RecentAnswers:
     """The latest answers of each map, bounded in number.  Any thread may use it."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[MapKey, deque[RecentAnswer]] = OrderedDict()
+        self._kept: OrderedDict[MapKey, deque[GivenAnswer]] = OrderedDict()
         self._count = 0
         self._lock = threading.Lock()
 
-    def add(self, key: MapKey, answer: QueryAnswer, frame: AskedFrame) -> None:
+    def add(self, key: MapKey, answer: GivenAnswer) -> None:
         """Keep an answer of a map."""
-        made = RecentAnswer.of(answer, frame)
         with self._lock:
             of_map = self._kept.get(key)
             if of_map is None:
@@ -104,11 +152,11 @@ class RecentAnswers:
             else:
                 self._kept.move_to_end(key)
             self._count += len(of_map) < MOST_OF_MAP
-            of_map.append(made)
+            of_map.append(answer)
             while self._count > MOST:
                 self._count -= len(self._kept.popitem(last=False)[1])
 
-    def of_map(self, key: MapKey) -> list[RecentAnswer]:
+    def of_map(self, key: MapKey) -> list[GivenAnswer]:
         """The answers of a map, the latest first."""
         with self._lock:
             return list(reversed(self._kept.get(key, ())))
