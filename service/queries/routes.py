@@ -24,7 +24,6 @@ from service.http.routing import (
     EngineDep,
     FromState,
     MapId,
-    QuickRoute,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -46,7 +45,6 @@ from service.worker_threads import in_thread
 router = APIRouter(
     prefix="/v1/maps/{map}",
     tags=["queries"],
-    route_class=QuickRoute,
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
         errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
 ROW = re.compile(r"^\| `((?:core|service)/[\w/]+\.py)` \| (.+) \|$", re.MULTILINE)
-MOST_FILES = 25
+MOST_FILES = 30
 
 
 def rows_of(heading: str) -> list[tuple[str, str]]:

@@ -17,8 +17,8 @@ class AgreementDefinition(Model):
     the mean squared cosine over all cells makes up ``share`` of their score, the first stage's score the rest. They
     are the first of the ranking or, if more places are ``screened``, the most promising of these. ``centred`` is the
     share of its mean over the frame that each value of a cell loses before it is divided by its deviation over the
-    frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own
-    (``lab.training.projections``), others those of the regions. Encoders of 0.1.0 have none of the three.
+    frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own, others those of the
+    regions. Encoders of 0.1.0 have none of the three.
     """
 
     layers: list[str]
