@@ -26,7 +26,7 @@ from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
 from service.shared.keys import SharedKeys
 from service.shared.rates import SharedBuckets
-from service.shared.replica import Replica
+from service.shared.replica import ServiceReplica
 from service.shared.sessions import SessionTable
 from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
@@ -68,7 +68,7 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
 
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
-    replica = Replica(database, folder)
+    replica = ServiceReplica(database, folder)
     shared = SharedJobs(replica, shared_maps=True)
     found = []
     for jobs in (Jobs(folder), shared):
@@ -129,7 +129,7 @@ def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_notices(folders: list[Path], address: str, rounds: int) -> None:
     """From what one service says until another one hears it."""
     databases = [SharedDatabase(address) for _ in folders]
-    one, other = (Replica(database, folder) for database, folder in zip(databases, folders, strict=True))
+    one, other = (ServiceReplica(database, folder) for database, folder in zip(databases, folders, strict=True))
     heard = threading.Event()
     other.hear("test", lambda _: heard.set())
     one.start()

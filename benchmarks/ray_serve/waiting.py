@@ -12,7 +12,7 @@ import numpy as np
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoding, canary_frame
 from core.method.regions import Regions
-from service.ray_serve.replica import Replica, ReplicaSettings, ReturnedFrame, SentFrame
+from service.ray_serve.replica import EncoderReplica, ReplicaSettings, ReturnedFrame, SentFrame
 
 WAIT = "wait"
 """The file with the milliseconds of a frame, in the directory of models; it may change meanwhile."""
@@ -30,7 +30,7 @@ def prepare(models: Path, encoder: str, milliseconds: float) -> None:
     np.savez(models / MADE, descriptor=made.descriptor, local=made.local, **regions)
 
 
-class WaitingReplica(Replica):
+class WaitingReplica(EncoderReplica):
     """Takes its time for one frame after the other, as one device does, and no processor time for them."""
 
     def __init__(self, settings: ReplicaSettings) -> None:

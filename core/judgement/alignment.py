@@ -117,7 +117,7 @@ def of_matrix(scores: NDArray[np.floating]) -> Scores:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class AlignedPairs:
     """The pairs of Q frames with R others that speak for a path most.
 
     columns: int64 [Q, K], the other frame of each pair, ascending in each row.
@@ -131,11 +131,11 @@ class Pairs:
     others: int
     free: NDArray[np.bool_]
 
-    def turned_around(self) -> Pairs:
+    def turned_around(self) -> AlignedPairs:
         """The same pairs with the others in the opposite order."""
         return replace(self, columns=self.others - 1 - self.columns[:, ::-1], gains=self.gains[:, ::-1])
 
-    def without(self, rows: Frames) -> Pairs:
+    def without(self, rows: Frames) -> AlignedPairs:
         """The pairs without those of some rows."""
         free = self.free.copy()
         free[rows] = False
@@ -147,7 +147,7 @@ def best_pairs(
     rows: int,
     others: int,
     advance: Callable[[int], None] = lambda pairs: None,
-) -> Pairs:
+) -> AlignedPairs:
     """Of each of some rows the best pairs by comparable scores.
 
     Args:
@@ -175,10 +175,10 @@ def best_pairs(
             columns = np.take_along_axis(columns, best, axis=1)
             gains = np.take_along_axis(gains, best, axis=1)
         advance(found.size)
-    return Pairs(columns, gains.astype(np.float64), others, np.ones(rows, np.bool_))
+    return AlignedPairs(columns, gains.astype(np.float64), others, np.ones(rows, np.bool_))
 
 
-def _stretches(pairs: Pairs) -> Iterator[SharedStretch]:
+def _stretches(pairs: AlignedPairs) -> Iterator[SharedStretch]:
     """The paths that are better than by chance, best first."""
     least = BY_CHANCE * best_path(pairs.turned_around())[1]
     for _ in range(MOST_PATHS):
@@ -189,7 +189,7 @@ def _stretches(pairs: Pairs) -> Iterator[SharedStretch]:
         pairs = pairs.without(path[:, 0])
 
 
-def best_path(pairs: Pairs) -> tuple[Frames, float]:
+def best_path(pairs: AlignedPairs) -> tuple[Frames, float]:
     """The path with the largest sum of gains, int64 [n, 2] of row and column, and the sum; empty if all are losses.
 
     A path goes through columns where its sum is positive; of each row only these are remembered.
@@ -200,7 +200,7 @@ def best_path(pairs: Pairs) -> tuple[Frames, float]:
     return path, float(total)
 
 
-def best_path_by_rows(pairs: Pairs) -> tuple[Frames, float]:
+def best_path_by_rows(pairs: AlignedPairs) -> tuple[Frames, float]:
     """What :func:`best_path` computes, in NumPy."""
     columns, totals = np.empty(0, np.int64), np.empty(0)
     reached: list[tuple[Frames, NDArray[np.int8]]] = []
@@ -226,7 +226,7 @@ _BEGINS = -1
 """The step of a path's first pair."""
 
 
-def _row(pairs: Pairs, row: int, before: Frames, totals: Values) -> tuple[Frames, Values, NDArray[np.int8]]:
+def _row(pairs: AlignedPairs, row: int, before: Frames, totals: Values) -> tuple[Frames, Values, NDArray[np.int8]]:
     """The columns of a row at which a path may be, its sum, and by which step it came, given those of the row before.
 
     Returns:

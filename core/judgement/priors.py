@@ -78,7 +78,7 @@ class Disc:
 
 
 @dataclass(frozen=True)
-class Box:
+class GeographicBox:
     """Between two parallels and two meridians, in degrees, edges included; ``west`` > ``east`` crosses ±180°."""
 
     west: float

@@ -107,7 +107,7 @@ def _in_one_line(text: str) -> str:
     return " ".join(text.split())[:300]
 
 
-class Connection:
+class MilvusConnection:
     """A connection to Milvus, which is made when it is first used.  Any thread may use it."""
 
     def __init__(self, address: str, token: str, database: str, certificate: str | None) -> None:
@@ -172,7 +172,7 @@ class Collection:
         encoder, dimension: its identity, and the values of a descriptor.
     """
 
-    def __init__(self, connection: Connection, encoder: str, dimension: int) -> None:
+    def __init__(self, connection: MilvusConnection, encoder: str, dimension: int) -> None:
         self._connection = connection
         self._encoder, self._dimension = encoder, dimension
         self.name = collection_name(encoder, dimension)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from core.judgement.priors import TOLERANCE, Box, Constraint, Disc, Facing, InSequences, NotLately, Period
+from core.judgement.priors import TOLERANCE, Constraint, Disc, Facing, GeographicBox, InSequences, NotLately, Period
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_TIME
 
 NO_HEADING = -1.0
@@ -39,7 +39,7 @@ def bounds_of(constraint: Constraint) -> str | None:
     match constraint:
         case Disc():
             return _disc(constraint)
-        case Box():
+        case GeographicBox():
             south, north = (EARTH_RADIUS * np.sin(np.radians(edge)) for edge in (constraint.south, constraint.north))
             return f"kind == {GEOGRAPHIC} and {_between('z', south - TOLERANCE, north + TOLERANCE)}"
         case Facing(heading, tolerance):

@@ -17,7 +17,7 @@ from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.milvus import ledger
-from core.milvus.collection import Collection, Connection
+from core.milvus.collection import Collection, MilvusConnection
 from core.milvus.database import Database
 from core.milvus.importing import Importing
 from core.milvus.map import MilvusMap
@@ -74,7 +74,7 @@ class MilvusStore:
         self._closed = threading.Event()
         self._sweeper: threading.Thread | None = None
         self._database = Database(postgres)
-        self._milvus = Connection(milvus, token, database, certificate)
+        self._milvus = MilvusConnection(milvus, token, database, certificate)
         self._objects = None if bucket is None else _objects_of(bucket)
 
     def create(

@@ -42,7 +42,7 @@ THUMBNAIL_SIDE = 320
 
 
 @dataclass(frozen=True)
-class RivalGroup:
+class RivalPlaces:
     """Rivals of the best match, as ``core.judgement.verdict.Rivals``.
 
     places: ids, best first.
@@ -83,7 +83,7 @@ class Answer:
     encoding: Encoding
     candidates: Candidates
     third_stage: ThirdStage = NOT_VERIFIED
-    rivals: tuple[RivalGroup, ...] = ()
+    rivals: tuple[RivalPlaces, ...] = ()
     note: str | None = None
 
     @property
@@ -301,12 +301,12 @@ def _put_together(
     return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
 
 
-def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalGroup, ...]:
+def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalPlaces, ...]:
     """The rivals by id; places that were deleted since the search are left out."""
     groups = []
     for group in judgement.rivals:
         places = map_.places_at(candidates.rows[list(group.positions)].tolist())
         ids = tuple(place.id for place in places if place is not None)
         if ids:
-            groups.append(RivalGroup(ids, float(candidates.scores[group.positions[0]]), group.same_place))
+            groups.append(RivalPlaces(ids, float(candidates.scores[group.positions[0]]), group.same_place))
     return tuple(groups)

@@ -277,7 +277,7 @@ class Examined:
     examined: NDArray[np.bool_]
 
 
-class SecondStage(NamedTuple):
+class CellComparison(NamedTuple):
     """How the second stage of an encoder compares a query with the places of a ranking.
 
     candidates: how many places it examines; 0 if the encoder has no second stage.
@@ -292,7 +292,7 @@ class SecondStage(NamedTuple):
     promise: Callable[[Positions], Array] | None = None
 
 
-def second_stage(encoder: Encoder, query: Cells, local_at: Callable[[Positions], Cells]) -> SecondStage:
+def second_stage(encoder: Encoder, query: Cells, local_at: Callable[[Positions], Cells]) -> CellComparison:
     """The second stage of an encoder for one query, int8 [C, L].
 
     Args:
@@ -312,7 +312,7 @@ def second_stage(encoder: Encoder, query: Cells, local_at: Callable[[Positions],
         known = [numbers[position] for position in positions.tolist() if position in numbers]
         return encoder.agreement(query, read[known] if len(known) == len(positions) else local_at(positions))
 
-    return SecondStage(encoder.candidates, gains, encoder.screened, promise)
+    return CellComparison(encoder.candidates, gains, encoder.screened, promise)
 
 
 def examine(
@@ -335,7 +335,7 @@ def examine(
         scores: float32 [n], the scores of the first stage, best first.
         whereabouts: the poses and sequences of the n places.
         neighborhood: which places count as the same place.
-        candidates, gains, screened, promise: as of :class:`SecondStage`.
+        candidates, gains, screened, promise: as of :class:`CellComparison`.
         others: how many of the examined places have to be other than the best place, if the map has so many.
     """
     raised = scores.copy()

@@ -16,7 +16,7 @@ import numpy as np
 
 from core.errors import InvalidRecording, InvalidTrajectory, UnknownTopic
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES, natural_key
-from core.recordings.frame import NANOSECONDS, Frame, make_id, utc
+from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id, utc
 from core.recordings.mcap_storage import McapStorage
 from core.recordings.messages import FIX, POSE_TYPES, check_installed, picture_of, pose_of
 from core.recordings.ros1_storage import Ros1Storage
@@ -156,7 +156,7 @@ class Bag:
             raise UnknownTopic(f"The messages of {name} in {self.path} are written neither by ROS 1 nor by ROS 2.")
         return name
 
-    def frames(self, name: str) -> list[Frame]:
+    def frames(self, name: str) -> list[RecordedFrame]:
         """The frames of a topic that ``choose`` has given, in the order of their times; remarks tell what is odd.
 
         The id of a frame is made of the topic and its stamp.
@@ -171,7 +171,9 @@ class Bag:
             written = f"{seconds}.{rest:09d}"
             again = f"~{seen[taken]}" if seen[taken] > 1 else ""
             load = partial(self._picture, file, name, entry)
-            frames.append(Frame(f"{start}-{written}{again}", f"{name} at {written}", load, None, utc(taken), taken))
+            frames.append(
+                RecordedFrame(f"{start}-{written}{again}", f"{name} at {written}", load, None, utc(taken), taken)
+            )
         return frames
 
     def _once(self, name: str, entries: Sequence[tuple[int, Entry]]) -> list[tuple[int, Entry]]:

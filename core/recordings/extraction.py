@@ -9,12 +9,12 @@ from pathlib import Path
 from core.errors import InvalidImage, InvalidRecording
 from core.frames.containers import read_header
 from core.recordings.folder import FILE_NAME, POSE
-from core.recordings.frame import Frame
+from core.recordings.frame import RecordedFrame
 
 SUFFIXES = {"jpeg": ".jpg", "png": ".png", "webp": ".webp"}
 
 
-def extract(frames: Iterable[Frame], folder: Path) -> list[Path]:
+def extract(frames: Iterable[RecordedFrame], folder: Path) -> list[Path]:
     """Write frames as picture files into an empty folder, one at a time, with their poses in ``places.csv``.
 
     The files are called after the numbers of the frames from 0 and after their ids, so that their names have the order

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from core.errors import InvalidRecording, InvalidTraverse
 from core.frames.traverses import find_images
 from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
-from core.recordings.frame import Frame, make_id
+from core.recordings.frame import RecordedFrame, make_id
 from core.recordings.pictures import sendable
 
 FILE_NAME = "places.csv"
@@ -34,7 +34,7 @@ class _Row(BaseModel):
     timestamp: Timestamp | None = None
 
 
-def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[str]]:
+def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame], list[str]]:
     """The frames of a directory, and remarks on them; one of whose name no id can be made has its name as its id.
 
     Args:
@@ -55,7 +55,7 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[
             remarks.append(f"{left_out} images of {directory} are not listed in {FILE_NAME} and are left out.")
     else:
         found = [
-            (path, Frame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
+            (path, RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
             for path in find_images(directory)
         ]
     first: dict[str, Path] = {}
@@ -69,9 +69,9 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[
     return [frame for _, frame in found], remarks
 
 
-def picture_frame(path: Path) -> Frame:
+def picture_frame(path: Path) -> RecordedFrame:
     """A single image file as a frame; its pose and time are those of its EXIF data."""
-    return Frame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
+    return RecordedFrame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
 
 
 def read_picture(path: Path) -> bytes:
@@ -92,7 +92,7 @@ def _id(path: Path, prefix: str) -> str:
         return prefix + path.stem
 
 
-def _listed_frames(path: Path, prefix: str) -> Iterator[tuple[Path, Frame]]:
+def _listed_frames(path: Path, prefix: str) -> Iterator[tuple[Path, RecordedFrame]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True, strict=True)
@@ -116,7 +116,7 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         )
 
 
-def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> tuple[Path, Frame]:
+def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> tuple[Path, RecordedFrame]:
     where = f"{path.name}, line {line}"
     if None in cells or None in cells.values():
         raise InvalidTraverse(f"{where}: the row has more or fewer cells than the first line.")
@@ -135,4 +135,4 @@ def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> 
     chosen = check_place_id(given["id"]) if "id" in given else _id(image, prefix)
     taken = None if fields.timestamp is None else 1000 * microseconds(fields.timestamp)
     load = partial(read_picture, image)
-    return image, Frame(chosen, image.name, load, fields.pose, fields.timestamp, taken)
+    return image, RecordedFrame(chosen, image.name, load, fields.pose, fields.timestamp, taken)

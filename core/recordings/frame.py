@@ -15,7 +15,7 @@ NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Frame:
+class RecordedFrame:
     """A frame that is read when it is needed.
 
     id: the id of its place, the same whenever the recording is opened; what no place can have if its file's name makes
@@ -36,7 +36,7 @@ class Frame:
     nanoseconds: int | None = None
     embedded: bool = False
 
-    def described(self, data: bytes | None = None) -> Frame:
+    def described(self, data: bytes | None = None) -> RecordedFrame:
         """The frame with the pose and the time that its bytes tell, if that is where they stand.
 
         Args:

@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.recordings.frame import NANOSECONDS, Frame
+from core.recordings.frame import NANOSECONDS, RecordedFrame
 
-Describe = Callable[[Frame], NDArray[np.float32] | None]
+Describe = Callable[[RecordedFrame], NDArray[np.float32] | None]
 """Gives the descriptor of a frame, float32 [D], of length 1; None if it has none."""
 
 
@@ -64,8 +64,8 @@ class Left:
 
 
 def keyframes(
-    frames: Iterable[Frame], spacing: Spacing, describe: Describe | None = None, left: Left | None = None
-) -> Iterator[Frame]:
+    frames: Iterable[RecordedFrame], spacing: Spacing, describe: Describe | None = None, left: Left | None = None
+) -> Iterator[RecordedFrame]:
     """The first frame and then each that is far enough from the keyframe before it.
 
     A frame is judged by the measures that are known of it and of the keyframe; one of which none is known is left out.
@@ -75,8 +75,8 @@ def keyframes(
         describe: is called, in the order of the frames, if ``spacing`` gives a change.
         left: counts the frames that could not be judged.
     """
-    last: tuple[Frame, NDArray[np.float32] | None] | None = None
-    previous: Frame | None = None
+    last: tuple[RecordedFrame, NDArray[np.float32] | None] | None = None
+    previous: RecordedFrame | None = None
     for frame in frames:
         described = frame.described()
         descriptor = describe(described) if spacing.change is not None and describe is not None else None
@@ -91,8 +91,8 @@ def keyframes(
 
 
 def moving(
-    frames: Sequence[Frame], look: Callable[[Frame], Look | None], same: Callable[[Look, Look], bool]
-) -> Iterator[Frame]:
+    frames: Sequence[RecordedFrame], look: Callable[[RecordedFrame], Look | None], same: Callable[[Look, Look], bool]
+) -> Iterator[RecordedFrame]:
     """The frames without those that show the same as the last frame before them that is not left out.
 
     A frame that shows the same stays where its pose says that the robot has moved, as in a tunnel: by more than
@@ -102,7 +102,7 @@ def moving(
         look: gives what a frame shows; None: it cannot be read, and the frame stays.
         same: whether two frames show the same.
     """
-    last: tuple[Frame, Look] | None = None
+    last: tuple[RecordedFrame, Look] | None = None
     apart = max(STANDING, NOISE * pose_noise(frames))
     for frame in frames:
         shown = look(frame)
@@ -117,7 +117,7 @@ def moving(
         yield frame
 
 
-def pose_noise(frames: Sequence[Frame]) -> float:
+def pose_noise(frames: Sequence[RecordedFrame]) -> float:
     """The standard deviation of each coordinate of the frames' poses, metres.
 
     It is told by how much the way of a second differs from that of the second before, which is little while a robot
@@ -135,7 +135,7 @@ def pose_noise(frames: Sequence[Frame]) -> float:
     return float(np.median(np.linalg.norm(differences, axis=1)) / (np.sqrt(6) * np.sqrt(2 * np.log(2))))
 
 
-def _judgeable(frame: Frame, descriptor: NDArray[np.float32] | None, spacing: Spacing) -> bool:
+def _judgeable(frame: RecordedFrame, descriptor: NDArray[np.float32] | None, spacing: Spacing) -> bool:
     heading = None if frame.pose is None else frame.pose.heading
     known = (frame.pose, heading, frame.nanoseconds, descriptor)
     wanted = (spacing.metres, spacing.degrees, spacing.seconds, spacing.change)
@@ -143,11 +143,11 @@ def _judgeable(frame: Frame, descriptor: NDArray[np.float32] | None, spacing: Sp
 
 
 def _is_far(
-    frame: Frame,
+    frame: RecordedFrame,
     descriptor: NDArray[np.float32] | None,
-    before: Frame,
+    before: RecordedFrame,
     last: NDArray[np.float32] | None,
-    previous: Frame,
+    previous: RecordedFrame,
     spacing: Spacing,
 ) -> bool:
     """Whether one of the measures is reached; one that is known of the frame and not of the keyframe counts as such.
@@ -168,7 +168,7 @@ def _is_far(
     )
 
 
-def _metres(one: Frame, other: Frame) -> float | None:
+def _metres(one: RecordedFrame, other: RecordedFrame) -> float | None:
     """Between two frames; endless if the pose of one is in metres and that of the other in degrees."""
     if one.pose is None or other.pose is None:
         return None
@@ -177,14 +177,14 @@ def _metres(one: Frame, other: Frame) -> float | None:
     return float(np.linalg.norm(one.pose.position() - other.pose.position()))
 
 
-def _degrees(one: Frame, other: Frame) -> float | None:
+def _degrees(one: RecordedFrame, other: RecordedFrame) -> float | None:
     headings = [None if frame.pose is None else frame.pose.heading for frame in (one, other)]
     if headings[0] is None or headings[1] is None:
         return None
     return abs((headings[0] - headings[1] + 180) % 360 - 180)
 
 
-def _seconds(one: Frame, other: Frame) -> float | None:
+def _seconds(one: RecordedFrame, other: RecordedFrame) -> float | None:
     if one.nanoseconds is None or other.nanoseconds is None:
         return None
     return (one.nanoseconds - other.nanoseconds) / NANOSECONDS

@@ -11,7 +11,7 @@ from core.errors import InvalidRecording, InvalidTrajectory
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES
 from core.recordings.bag import Bag, bag_files
 from core.recordings.folder import folder_frames
-from core.recordings.frame import NANOSECONDS, Frame, make_id
+from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id
 from core.recordings.messages import IMAGE_TYPES
 from core.recordings.trajectory import Trajectory, missing
 from core.recordings.trajectory_files import read_trajectory
@@ -48,7 +48,7 @@ class Recording:
     """
 
     name: str
-    frames: list[Frame]
+    frames: list[RecordedFrame]
     remarks: list[str] = field(default_factory=list)
     continuous: bool = False
     _close: Callable[[], None] = lambda: None

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from core.errors import InvalidRecording, NotAnImage
-from core.recordings.frame import NANOSECONDS, Frame, make_id
+from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id
 from core.recordings.pictures import png
 
 SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv"})
@@ -45,7 +45,7 @@ class Video:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         return capture
 
-    def frames(self) -> tuple[list[Frame], list[str]]:
+    def frames(self) -> tuple[list[RecordedFrame], list[str]]:
         """The frames and remarks on them; the whole file is decoded once to learn how many there are, and when.
 
         The id of a frame is made of the file's name and its number.
@@ -67,7 +67,7 @@ class Video:
                 "be cut short."
             )
         frames = [
-            Frame(
+            RecordedFrame(
                 make_id(f"{stem}-{number:06d}"),
                 f"{self.path.name}, frame {number} at {taken / NANOSECONDS:.3f} s",
                 partial(self._picture, number),

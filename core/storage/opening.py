@@ -42,7 +42,7 @@ from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
 from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.segment import Held, Segment
+from core.storage.search.segment import HeldRows, Segment
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import holds_for, tier_for
 
@@ -132,7 +132,7 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
         connection.close()
 
 
-def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: NDArray[np.uint32]) -> Held:
+def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: NDArray[np.uint32]) -> HeldRows:
     """The descriptors of a segment, each of them checked; ``checksums`` are those that SQLite has of its rows."""
     index = flat_index(entry.rows, layout.dimension, layout.precision == HALF)
     local = np.zeros((entry.rows, *layout.local_shape), dtype=np.int8)
@@ -145,7 +145,7 @@ def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: 
             raise Damage(f"{descriptors.segment_name(entry.number)}: row {row} is of another frame")
         target[part], local[part] = layout.descriptors_of(records), layout.locals_of(records)
         filled += len(records)
-    return Held(index, local)
+    return HeldRows(index, local)
 
 
 def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable:

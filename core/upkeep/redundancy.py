@@ -139,7 +139,7 @@ def thinned(
 
 
 @dataclass(frozen=True)
-class Trial:
+class RemovalTrial:
     """The matches of queries with known truth against a whole map, from which the matches in a part of it follow.
 
     positions: int64 [q, c], the best places for each query by the first stage, best first, filled up with NONE.

@@ -39,7 +39,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
 from core.places import NO_POSE, Neighborhood, Whereabouts
-from core.recognition.stages import SecondStage, examine
+from core.recognition.stages import CellComparison, examine
 from core.threads import cores, each, share_cores
 from lab.training.photographs import find_photographs, read
 from lab.training.validation import Encodings, TraverseTask, describe, load_traverses, with_corrected_truth
@@ -145,7 +145,7 @@ class Traverse:
         def promise(at: Positions) -> Array:
             return np.asarray(self.promised[query, rows[at]])
 
-        stage = SecondStage(self.candidates, gains, self.screened, promise)
+        stage = CellComparison(self.candidates, gains, self.screened, promise)
         seen = examine(self.first[query, rows], places, NEIGHBORHOOD, *stage)
         ranked, places = rows[seen.order], places.take(seen.order)
 

@@ -41,7 +41,7 @@ log = logging.getLogger("placerec.access")
 
 
 @dataclass
-class Held:
+class HeldKeys:
     """A key in memory.
 
     Args:
@@ -69,7 +69,7 @@ class _Known:
 
     demanded: bool = False
     broken: str | None = None
-    held: dict[bytes, Held] = field(default_factory=dict)
+    held: dict[bytes, HeldKeys] = field(default_factory=dict)
 
 
 class Keyring:
@@ -219,16 +219,16 @@ class Keyring:
             log.info("keys are demanded", extra={"keys": len(keys)})
         self._known = _Known(demanded=True, held=held)
 
-    def _hold(self, key: Key, before: Held | None) -> Held:
+    def _hold(self, key: Key, before: HeldKeys | None) -> HeldKeys:
         principal = Principal(key.name, key.id, key.role, key.maps)
         if key.expires_at is None:
-            return Held(key, principal, None, None)
+            return HeldKeys(key, principal, None, None)
         expires = key.expires_at.timestamp()
         proven = max(moment.timestamp() for moment in (key.created_at, key.last_used_at) if moment is not None)
         deadline = self._monotonic() + expires - max(self._wall(), proven)
         if before is not None and before.deadline is not None and before.expires == expires:
             deadline = min(deadline, before.deadline)
-        return Held(key, principal, expires, deadline)
+        return HeldKeys(key, principal, expires, deadline)
 
     def _write_uses(self) -> None:
         before, self._used = self._used, {}

@@ -120,7 +120,7 @@ def digest_of(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-class KeyChanges(Protocol):
+class KeyNarrowing(Protocol):
     """All keys, while nobody else changes them; what is put is kept when the change ends without an error."""
 
     def read(self) -> list[Key]: ...
@@ -172,7 +172,7 @@ class KeyRecords(ABC):
         """What a running service learns of changes by."""
 
     @abstractmethod
-    def changing(self) -> AbstractContextManager[KeyChanges]:
+    def changing(self) -> AbstractContextManager[KeyNarrowing]:
         """A change, which is durable when the context ends."""
 
     @abstractmethod
@@ -366,7 +366,7 @@ class KeyStore(KeyRecords):
                 raise KeysUnreadable(f"{self.path} is damaged: {error}.") from error
 
     @contextmanager
-    def changing(self) -> Iterator[KeyChanges]:
+    def changing(self) -> Iterator[KeyNarrowing]:
         with self._transaction() as connection:
             yield _FileChanges(connection)
 

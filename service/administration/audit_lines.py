@@ -61,12 +61,12 @@ class Position:
 class Trail(Protocol):
     """An audit trail that several services write together."""
 
-    def lines(self, before: Position | None) -> Iterator[Line]:
+    def lines(self, before: Position | None) -> Iterator[AuditLine]:
         """The lines from the latest to the oldest, before one of them; None: all."""
 
 
 @dataclass(frozen=True)
-class Line:
+class AuditLine:
     """One line of the trail.
 
     size: its bytes.
@@ -78,7 +78,7 @@ class Line:
     fields: dict[str, Any] | None
 
 
-def lines_of_files(path: Path, before: Position | None) -> Iterator[Line]:
+def lines_of_files(path: Path, before: Position | None) -> Iterator[AuditLine]:
     """The lines of the trail from the latest to the oldest.
 
     Args:
@@ -100,7 +100,7 @@ def lines_of_files(path: Path, before: Position | None) -> Iterator[Line]:
                 continue  # it was removed meanwhile
             with opened:
                 for offset, line in _backwards(opened, before.offset if number == 0 and before is not None else None):
-                    yield Line(Position(inode, offset), len(line), _parsed(line))
+                    yield AuditLine(Position(inode, offset), len(line), _parsed(line))
 
 
 def _files(path: Path) -> list[tuple[Path, int]]:
@@ -160,7 +160,7 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[Line]:
+def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[AuditLine]:
     """The lines that are kept in memory from the latest to the oldest.
 
     Args:
@@ -170,4 +170,4 @@ def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[Li
     for back, line in enumerate(reversed(lines)):
         position = Position(0, written - back)
         if before is None or position.offset < before.offset:
-            yield Line(position, len(line), json.loads(line))
+            yield AuditLine(position, len(line), json.loads(line))

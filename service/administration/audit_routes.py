@@ -13,7 +13,7 @@ from core import errors
 from core.maps.pagination import Listing, decode_name, encode_cursor
 from core.places import Timestamp
 from service.access.audit import LatestLines
-from service.administration.audit_lines import Line, Position, Trail, lines_in_memory, lines_of_files
+from service.administration.audit_lines import AuditLine, Position, Trail, lines_in_memory, lines_of_files
 from service.errors.faults import InvalidRequest
 from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, FromState, single_values
@@ -124,7 +124,7 @@ def read_audit(
     return AuditPage(items=items, next_cursor=more, source=source if shared is None else "database")
 
 
-def _page(lines: Iterator[Line], options: AuditParameters) -> tuple[list[AuditEntry], Position | None]:
+def _page(lines: Iterator[AuditLine], options: AuditParameters) -> tuple[list[AuditEntry], Position | None]:
     """The lines of a page, and the position of the last one that was read; None if there are no more."""
     items: list[AuditEntry] = []
     read, reached = 0, None

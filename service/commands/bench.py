@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.connection.client import Target, ask, path_of, read_bytes
+from service.commands.connection.client import CommandTarget, ask, path_of, read_bytes
 from service.commands.connection.credentials import given_key
 from service.commands.console import Failure, number, progress, show, table, write_file
 from service.commands.encoders.models import ModelsDir, default_encoder, open_catalogue
@@ -101,7 +101,7 @@ def _measure_service(
     from service.commands.timing.samples import jpeg, sample_frame
 
     path = path_of("encode") if map_id is None else path_of("maps", map_id, "query")
-    version = ask(Target(url, None), "GET", "/version").json()
+    version = ask(CommandTarget(url, None), "GET", "/version").json()
     frames = [read_bytes(image)] if image else [jpeg(sample_frame(index)) for index in range(FRAMES)]
     seen: dict[str, Any] = {}
     shown = table("robots", "#answers/s", "#p50 ms", "#p95 ms", "#p99 ms", "#refused", title=f"{url}{path}")
@@ -109,7 +109,7 @@ def _measure_service(
         folder = Path(text)
         for index, data in enumerate(frames):
             # A frame that the service refuses ends the command before the measurement.
-            ask(Target(url, None), "POST", path, content=data, headers={"Content-Type": "image/jpeg"})
+            ask(CommandTarget(url, None), "POST", path, content=data, headers={"Content-Type": "image/jpeg"})
             (folder / f"{index}.jpg").write_bytes(data)
         task = bar.add_task("Driving", total=len(robots))
         for count in robots:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from core.errors import InvalidImage, InvalidRecording
-from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of
+from service.commands.connection.client import AsJson, CommandTarget, DataDir, MapId, Url, ask, media_type, path_of
 from service.commands.console import Failure, number, output, remark, show, show_json, table
 from service.commands.encoders.models import ModelsDir, models_directory, open_catalogue
 from service.commands.encoders.pictures import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
@@ -96,7 +96,7 @@ def calibrate(
         raise typer.BadParameter("--topic needs --recording")
     order: dict[str, Any] = {"target": _target(precision, false_accept_rate, mean_of_negatives), "dry_run": dry_run}
     order |= {} if most is None else {"most": most}
-    target, path = Target(url, data_dir), path_of("maps", map_id, "calibrate")
+    target, path = CommandTarget(url, data_dir), path_of("maps", map_id, "calibrate")
     if frames is not None:
         rows = _rows(frames, ("file", "place"))
         names = [f"frame-{index}" for index in range(len(rows))]

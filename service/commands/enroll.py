@@ -16,8 +16,8 @@ from rich.markup import escape
 
 from core.errors import InvalidIdentifier
 from core.places import check_sequence
-from service.commands.connection.batches import Frame, Outcome, enrol_frames
-from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
+from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
+from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress
 from service.commands.jobs import show_outcome, submit
 from service.commands.recordings import (
@@ -48,7 +48,7 @@ class Report:
     uploaded: int = 0
     failures: list[tuple[str, str]] = field(default_factory=list)
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: SendingOutcome) -> None:
         """Count one frame."""
         self.uploaded += outcome.uploaded
         if outcome.change is None:
@@ -127,15 +127,15 @@ def enroll(
         every_seconds,
         every_change,
     )
-    target = Target(url, data_dir)
+    target = CommandTarget(url, data_dir)
     began = time.monotonic()
     with options.open(recording, id_prefix) as opened:
         name = _checked_sequence(opened.name if sequence is None else sequence)
 
-        def choose(used: str | None, mask: Mask | None) -> list[Frame]:
+        def choose(used: str | None, mask: Mask | None) -> list[FrameToSend]:
             chosen = options.choose(opened, used, mask)
             chosen = chosen if keep_standing else without_standing(opened, chosen, mask)
-            return [Frame(taken, name, camera) for taken in chosen]
+            return [FrameToSend(taken, name, camera) for taken in chosen]
 
         report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, name, frames, time.monotonic() - began)
@@ -178,9 +178,9 @@ def _show_aligned(job: dict[str, Any]) -> None:
 
 
 async def _enroll(
-    target: Target,
+    target: CommandTarget,
     map_id: str,
-    choose: Callable[[str | None, Mask | None], list[Frame]],
+    choose: Callable[[str | None, Mask | None], list[FrameToSend]],
     camera: str | None,
     create: bool,
     wanted: dict[str, str | None],
@@ -200,7 +200,7 @@ async def _enroll(
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
 
-            def tell(outcome: Outcome) -> None:
+            def tell(outcome: SendingOutcome) -> None:
                 report.add(outcome)
                 bar.advance(task)
 
@@ -236,7 +236,7 @@ async def _mask(service: Service, map_id: str, camera: str) -> Mask | None:
     return None if found is None else Mask.model_validate_json(json.dumps(found))
 
 
-async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> frozenset[str]:
+async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend]) -> frozenset[str]:
     """The frames' ids that the map already has; those of another traverse are refused, not overwritten."""
     wanted = {frame.id for frame in frames}
     known: dict[str, Any] = {}

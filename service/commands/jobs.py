@@ -8,9 +8,9 @@ import typer
 
 from service.commands.connection.client import (
     AsJson,
+    CommandTarget,
     DataDir,
     Service,
-    Target,
     Url,
     ask,
     list_items,
@@ -48,7 +48,7 @@ def list_jobs(
 ) -> None:
     """List jobs, the newest first."""
     asked = {"map": map_id, "state": state}
-    found = list_items(Target(url, data_dir), path_of("jobs"), {n: v for n, v in asked.items() if v is not None})
+    found = list_items(CommandTarget(url, data_dir), path_of("jobs"), {n: v for n, v in asked.items() if v is not None})
     if as_json:
         show_json(found)
         return
@@ -61,7 +61,7 @@ def list_jobs(
 @jobs.command("show")
 def show_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Show one job."""
-    show_outcome(ask(Target(url, data_dir), "GET", path_of("jobs", job_id)).json(), as_json)
+    show_outcome(ask(CommandTarget(url, data_dir), "GET", path_of("jobs", job_id)).json(), as_json)
 
 
 @jobs.command("wait")
@@ -69,7 +69,7 @@ def wait_for_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_js
     """Wait until a job ends; the exit status is 1 unless it succeeds."""
 
     async def work() -> dict[str, Any]:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             return await followed(service, await service.get(path_of("jobs", job_id)))
 
     show_outcome(run(work()), as_json)
@@ -78,7 +78,7 @@ def wait_for_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_js
 @jobs.command("cancel")
 def cancel_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Ask a job to stop; it stops at its next safe point."""
-    job = ask(Target(url, data_dir), "POST", path_of("jobs", job_id, "cancel")).json()
+    job = ask(CommandTarget(url, data_dir), "POST", path_of("jobs", job_id, "cancel")).json()
     if as_json:
         show_json(job)
     else:
@@ -101,7 +101,7 @@ async def followed(service: Service, job: dict[str, Any]) -> dict[str, Any]:
     return job
 
 
-def submit(target: Target, path: str, body: dict[str, Any], wait: bool) -> dict[str, Any]:
+def submit(target: CommandTarget, path: str, body: dict[str, Any], wait: bool) -> dict[str, Any]:
     """Submit a job, wait until it ends if ``wait`` is set, and return it.
 
     Raises:
@@ -118,7 +118,7 @@ def submit(target: Target, path: str, body: dict[str, Any], wait: bool) -> dict[
     return run(work())
 
 
-def check_outlives(target: Target, wait: bool) -> None:
+def check_outlives(target: CommandTarget, wait: bool) -> None:
     """Refuse not to wait for a job if its service ends with this command.
 
     Raises:

@@ -12,10 +12,10 @@ import typer
 
 from core.errors import InvalidImage, InvalidRecording
 from service.commands.connection.client import (
+    CommandTarget,
     DataDir,
     Refused,
     Service,
-    Target,
     Url,
     media_type,
     open_service,
@@ -37,9 +37,9 @@ from service.commands.recordings import (
 )
 
 if TYPE_CHECKING:
-    from core.recordings import Frame
+    from core.recordings import RecordedFrame
 
-Asked = tuple[str, "Frame", bool]
+Asked = tuple[str, "RecordedFrame", bool]
 """The file of a frame as it was given, the frame, and whether it is one of a recording."""
 
 PATIENCE = 30.0
@@ -128,7 +128,9 @@ def query(
     def asked(encoder: str | None) -> Iterator[Asked]:
         return _frames(images, options, encoder)
 
-    failures = run(_query(Target(url, data_dir), map_id, asked, options.every_change is not None, parameters, as_json))
+    failures = run(
+        _query(CommandTarget(url, data_dir), map_id, asked, options.every_change is not None, parameters, as_json)
+    )
     if failures:
         raise typer.Exit(1)
 
@@ -157,7 +159,7 @@ def _frames(images: list[Path], options: RecordingOptions, encoder: str | None) 
 
 
 async def _query(
-    target: Target,
+    target: CommandTarget,
     map_id: str,
     asked: Callable[[str | None], Iterator[Asked]],
     by_change: bool,
@@ -190,7 +192,7 @@ async def _query(
     return failures
 
 
-def _load(file: str, frame: Frame) -> bytes:
+def _load(file: str, frame: RecordedFrame) -> bytes:
     try:
         return frame.load()
     except OSError as error:

@@ -14,7 +14,7 @@ from service.commands.console import Failure, messages, progress, remark
 
 if TYPE_CHECKING:
     from core.frames.masks import Mask
-    from core.recordings import Frame, Recording
+    from core.recordings import RecordedFrame, Recording
     from core.recordings.keyframes import Describe
 
 PANEL = "Recordings"
@@ -119,7 +119,7 @@ class RecordingOptions:
         measures = (self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
         return any(measure is not None for measure in measures)
 
-    def choose(self, recording: Recording, encoder: str | None, mask: Mask | None = None) -> list[Frame]:
+    def choose(self, recording: Recording, encoder: str | None, mask: Mask | None = None) -> list[RecordedFrame]:
         """The frames that are taken: the keyframes that the options ask for, or all.
 
         Args:
@@ -152,7 +152,9 @@ class RecordingOptions:
         return chosen
 
 
-def without_standing(recording: Recording, frames: list[Frame], mask: Mask | None = None) -> list[Frame]:
+def without_standing(
+    recording: Recording, frames: list[RecordedFrame], mask: Mask | None = None
+) -> list[RecordedFrame]:
     """The frames of a bag or a video without those in which nothing has changed; says how many these are.
 
     The frames of a folder all stay, for somebody chose them.
@@ -170,7 +172,7 @@ def without_standing(recording: Recording, frames: list[Frame], mask: Mask | Non
     with progress() as bar:
         task = bar.add_task("Looking for stops", total=len(frames))
 
-        def look(frame: Frame) -> View | None:
+        def look(frame: RecordedFrame) -> View | None:
             bar.advance(task)
             try:
                 return view_of(decode(frame.load()), mask)
@@ -197,7 +199,7 @@ def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
 
     used = open_catalogue(None).get(encoder or default_encoder())
 
-    def describe(frame: Frame) -> NDArray[np.float32] | None:
+    def describe(frame: RecordedFrame) -> NDArray[np.float32] | None:
         try:
             descriptor = used.encode(decode(frame.load()), mask).descriptor
         except (InvalidImage, InvalidRecording, OSError):

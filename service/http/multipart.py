@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Part:
+class FormPart:
     """One part of a form.  ``data`` is empty if the part was ``oversized``, because its bytes were not kept."""
 
     name: str = ""
@@ -50,7 +50,7 @@ class FormReader:
         boundary = options.get(b"boundary")
         if not boundary:
             raise MalformedBody("The Content-Type gives no multipart boundary.")
-        self.parts: list[Part] = []
+        self.parts: list[FormPart] = []
         self._max_parts, self._max_part_bytes = max_parts, max_part_bytes
         self._part = _OpenPart()
         self._field, self._value = b"", b""
@@ -81,7 +81,7 @@ class FormReader:
         except FormParserError as error:
             raise MalformedBody(f"The body is not a valid multipart form: {error}.") from error
 
-    def close(self) -> list[Part]:
+    def close(self) -> list[FormPart]:
         """All parts; call it after the last chunk.
 
         Raises:
@@ -126,13 +126,15 @@ class FormReader:
         if not name:
             raise MalformedBody("A part of the form has no name.")
         oversized = self._part.size > self._max_part_bytes
-        self.parts.append(Part(name, filename, content_type, b"".join(self._part.chunks), oversized))
+        self.parts.append(FormPart(name, filename, content_type, b"".join(self._part.chunks), oversized))
 
     def _end(self) -> None:
         self._ended = True
 
 
-async def read_form(chunks: AsyncIterator[bytes], content_type: str, max_parts: int, max_part_bytes: int) -> list[Part]:
+async def read_form(
+    chunks: AsyncIterator[bytes], content_type: str, max_parts: int, max_part_bytes: int
+) -> list[FormPart]:
     """Read all parts of a form, in order.
 
     Raises:

@@ -13,7 +13,7 @@ from core.errors import EmptyImage, ImageTooLarge
 from core.frames.containers import read_header
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of, parse_json
-from service.http.multipart import Part, read_form
+from service.http.multipart import FormPart, read_form
 from service.settings import Settings
 
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png", "image/webp": "webp"}
@@ -29,7 +29,7 @@ FIELD_PARTS = 16
 
 
 @dataclass(frozen=True)
-class Frame:
+class UploadedFrame:
     """A frame as it was sent, not decoded yet, and the form fields that came with it."""
 
     data: bytes
@@ -60,7 +60,7 @@ def check_frame(data: bytes, content_type: str | None) -> None:
         raise UnsupportedMediaType(f"The content type is {content_type}, but the bytes are those of a {found} file.")
 
 
-def check_part(part: Part, settings: Settings) -> None:
+def check_part(part: FormPart, settings: Settings) -> None:
     """Check a part of a form as :func:`check_frame` does.
 
     Raises:
@@ -72,7 +72,7 @@ def check_part(part: Part, settings: Settings) -> None:
     check_frame(part.data, part.content_type)
 
 
-async def read_frame(request: Request, settings: Settings) -> Frame:
+async def read_frame(request: Request, settings: Settings) -> UploadedFrame:
     """Read one frame: the raw body, or the one file part of a form, whose other parts are its fields.
 
     Raises:
@@ -87,13 +87,13 @@ async def read_frame(request: Request, settings: Settings) -> Frame:
         if len(files) != 1:
             raise InvalidRequest(f"The form has {len(files)} file parts. Send exactly one frame.")
         check_part(files[0], settings)
-        return Frame(files[0].data, fields)
+        return UploadedFrame(files[0].data, fields)
     if kind not in FORMATS:
         raise UnsupportedMediaType(f"Send a frame as {', '.join(FORMATS)} or in a {FORM} body{instead_of(kind)}.")
     intake_of(request).limit = settings.max_image_bytes
     data = await request.body()
     check_frame(data, kind)
-    return Frame(data, {})
+    return UploadedFrame(data, {})
 
 
 async def read_pair(request: Request, settings: Settings) -> tuple[bytes, bytes, Mapping[str, str]]:
@@ -107,7 +107,7 @@ async def read_pair(request: Request, settings: Settings) -> tuple[bytes, bytes,
     return found["a"].data, found["b"].data, fields
 
 
-async def read_many(request: Request, settings: Settings) -> list[Part]:
+async def read_many(request: Request, settings: Settings) -> list[FormPart]:
     """Read the parts of a form of many frames.  They are not checked here, so that a bad one fails alone.
 
     Raises:
@@ -117,7 +117,7 @@ async def read_many(request: Request, settings: Settings) -> list[Part]:
     return await _read_form(request, settings, settings.max_batch_items)
 
 
-async def _read_form(request: Request, settings: Settings, frames: int) -> list[Part]:
+async def _read_form(request: Request, settings: Settings, frames: int) -> list[FormPart]:
     kind = media_type(request)
     if kind != FORM:
         raise UnsupportedMediaType(f"Send the frames in a {FORM} body{instead_of(kind)}.")
@@ -129,26 +129,26 @@ def instead_of(kind: str) -> str:
     return f", not as {kind[:80]}" if kind else "; the request has no Content-Type"
 
 
-async def _read_parts(request: Request, settings: Settings, frames: int) -> list[Part]:
+async def _read_parts(request: Request, settings: Settings, frames: int) -> list[FormPart]:
     intake_of(request).limit = min(frames * settings.max_image_bytes, settings.max_batch_bytes) + FORM_ALLOWANCE
     content_type = request.headers["content-type"]
     return await read_form(request.stream(), content_type, frames + FIELD_PARTS, settings.max_image_bytes)
 
 
-def is_file(part: Part) -> bool:
+def is_file(part: FormPart) -> bool:
     """Whether a part is a file rather than a field: it has a file name, or a content type other than text and JSON."""
     if part.filename is not None or part.content_type is None:
         return part.filename is not None
     return not part.content_type.startswith("text/") and part.content_type != "application/json"
 
 
-def split_form(parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
+def split_form(parts: Iterable[FormPart]) -> tuple[list[FormPart], dict[str, str]]:
     """Split a form into its file parts and its fields by name.
 
     Raises:
         InvalidRequest: a field is given twice, is too large, or is not UTF-8.
     """
-    files: list[Part] = []
+    files: list[FormPart] = []
     fields: dict[str, str] = {}
     for part in parts:
         if is_file(part):
@@ -162,14 +162,14 @@ def split_form(parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
     return files, fields
 
 
-def _text(part: Part) -> str:
+def _text(part: FormPart) -> str:
     try:
         return part.data.decode()
     except UnicodeDecodeError:
         raise InvalidRequest(f"The field {part.name[:80]!r} is not UTF-8.") from None
 
 
-def json_part(parts: Iterable[Part], name: str) -> tuple[Any, list[Part]]:
+def json_part(parts: Iterable[FormPart], name: str) -> tuple[Any, list[FormPart]]:
     """The parsed value of the JSON part ``name``, and the other parts.
 
     Raises:

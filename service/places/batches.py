@@ -13,7 +13,7 @@ from core.maps.cameras import KnownCameras
 from core.places import check_place_id
 from service.errors.faults import Fault, FrameNeeded, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import Problem, request_problem
-from service.http.multipart import Part
+from service.http.multipart import FormPart
 from service.http.schemas import validated
 from service.http.uploads import check_part
 from service.places.enrolment import FrameToEnrol
@@ -84,7 +84,7 @@ def check_batch(entries: Any, names: list[str], most: int) -> None:
 
 
 def read_entry(
-    entry: Any, names: Collection[str], read: Callable[[str], Part], cameras: KnownCameras, settings: Settings
+    entry: Any, names: Collection[str], read: Callable[[str], FormPart], cameras: KnownCameras, settings: Settings
 ) -> FrameToEnrol:
     """The frame that one entry of a batch describes.
 

@@ -18,7 +18,7 @@ from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
-from service.http.multipart import Part
+from service.http.multipart import FormPart
 from service.http.uploads import FIELD_PARTS, FORM, media_type
 from service.jobs.context import JobContext, creation_time, run_after_requests
 from service.jobs.jobs import Jobs
@@ -224,5 +224,5 @@ class _BulkEnrolment:
             raise InvalidRequest(f"id: the form has {frame.id} twice.")
         return frame
 
-    def _read(self, name: str) -> Part:
+    def _read(self, name: str) -> FormPart:
         return self.form.read(self.files[name])

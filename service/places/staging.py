@@ -22,7 +22,7 @@ from core.errors import StorageFailure, StorageFull
 from service.errors.faults import StagingFull
 from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
-from service.http.multipart import FormReader, Part
+from service.http.multipart import FormPart, FormReader
 from service.worker_threads import to_its_end
 
 FOLDER = "staging"
@@ -91,7 +91,7 @@ class StagedForm:
         except (ValueError, TypeError) as error:
             raise StorageFailure(f"{folder / 'parts'} is damaged: {error}.") from error
 
-    def read(self, part: StagedPart) -> Part:
+    def read(self, part: StagedPart) -> FormPart:
         """A part with its bytes.
 
         Raises:
@@ -102,7 +102,7 @@ class StagedForm:
             data = file.read(part.size)
         if hashlib.sha256(data).hexdigest() != part.sha256:
             raise StorageFailure(f"{self._path}: the part {part.name[:80]!r} is damaged.")
-        return Part(part.name, part.filename, part.content_type, data, part.oversized)
+        return FormPart(part.name, part.filename, part.content_type, data, part.oversized)
 
 
 class Staging:

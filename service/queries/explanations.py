@@ -22,7 +22,7 @@ from core.recognition.recognition import Answer
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
-from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
+from service.queries.pictures import DrawnLine, DrawnOutline, ExplanationPictures, scaled, side_by_side
 from service.queries.schemas import (
     CellPair,
     ExplainedRegion,
@@ -197,20 +197,20 @@ def draw_explanation(
         inliers: what geometric verification found.
     """
     if len(inliers) >= LEAST_MATCHES:
-        lines = [Line(pair.query, pair.match, 0.0) for pair in inliers[:DRAWN]]
+        lines = [DrawnLine(pair.query, pair.match, 0.0) for pair in inliers[:DRAWN]]
         return side_by_side(query, match, lines, ([], []))
     sides = (shown.query_regions, shown.match_regions or [])
     outlines = ([], []) if shown.cells else (_outlines(sides[0]), _outlines(sides[1]))
     return side_by_side(query, match, _lines(shown), outlines)
 
 
-def _outlines(regions: Sequence[ExplainedRegion]) -> list[Outline]:
+def _outlines(regions: Sequence[ExplainedRegion]) -> list[DrawnOutline]:
     most = max((region.loss for region in regions), default=0.0)
     drawn = [region for region in regions if region.loss > 0]
-    return [Outline((one.box.left, one.box.top, one.box.right, one.box.bottom), one.loss / most) for one in drawn]
+    return [DrawnOutline((one.box.left, one.box.top, one.box.right, one.box.bottom), one.loss / most) for one in drawn]
 
 
-def _lines(shown: ExplanationView) -> list[Line]:
+def _lines(shown: ExplanationView) -> list[DrawnLine]:
     if shown.cells:
         rows, columns = shown.grid
         most = max(pair.gain for pair in shown.cells) or 1.0
@@ -218,11 +218,11 @@ def _lines(shown: ExplanationView) -> list[Line]:
         def centre(cell: tuple[int, int]) -> tuple[float, float]:
             return (cell[1] + 0.5) / columns, (cell[0] + 0.5) / rows
 
-        return [Line(centre(pair.query), centre(pair.match), pair.gain / most) for pair in shown.cells[:DRAWN]]
+        return [DrawnLine(centre(pair.query), centre(pair.match), pair.gain / most) for pair in shown.cells[:DRAWN]]
     if shown.match_regions is None:
         return []
     ends = [(shown.query_regions[pair.query].box, shown.match_regions[pair.match].box) for pair in shown.regions]
-    return [Line(_middle(a), _middle(b), 0.0) for a, b in ends[:DRAWN]]
+    return [DrawnLine(_middle(a), _middle(b), 0.0) for a, b in ends[:DRAWN]]
 
 
 def _middle(box: RelativeBox) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from core.judgement.priors import Box, Constraint, Disc, Facing, Period
+from core.judgement.priors import Constraint, Disc, Facing, GeographicBox, Period
 from core.maps.place_filter import Scalar
 from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
 from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
@@ -191,7 +191,7 @@ def _conditions(
     )
 
 
-def parse_box(text: str) -> Box:
+def parse_box(text: str) -> GeographicBox:
     """The box of a text ``west,south,east,north`` in degrees.
 
     Raises:
@@ -203,7 +203,7 @@ def parse_box(text: str) -> Box:
     west, south, east, north = map(float, parts)
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
         raise InvalidRequest("bbox: west and east must be -180 to 180, and -90 <= south <= north <= 90.")
-    return Box(west, south, east, north)
+    return GeographicBox(west, south, east, north)
 
 
 MOST_MAPS = 100

@@ -34,7 +34,7 @@ SECONDS = 600.0
 
 
 @dataclass(frozen=True)
-class Line:
+class DrawnLine:
     """A line from a point of the left frame to one of the right one, (x, y) in shares of width and height.
 
     weight: 0 … 1; a heavier line is thicker.
@@ -46,7 +46,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Outline:
+class DrawnOutline:
     """A box (left, top, right, bottom) in shares of width and height.
 
     weight: 0 … 1; a heavier outline is thicker.
@@ -57,7 +57,10 @@ class Outline:
 
 
 def side_by_side(
-    left: Pixels, right: Pixels, lines: Sequence[Line], outlines: tuple[Sequence[Outline], Sequence[Outline]]
+    left: Pixels,
+    right: Pixels,
+    lines: Sequence[DrawnLine],
+    outlines: tuple[Sequence[DrawnOutline], Sequence[DrawnOutline]],
 ) -> bytes:
     """A PNG of two frames with lines and outlines; heavier ones are thicker and drawn over the others.
 

@@ -139,7 +139,7 @@ class Statistics:
 
 
 @dataclass
-class Counts:
+class AnswerCounts:
     """The counts of one map that are not written yet."""
 
     since: str
@@ -147,7 +147,7 @@ class Counts:
     weeks: dict[date, Week] = field(default_factory=dict)
     hours: dict[int, Counter[Verdict]] = field(default_factory=dict)
 
-    def add(self, other: Counts) -> None:
+    def add(self, other: AnswerCounts) -> None:
         for place, count in other.places.items():
             self.places[place] = self.places.get(place, PlaceCount()) + count
         for monday, week in other.weeks.items():
@@ -179,7 +179,7 @@ class QueryStatistics:
         self._database = SqliteFile(directory / FILE, _SCHEMA, settings, readable, check_whole=False)
         self._seconds, self._sizes, self._present = seconds, sizes, present
         self._lock = threading.Lock()
-        self._counts: dict[MapKey, Counts] = {}
+        self._counts: dict[MapKey, AnswerCounts] = {}
         self._waiting = 0
         self.recent = RecentAnswers()
         """The latest answers, which are in memory alone."""
@@ -244,7 +244,7 @@ class QueryStatistics:
         now = datetime.now(UTC)
         counted = Week.of(_monday(now.date()), verdict, score, decision)
         with self._lock:
-            counts = self._counts.setdefault(key, Counts(since=now.isoformat()))
+            counts = self._counts.setdefault(key, AnswerCounts(since=now.isoformat()))
             counts.weeks[counted.monday] = counts.weeks.get(counted.monday, Week(counted.monday)) + counted
             counts.hours.setdefault(hour_of(now), Counter())[verdict] += 1
             if best is None:
@@ -410,12 +410,12 @@ class QueryStatistics:
             except BaseException:
                 with self._lock:  # add the counts of the meantime to those that could not be written
                     for key, newer in self._counts.items():
-                        taken.setdefault(key, Counts(newer.since)).add(newer)
+                        taken.setdefault(key, AnswerCounts(newer.since)).add(newer)
                     self._counts = taken
                     self._waiting = sum(len(counts.places) for counts in taken.values())
                 raise
 
-    def _keep(self, counts: Mapping[MapKey, Counts]) -> None:
+    def _keep(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
         """Add counts to those that are kept, all or none."""
         with self._replacing_damage():
             self._write(counts)
@@ -437,7 +437,7 @@ class QueryStatistics:
             self._connection.execute("PRAGMA synchronous = NORMAL")
         return self._connection
 
-    def _write(self, counts: Mapping[MapKey, Counts]) -> None:
+    def _write(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
         connection, sizes = self._open(), self._sizes()
         with transaction(connection):
             if sizes is not None:
@@ -448,7 +448,7 @@ class QueryStatistics:
                 if sizes is None or key in sizes:
                     self._add(connection, key, counted, None if sizes is None else sizes[key])
 
-    def _add(self, connection: sqlite3.Connection, key: MapKey, counted: Counts, places: int | None) -> None:
+    def _add(self, connection: sqlite3.Connection, key: MapKey, counted: AnswerCounts, places: int | None) -> None:
         code = _code(connection, key, counted.since)
         connection.executemany(
             "INSERT INTO places VALUES (?1, ?2, ?3, ?4, ?5) ON CONFLICT DO UPDATE SET"

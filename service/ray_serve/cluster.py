@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from core.frames.images import Limits
 from core.silence import SWITCHES
 from core.threads import cores
-from service.ray_serve.replica import Replica, ReplicaSettings
+from service.ray_serve.replica import EncoderReplica, ReplicaSettings
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class Cluster:
         except (OSError, ValueError) as error:
             raise RayUnavailable(f"the Ray cluster {address} is away: {_first_line(error)}") from error
 
-    def deploy(self, replica: type = Replica) -> None:
+    def deploy(self, replica: type = EncoderReplica) -> None:
         """Deploy the encoders as they are installed now.
 
         Replicas that run are replaced one after the other: the new one has loaded its encoder, and answers, before an
@@ -320,14 +320,14 @@ def start_no_dashboards() -> None:
     Node.start_api_server = start_none  # type: ignore[assignment,method-assign]
 
 
-def caller() -> DeploymentHandle[Replica]:
+def caller() -> DeploymentHandle[EncoderReplica]:
     """What calls replicas to encode, from the event loop that runs now and with no thread of Ray's between.
 
     It is no handle that Ray Serve keeps for others, which may have no such loop.
     """
     from ray.serve.handle import DeploymentHandle
 
-    handle: DeploymentHandle[Replica] = DeploymentHandle(DEPLOYMENT, APPLICATION)
+    handle: DeploymentHandle[EncoderReplica] = DeploymentHandle(DEPLOYMENT, APPLICATION)
     handle._init(_run_router_in_separate_loop=False)  # type: ignore[no-untyped-call]
     # Without references a call goes straight to the replica; Ray's object store would double its cost.
     return handle.options(

@@ -68,7 +68,7 @@ class ReturnedFrame:
     milliseconds: dict[str, float]
 
 
-class Replica:
+class EncoderReplica:
     """The encoders of one process.
 
     Raises:

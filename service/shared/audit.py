@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from core.errors import StorageFailure, StorageFull
 from service.access.audit import LOGGER
-from service.administration.audit_lines import Line, Position
+from service.administration.audit_lines import AuditLine, Position
 from service.shared.database import SharedDatabase
 from service.telemetry.requests import JsonLines
 
@@ -84,7 +84,7 @@ class AuditTable(logging.Handler):
             self._waiting.extendleft(reversed(taken))
             raise
 
-    def lines(self, before: Position | None) -> Iterator[Line]:
+    def lines(self, before: Position | None) -> Iterator[AuditLine]:
         """The lines of all services from the latest to the oldest.
 
         Args:
@@ -97,5 +97,5 @@ class AuditTable(logging.Handler):
         reached = (1 << 63) - 1 if before is None else before.offset
         while found := self._database.execute("read the audit trail", query, (reached, LINES_AT_ONCE)):
             for number, replica, line in found:
-                yield Line(Position(0, number), len(line), {**json.loads(line), "replica": replica})
+                yield AuditLine(Position(0, number), len(line), {**json.loads(line), "replica": replica})
             reached = found[-1][0]

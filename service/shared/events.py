@@ -14,7 +14,7 @@ from collections import deque
 from core.errors import StorageFailure, StorageFull
 from service.events.events import Events
 from service.events.feed import Feed, Kept
-from service.shared.replica import LIVING, Replica
+from service.shared.replica import LIVING, ServiceReplica
 
 EVENT, LISTENING = "event", "listening"
 """What services tell each other of: that there are new events, and that somebody listens to other maps than before."""
@@ -41,7 +41,7 @@ class SharedEvents(Events):
     Nobody who publishes an event waits for PostgreSQL.
     """
 
-    def __init__(self, replica: Replica, most_listeners: int) -> None:
+    def __init__(self, replica: ServiceReplica, most_listeners: int) -> None:
         super().__init__(most_listeners)
         self._replica, self._database = replica, replica.database
         self._elsewhere: dict[str, bool] = {}  # maps with listeners at other services; whether they want pictures

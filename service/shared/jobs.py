@@ -27,7 +27,7 @@ from service.jobs.context import JobInterrupted, Work
 from service.jobs.jobs import Jobs, note_event, problem_of_job
 from service.jobs.records import Job, JobState
 from service.shared.database import SharedDatabase
-from service.shared.replica import BEAT_SECONDS, LIVING, Replica
+from service.shared.replica import BEAT_SECONDS, LIVING, ServiceReplica
 
 TAKING = 7_061_636_575
 """The lock of whoever adds or takes a job."""
@@ -266,7 +266,7 @@ class SharedJobs(Jobs):
 
     def __init__(
         self,
-        replica: Replica,
+        replica: ServiceReplica,
         shared_maps: bool,
         workers: int = 1,
         longest_queue: int = 32,

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from psycopg import Connection
 
 from core.errors import StorageFailure, StorageFull
-from service.access.keys import COLUMNS, Key, KeyChanges, KeyRecords, KeyWatch, key_of, row_of, text_of
+from service.access.keys import COLUMNS, Key, KeyNarrowing, KeyRecords, KeyWatch, key_of, row_of, text_of
 from service.errors.faults import KeysUnreadable
 from service.shared.database import SharedDatabase
 
@@ -48,7 +48,7 @@ class SharedKeys(KeyRecords):
         return _Watch(self)
 
     @contextmanager
-    def changing(self) -> Iterator[KeyChanges]:
+    def changing(self) -> Iterator[KeyNarrowing]:
         with _refusals(), self.database.transaction("change the keys") as connection:
             connection.execute(_CHANGE)
             yield _Changes(connection)

@@ -35,7 +35,7 @@ Heard = Callable[[str | None], None]
 log = logging.getLogger("placerec.shared")
 
 
-class Replica:
+class ServiceReplica:
     """This service among those that share state.  Any thread may use it.
 
     id: of the data directory, the same after a restart.

@@ -38,7 +38,7 @@ from service.sessions.sessions import (
 from service.sessions.store import COLUMNS, StoredSession
 from service.settings import Settings
 from service.shared.database import SharedDatabase
-from service.shared.replica import Replica
+from service.shared.replica import ServiceReplica
 
 ADDING = 7_061_636_574
 """The lock of whoever adds a session, so that together they keep to the limit."""
@@ -218,7 +218,7 @@ class SharedSessions(Sessions):
     the same, and says so; the next one at this service goes on from it.
     """
 
-    def __init__(self, settings: Settings, events: Events, replica: Replica) -> None:
+    def __init__(self, settings: Settings, events: Events, replica: ServiceReplica) -> None:
         self._table, self._counted, self._beats = SessionTable(replica.database), 0, 0
         super().__init__(settings, events, self._table)
         replica.every(self.tidy)

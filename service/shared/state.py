@@ -13,7 +13,7 @@ from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
 from service.shared.events import SharedEvents
 from service.shared.jobs import SharedJobs
-from service.shared.replica import Replica
+from service.shared.replica import ServiceReplica
 from service.shared.sessions import SharedSessions
 from service.shared.statistics import SharedStatistics
 
@@ -28,7 +28,7 @@ class SharedState:
 
     def __init__(self, settings: Settings, database: SharedDatabase, shared_maps: bool) -> None:
         self._settings, self._shared_maps = settings, shared_maps
-        self.replica = Replica(database, settings.data_dir)
+        self.replica = ServiceReplica(database, settings.data_dir)
         self.agreement = Agreement(settings, database, self.replica.id)
         self.replica.every(self.agreement.compare)
         self.audit = AuditTable(database, self.replica.id)

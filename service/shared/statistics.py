@@ -23,7 +23,7 @@ from service.queries.statistics import (
     HOURS,
     MOST_WEEKS,
     SPARE_PLACES,
-    Counts,
+    AnswerCounts,
     PlaceCount,
     QueryStatistics,
     Statistics,
@@ -171,7 +171,7 @@ class SharedStatistics(QueryStatistics):
     def _read(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._common.execute("read the statistics of queries", query, values)
 
-    def _keep(self, counts: Mapping[MapKey, Counts]) -> None:
+    def _keep(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
         sizes = self._sizes()
         with self._common.transaction("write down the statistics of queries") as connection:
             if sizes is not None:
@@ -182,7 +182,7 @@ class SharedStatistics(QueryStatistics):
                 if sizes is None or key in sizes:
                     self._add_counts(connection, key, counts[key], None if sizes is None else sizes[key])
 
-    def _add_counts(self, connection: Connection[Any], key: MapKey, counted: Counts, places: int | None) -> None:
+    def _add_counts(self, connection: Connection[Any], key: MapKey, counted: AnswerCounts, places: int | None) -> None:
         code = _code(connection, key, counted.since)
         found = sorted(counted.places.items())
         connection.execute(

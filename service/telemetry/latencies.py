@@ -25,7 +25,7 @@ Operation = tuple[str, str]
 
 
 @dataclass
-class Counts:
+class LatencyCounts:
     """Durations of the requests of one operation.
 
     bins: how many fell into each bin.
@@ -46,7 +46,7 @@ class Counts:
         self.errors += is_error
         self.longest = max(self.longest, seconds)
 
-    def add(self, other: Counts) -> None:
+    def add(self, other: LatencyCounts) -> None:
         """Count the requests of another time, too."""
         for number, count in other.bins.items():
             self.bins[number] = self.bins.get(number, 0) + count
@@ -72,7 +72,7 @@ class RecentLatencies:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._slots: deque[tuple[int, dict[Operation, Counts]]] = deque(maxlen=SECONDS // SLOT_SECONDS)
+        self._slots: deque[tuple[int, dict[Operation, LatencyCounts]]] = deque(maxlen=SECONDS // SLOT_SECONDS)
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count one request."""
@@ -82,15 +82,15 @@ class RecentLatencies:
         slot = self._slots[-1][1]
         counts = slot.get((method, route))
         if counts is None:
-            counts = slot[method, route] = Counts()
+            counts = slot[method, route] = LatencyCounts()
         counts.observe(seconds, status >= 500 or status == 0)
 
-    def read(self) -> dict[Operation, Counts]:
+    def read(self) -> dict[Operation, LatencyCounts]:
         """The counts of the last ``SECONDS``, the most frequent operation first."""
         oldest = int(self._clock() / SLOT_SECONDS) - SECONDS // SLOT_SECONDS
-        found: dict[Operation, Counts] = {}
+        found: dict[Operation, LatencyCounts] = {}
         for number, slot in self._slots:
             if number > oldest:
                 for operation, counts in slot.items():
-                    found.setdefault(operation, Counts()).add(counts)
+                    found.setdefault(operation, LatencyCounts()).add(counts)
         return dict(sorted(found.items(), key=lambda item: -item[1].count))

@@ -64,7 +64,7 @@ def align_sequence(
         As :func:`align`.
     """
     map_ = context.map(engine.maps)
-    traverses = Traverses(map_)
+    traverses = TraversesToAlign(map_)
     first = traverses.rows(sequence)
     names = traverses.others(sequence) if others is None else list(dict.fromkeys(others))
     seconds = [traverses.rows(name) for name in names]
@@ -114,12 +114,12 @@ def check_request(map_: Map, sequence: str, others: Sequence[str] | None) -> Non
     """
     if sequence in (others or ()):
         raise InvalidRequest("with: a sequence cannot be aligned with itself.")
-    traverses = Traverses(map_)
+    traverses = TraversesToAlign(map_)
     for name in (sequence, *(others or ())):
         traverses.rows(name)
 
 
-class Traverses:
+class TraversesToAlign:
     """The traverses of a map at one moment, with at least one frame each.
 
     snapshot: what is searched at that moment.
@@ -212,7 +212,7 @@ def _pairs(found: Sequence[Shared], still: NDArray[np.bool_]) -> Rows:
 
 
 def _change(
-    map_: Map, traverses: Traverses, own: Rows, found: Sequence[Shared], forget: bool, poses: bool
+    map_: Map, traverses: TraversesToAlign, own: Rows, found: Sequence[Shared], forget: bool, poses: bool
 ) -> Correspondence:
     """What to store, for the places that are what they were when they were compared; call it while no write begins.
 
@@ -255,7 +255,7 @@ def _change(
 
 
 def _report(
-    traverses: Traverses, sequence: str, own: Rows, found: Sequence[Shared], change: Correspondence
+    traverses: TraversesToAlign, sequence: str, own: Rows, found: Sequence[Shared], change: Correspondence
 ) -> dict[str, Any]:
     places = traverses.places
     frames = set(own.tolist())

@@ -41,7 +41,7 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Plan:
+class MergePlan:
     """What a merge is going to do.
 
     coming: the places of the other map that are copied, each with its id in this map.
@@ -84,7 +84,7 @@ def check_same_encoder(map_: Map, other: Map) -> None:
         )
 
 
-def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequence[Outline]) -> Plan:
+def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequence[Outline]) -> MergePlan:
     """Decide what to copy, under which names, and find what prevents it; nothing is changed.
 
     Args:
@@ -125,7 +125,7 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
         conflicts.append(f"{len(coming) - len(given)} places would get the id of another place; choose another prefix.")
     wanted = [place for place, _ in coming] + unnamed
     sequences, cameras = _new_names(map_, other, options, before, wanted, conflicts)
-    return Plan(coming, known, skipped, renamed, sequences, cameras, conflicts)
+    return MergePlan(coming, known, skipped, renamed, sequences, cameras, conflicts)
 
 
 def _new_names(
@@ -217,7 +217,7 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     return dict(context.notes["report"]) | {"places": map_.count_places()}
 
 
-def _new_cameras(map_: Map, other: Map, plan: Plan) -> list[str]:
+def _new_cameras(map_: Map, other: Map, plan: MergePlan) -> list[str]:
     existing = {camera.name for camera in map_.cameras.all()}
     used = {place.camera for place, _ in plan.coming}
     names = [plan.cameras.get(camera.name, camera.name) for camera in other.cameras.all() if camera.name in used]

@@ -16,7 +16,7 @@ from core.errors import UnknownSequence
 from core.judgement.reliability import wilson
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.upkeep.hubness import NONE
-from core.upkeep.redundancy import Thinning, Trial, best_thinning, first_looks, neighbour_pairs, steps, thinned
+from core.upkeep.redundancy import RemovalTrial, Thinning, best_thinning, first_looks, neighbour_pairs, steps, thinned
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
 from service.jobs.context import JobContext, yield_to_requests
@@ -169,7 +169,7 @@ def _search(
     queries: NDArray[np.bool_],
     references: NDArray[np.bool_],
     sample: int,
-) -> Trial:
+) -> RemovalTrial:
     """Search for a sample of the queries among the references, for each query without itself.
 
     Raises:
@@ -209,4 +209,4 @@ def _search(
             "to prune, or poses and sequences do not tell which places are the same."
         )
     positions, scores, gains, right = (np.stack(column) for column in zip(*found, strict=True))
-    return Trial(positions, scores, gains, right, stage)
+    return RemovalTrial(positions, scores, gains, right, stage)

@@ -28,7 +28,7 @@ from service.http.openapi import BINARY
 from service.http.routing import EngineDep, FromState, MapId, milliseconds_since, rounded, single_values, started
 from service.http.schemas import Parameters
 from service.jobs.context import creation_time
-from service.upkeep.alignment import Traverses
+from service.upkeep.alignment import TraversesToAlign
 from service.upkeep.schemas import ComparedTraverse, SharedPath, SimilarityScale, SimilarityView
 
 router = APIRouter(prefix="/v1/maps/{map}", tags=["upkeep"], dependencies=[Depends(single_values)])
@@ -82,7 +82,7 @@ class Matrices:
         self.turn = CapacityLimiter(1)
         self._kept: OrderedDict[tuple[str, str], Matrix] = OrderedDict()
 
-    def of(self, map_: Map, traverses: Traverses, encoder: Encoder, queries: Rows, references: Rows) -> Matrix:
+    def of(self, map_: Map, traverses: TraversesToAlign, encoder: Encoder, queries: Rows, references: Rows) -> Matrix:
         """The matrix of two traverses; call it in the turn.
 
         Raises:
@@ -134,7 +134,7 @@ async def compare_traverses(
     most = engine.settings.max_similarity_pairs
 
     def make() -> Response:
-        traverses = Traverses(map_)
+        traverses = TraversesToAlign(map_)
         queries, references = (traverses.frames(name) for name in (options.query, options.reference))
         if len(queries) * len(references) > most:
             raise TooManyPairs(
@@ -161,7 +161,7 @@ def _about(matrix: Matrix) -> dict[str, str]:
 
 def _view(
     map_: Map,
-    traverses: Traverses,
+    traverses: TraversesToAlign,
     encoder: Encoder,
     options: SimilarityParameters,
     rows: tuple[Rows, Rows],

@@ -50,7 +50,7 @@ MOST_PART_BYTES = 8 << 30
 Count = Annotated[int, Field(ge=0, strict=True)]
 
 
-class Part(BaseModel):
+class ArchivePart(BaseModel):
     """One part of the file.  rows: how many lines it has, or of how many places it holds descriptors or pictures."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -82,14 +82,14 @@ class Manifest(BaseModel):
     version: int
     map: ArchivedRecord
     places: Count
-    parts: Annotated[list[Part], FailFast()]
+    parts: Annotated[list[ArchivePart], FailFast()]
 
     @property
     def groups(self) -> int:
         """How many groups of places, descriptors, pictures and keypoints there are."""
         return (len(self.parts) - 2) // _kinds(self.version)
 
-    def group(self, number: int) -> Sequence[Part]:
+    def group(self, number: int) -> Sequence[ArchivePart]:
         """Places, descriptors, pictures and, from version 2 on, keypoints of group ``number``, counted from 0."""
         first = 2 + number * _kinds(self.version)
         return self.parts[first : first + _kinds(self.version)]
@@ -196,7 +196,7 @@ def _read(value: dict[str, Any]) -> Manifest:
     expect_names(value, Manifest, MANIFEST)
     parts = value.get("parts")
     for part in parts if isinstance(parts, list) else ():
-        expect_names(part, Part, f"{MANIFEST}: parts")
+        expect_names(part, ArchivePart, f"{MANIFEST}: parts")
     try:
         manifest = Manifest.model_validate(value)
     except (ValidationError, RecursionError) as error:

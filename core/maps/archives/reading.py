@@ -11,7 +11,7 @@ from typing import Self
 
 from core.errors import InvalidArchive
 from core.maps.archives.lines import MOST_LINE_BYTES
-from core.maps.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
+from core.maps.archives.manifest import MANIFEST, SEAL, ArchivePart, Manifest, read_manifest, seal_of, tag_of
 from core.maps.archives.tar_layout import (
     BLOCK,
     END_BYTES,
@@ -61,7 +61,7 @@ class Archive:
         """Close the file."""
         os.close(self._file)
 
-    def part(self, part: Part) -> PartReader:
+    def part(self, part: ArchivePart) -> PartReader:
         """A reader of a part, from its beginning to its end."""
         return PartReader(self._read_at, self._members[part.name], part)
 
@@ -117,7 +117,7 @@ def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Mani
 class PartReader:
     """Reads one part in order; what was read is trustworthy only when :meth:`finish` has returned."""
 
-    def __init__(self, read_at: Callable[[int, int], bytes], member: Member, part: Part) -> None:
+    def __init__(self, read_at: Callable[[int, int], bytes], member: Member, part: ArchivePart) -> None:
         self._read_at, self._member, self._part = read_at, member, part
         block = read_at(member.start - BLOCK, BLOCK)
         if block != header(member.name, member.size):

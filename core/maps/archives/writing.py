@@ -23,8 +23,8 @@ from core.maps.archives.manifest import (
     SEQUENCES,
     VERSION,
     ArchivedRecord,
+    ArchivePart,
     Manifest,
-    Part,
     group_names,
     seal_of,
     tag_of,
@@ -200,11 +200,11 @@ def _write(
     return Exported(path, manifest, tag_of(text), tape.size)
 
 
-def _unread(name: str, rows: int, size: int) -> Part:
-    return Part(name=name, rows=rows, bytes=size, sha256="0" * 64)
+def _unread(name: str, rows: int, size: int) -> ArchivePart:
+    return ArchivePart(name=name, rows=rows, bytes=size, sha256="0" * 64)
 
 
-def _write_part(file: BinaryIO, part: Part, chunks: Chunks) -> Part:
+def _write_part(file: BinaryIO, part: ArchivePart, chunks: Chunks) -> ArchivePart:
     """Write a part with its header; return it with its SHA-256."""
     file.write(header(part.name, part.bytes))
     digest, size = hashlib.sha256(), 0

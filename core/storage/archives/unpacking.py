@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from core.errors import InvalidArchive, InvalidImage, InvalidKeypoints
 from core.geometry.keypoints import MOST, keypoints_of, record_bytes
 from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
-from core.maps.archives.manifest import Manifest, Part
+from core.maps.archives.manifest import ArchivePart, Manifest
 from core.maps.archives.reading import Archive, PartReader
 from core.maps.cameras import MOST_CAMERAS
 from core.maps.enrolling import LARGEST_HALF
@@ -133,7 +133,7 @@ class Unpacking(ABC):
             self._group(*manifest.group(number))
         self.archive.check_end()
 
-    def _sequences(self, part: Part) -> Iterator[SequenceLine]:
+    def _sequences(self, part: ArchivePart) -> Iterator[SequenceLine]:
         places = self.archive.manifest.places
         if part.rows > places + 1:
             raise InvalidArchive(f"{part.name}: {places} places are in no more than {places + 1} sequences.")
@@ -144,7 +144,7 @@ class Unpacking(ABC):
             yield line
         reader.finish()
 
-    def _cameras(self, part: Part) -> Iterator[CameraLine]:
+    def _cameras(self, part: ArchivePart) -> Iterator[CameraLine]:
         if part.rows > MOST_CAMERAS:
             raise InvalidArchive(f"{part.name}: a map has at most {MOST_CAMERAS} cameras.")
         reader = self.archive.part(part)
@@ -152,7 +152,7 @@ class Unpacking(ABC):
             yield line
         reader.finish()
 
-    def _group(self, places: Part, frames: Part, *more: Part) -> None:
+    def _group(self, places: ArchivePart, frames: ArchivePart, *more: ArchivePart) -> None:
         lines, rows, *others = (self.archive.part(part) for part in (places, frames, *more))
         step = max(1, CHUNK_BYTES // self.layout.record.itemsize)
         chunk: list[PlaceLine] = []
@@ -218,7 +218,7 @@ class Unpacking(ABC):
         return record
 
 
-def _lines(reader: PartReader, part: Part, kind: type[Kind]) -> Iterator[tuple[Kind, int]]:
+def _lines(reader: PartReader, part: ArchivePart, kind: type[Kind]) -> Iterator[tuple[Kind, int]]:
     """The lines of a part, as many as the manifest says, each with the length of its text."""
     seen = 0
     for text in reader.lines():

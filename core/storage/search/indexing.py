@@ -28,7 +28,7 @@ from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.rebuilding import codes_of, extended, rebuilt
 from core.storage.search.recall import measure_recall
-from core.storage.search.segment import Held
+from core.storage.search.segment import HeldRows
 from core.storage.search.snapshot import Snapshot, threads
 from core.storage.search.tiers import holds_for, tier_for
 
@@ -388,7 +388,7 @@ class Indexer:
     def _hold(self, number: int) -> None:
         """Read the descriptors of a segment into memory; the last segment may grow meanwhile."""
 
-        def read(now: Snapshot, before: Held | None) -> Held:
+        def read(now: Snapshot, before: HeldRows | None) -> HeldRows:
             first, count = now.segments[number].first_row, len(now.segments[number])
             done = 0 if before is None else before.index.ntotal
             rows = np.arange(first + done, first + count)
@@ -397,7 +397,7 @@ class Indexer:
             if before is not None:
                 vectors(index)[:done], local[:done] = vectors(before.index), before.local
             vectors(index)[done:], local[done:] = now.descriptors_at(rows), now.locals_at(rows)
-            return Held(index, local)
+            return HeldRows(index, local)
 
         newest = self._map.snapshot()
         if newest.segments[number].removed:

@@ -53,7 +53,7 @@ def memory_of(whereabouts: Whereabouts) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class HeldRows:
     """The descriptors of a segment in memory.
 
     index: the segment's rows, followed by room for further rows.
@@ -69,13 +69,13 @@ class Held:
         return vectors(self.index)
 
     @classmethod
-    def nothing(cls, dimension: int, local_shape: tuple[int, int], halves: bool = False) -> Held:
+    def nothing(cls, dimension: int, local_shape: tuple[int, int], halves: bool = False) -> HeldRows:
         """The descriptors of a segment without rows."""
         return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
 
     def appended(
         self, n: int, descriptors: Sequence[Descriptor] | Vectors, local: Sequence[Local] | Local, largest: int
-    ) -> Held:
+    ) -> HeldRows:
         """With more rows after the first ``n``; the memory is shared if it has room for them."""
         index, cells, end = self.index, self.local, n + len(descriptors)
         if end > index.ntotal:
@@ -88,7 +88,7 @@ class Held:
             vectors(index)[n:end] = descriptors
         if len(local):
             cells[n:end] = local
-        return Held(index, cells)
+        return HeldRows(index, cells)
 
 
 class Reading:
@@ -108,7 +108,7 @@ class Segment:
     removed: no row is alive, and the descriptors are deleted in memory and on disk.
     """
 
-    held: Held | None
+    held: HeldRows | None
     first_row: int
     whereabouts: Whereabouts
     alive: NDArray[np.bool_]

@@ -31,7 +31,7 @@ from core.places import Neighborhood, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
-from core.storage.search.segment import Held, Location, Segment, whereabouts_of
+from core.storage.search.segment import HeldRows, Location, Segment, whereabouts_of
 from core.threads import cores, in_turns, keep_to
 
 __all__ = ["SHORTLIST", "Location", "SearchScope", "Segment", "Snapshot"]
@@ -306,7 +306,7 @@ class Snapshot:
             if not segments or len(segments[-1]) == self.rows_per_segment:
                 row = sum(len(segment) for segment in segments)
                 alive, no_sums = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
-                held = Held.nothing(self.dimension, self.local_shape, self.halves) if self.holds else None
+                held = HeldRows.nothing(self.dimension, self.local_shape, self.halves) if self.holds else None
                 segments.append(Segment(held, row, whereabouts_of([]), alive, no_sums))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
@@ -348,7 +348,7 @@ class Snapshot:
         assert self.table is not None
         return replace(self, table=self.table.with_block(block))
 
-    def holding(self, number: int, held: Held | None) -> Snapshot:
+    def holding(self, number: int, held: HeldRows | None) -> Snapshot:
         """The snapshot with a segment's descriptors in memory, or only on disk (None); a removed segment stays."""
         segments = list(self.segments)
         if segments[number].removed:

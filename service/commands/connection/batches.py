@@ -14,14 +14,14 @@ from placerec_client.errors import InvalidFrame, InvalidName
 from service.commands.connection.client import Service, failures
 
 if TYPE_CHECKING:
-    from core.recordings import Frame as TakenFrame
+    from core.recordings import RecordedFrame
 
 PATIENCE = 120.0
 """Seconds for which a batch is repeated while the service is overloaded or restarts."""
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameToSend:
     """One frame to enrol.
 
     taken: as the recording tells it.
@@ -29,7 +29,7 @@ class Frame:
     camera: the camera of the map that took it; None for none.
     """
 
-    taken: TakenFrame
+    taken: RecordedFrame
     sequence: str
     camera: str | None = None
 
@@ -55,10 +55,10 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SendingOutcome:
     """The result for one frame: its ``change``, or why it was refused, and whether its bytes were ``uploaded``."""
 
-    frame: Frame
+    frame: FrameToSend
     change: str | None
     posed: bool = False
     refusal: str | None = None
@@ -68,10 +68,10 @@ class Outcome:
 async def enrol_frames(
     service: Service,
     map_id: str,
-    frames: Sequence[Frame],
+    frames: Sequence[FrameToSend],
     known: frozenset[str],
     encoder: str | None,
-    tell: Callable[[Outcome], None],
+    tell: Callable[[SendingOutcome], None],
 ) -> None:
     """Enrol frames in their order.
 
@@ -93,7 +93,7 @@ async def enrol_frames(
                 tell(_outcome(by_id[outcome.place.id], outcome))
 
 
-def _load(frame: Frame) -> bytes:
+def _load(frame: FrameToSend) -> bytes:
     """The bytes of a frame, when its turn has come; one that cannot be used is refused alone."""
     try:
         return frame.taken.load()
@@ -103,10 +103,10 @@ def _load(frame: Frame) -> bytes:
         raise InvalidFrame(str(error)) from error
 
 
-def _outcome(frame: Frame, found: Enrolled) -> Outcome:
+def _outcome(frame: FrameToSend, found: Enrolled) -> SendingOutcome:
     if found.change is None:
         nameless = isinstance(found.error, InvalidName)
         refusal = "no id can be made from its name; give it one in places.csv." if nameless else str(found.error)
-        return Outcome(frame, None, refusal=refusal, uploaded=found.uploaded)
+        return SendingOutcome(frame, None, refusal=refusal, uploaded=found.uploaded)
     posed = bool(found.fields.keys() & {"x", "latitude"})
-    return Outcome(frame, found.change, posed=posed, uploaded=found.uploaded)
+    return SendingOutcome(frame, found.change, posed=posed, uploaded=found.uploaded)

@@ -63,7 +63,7 @@ class Refused(Failure):
 
 
 @dataclass
-class Target:
+class CommandTarget:
     """Where the requests of a command go: a URL, or the data directory if there is none."""
 
     url: str | None
@@ -176,7 +176,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 @asynccontextmanager
-async def open_service(target: Target) -> AsyncIterator[Service]:
+async def open_service(target: CommandTarget) -> AsyncIterator[Service]:
     """The service at the target's URL, or one in this process.
 
     Raises:
@@ -227,7 +227,7 @@ def read_settings(data_dir: Path | None = None) -> Settings:
     return found if data_dir is None else found.model_copy(update={"data_dir": data_dir})
 
 
-def ask(target: Target, method: str, path: str, **options: Any) -> httpx.Response:
+def ask(target: CommandTarget, method: str, path: str, **options: Any) -> httpx.Response:
     """Send one request and return its answer; it raises what ``Service.request`` raises."""
 
     async def work() -> httpx.Response:
@@ -237,7 +237,7 @@ def ask(target: Target, method: str, path: str, **options: Any) -> httpx.Respons
     return run(work())
 
 
-def list_items(target: Target, path: str, params: dict[str, Any] | None = None) -> list[Any]:
+def list_items(target: CommandTarget, path: str, params: dict[str, Any] | None = None) -> list[Any]:
     """All items of a listing; it raises what ``Service.request`` raises."""
 
     async def work() -> list[Any]:
@@ -254,11 +254,11 @@ def run(work: Coroutine[Any, Any, Result]) -> Result:
 
 __all__ = [
     "AsJson",
+    "CommandTarget",
     "DataDir",
     "MapId",
     "Refused",
     "Service",
-    "Target",
     "Url",
     "ask",
     "failures",

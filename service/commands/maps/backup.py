@@ -18,11 +18,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.commands.connection.client import (
     AsJson,
+    CommandTarget,
     DataDir,
     MapId,
     Refused,
     Service,
-    Target,
     Url,
     open_service,
     path_of,
@@ -55,7 +55,7 @@ def export(
         raise Failure(f"{file} already exists. Give --overwrite to replace it.")
 
     async def work() -> str | None:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             return await download(service, map_id, file, overwrite=overwrite)
 
     tag = run(work())
@@ -71,18 +71,18 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Create a map from a file, after all of the file was checked."""
-    check_outlives(Target(url, data_dir), wait)
+    check_outlives(CommandTarget(url, data_dir), wait)
     check_file(file)
 
     async def work() -> dict[str, object]:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             job = await upload(service, file, map_id)
             return await followed(service, job) if wait else job
 
     show_outcome(run(work()), as_json)
 
 
-class Entry(BaseModel):
+class BackupEntry(BaseModel):
     """A map of a backup; ``listed`` is whether the service had it when the backup was last made."""
 
     model_config = ConfigDict(extra="forbid")
@@ -96,21 +96,21 @@ class Entry(BaseModel):
     listed: bool = True
 
 
-class Index(BaseModel):
+class BackupIndex(BaseModel):
     """The maps of a backup."""
 
     model_config = ConfigDict(extra="forbid")
 
     format: str = FORMAT
     version: int = 1
-    maps: list[Entry] = []
+    maps: list[BackupEntry] = []
 
-    def find(self, map_id: str) -> Entry | None:
+    def find(self, map_id: str) -> BackupEntry | None:
         """The entry of a map."""
         return next((entry for entry in self.maps if entry.id == map_id), None)
 
 
-def read_index(folder: Path) -> Index:
+def read_index(folder: Path) -> BackupIndex:
     """The index of a backup.
 
     Raises:
@@ -118,7 +118,7 @@ def read_index(folder: Path) -> Index:
     """
     path = folder / INDEX
     try:
-        index = Index.model_validate_json(path.read_bytes())
+        index = BackupIndex.model_validate_json(path.read_bytes())
     except OSError as error:
         raise Failure(f"{path} cannot be read: {error.strerror}.") from error
     except ValidationError as error:
@@ -135,10 +135,10 @@ def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir
     Maps that the service no longer has stay in the folder until they are removed by hand.
     """
     with _held(folder):
-        index = read_index(folder) if (folder / INDEX).exists() else Index()
+        index = read_index(folder) if (folder / INDEX).exists() else BackupIndex()
 
         async def work() -> list[str]:
-            async with open_service(Target(url, data_dir)) as service:
+            async with open_service(CommandTarget(url, data_dir)) as service:
                 return await _save_all(service, folder, index, only)
 
         failed = run(work())
@@ -147,7 +147,7 @@ def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir
         raise Failure(f"These maps could not be saved: {', '.join(failed)}.")
 
 
-async def _save_all(service: Service, folder: Path, index: Index, only: list[str] | None) -> list[str]:
+async def _save_all(service: Service, folder: Path, index: BackupIndex, only: list[str] | None) -> list[str]:
     """Save maps one after the other; return those that could not be saved."""
     pages = [page async for page in service.pages(path_of("maps"))]
     there = [item["id"] for page in pages for item in page["items"]]
@@ -169,7 +169,7 @@ async def _save_all(service: Service, folder: Path, index: Index, only: list[str
     return failed
 
 
-async def _save(service: Service, folder: Path, index: Index, map_id: str) -> None:
+async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str) -> None:
     before = index.find(map_id)
     known = None
     if before is not None:
@@ -184,7 +184,7 @@ async def _save(service: Service, folder: Path, index: Index, map_id: str) -> No
     file = folder / f"{map_id}.{tag[:16]}.tar"
     _rename(downloaded, file)
     archive = _manifest_of(file)
-    entry = Entry(
+    entry = BackupEntry(
         id=map_id,
         file=file.name,
         manifest_sha256=tag,
@@ -215,7 +215,7 @@ def _manifest_of(file: Path) -> Any:
         return archive.manifest
 
 
-def _write_index(folder: Path, index: Index) -> None:
+def _write_index(folder: Path, index: BackupIndex) -> None:
     from core.disk.files import write_file
 
     text = json.dumps(index.model_dump(mode="json"), indent=2) + "\n"
@@ -225,7 +225,7 @@ def _write_index(folder: Path, index: Index) -> None:
         raise Failure(f"{folder / INDEX} cannot be written: {error.strerror}.") from error
 
 
-def _remove_strays(folder: Path, index: Index) -> None:
+def _remove_strays(folder: Path, index: BackupIndex) -> None:
     """Remove earlier files of maps, which the index no longer names."""
     named = {entry.file for entry in index.maps}
     for entry in index.maps:
@@ -282,7 +282,7 @@ def restore(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDi
 
     async def work() -> list[str]:
         failed = []
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             for entry in entries:
                 try:
                     await _restore(service, folder, entry)
@@ -295,7 +295,7 @@ def restore(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDi
         raise Failure(f"These maps were not restored: {', '.join(failed)}.")
 
 
-async def _restore(service: Service, folder: Path, entry: Entry) -> None:
+async def _restore(service: Service, folder: Path, entry: BackupEntry) -> None:
     file = folder / entry.file
     check_file(file, entry.manifest_sha256)
     job = await followed(service, await upload(service, file, entry.id))
@@ -305,7 +305,7 @@ async def _restore(service: Service, folder: Path, entry: Entry) -> None:
     remark(f"{entry.id}: {job['result']['places']} places.")
 
 
-def _chosen(index: Index, only: list[str] | None) -> list[Entry]:
+def _chosen(index: BackupIndex, only: list[str] | None) -> list[BackupEntry]:
     if only is None:
         return index.maps
     if missing := [map_id for map_id in only if index.find(map_id) is None]:

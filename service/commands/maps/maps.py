@@ -6,7 +6,17 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, open_service, path_of, run
+from service.commands.connection.client import (
+    AsJson,
+    CommandTarget,
+    DataDir,
+    MapId,
+    Url,
+    ask,
+    open_service,
+    path_of,
+    run,
+)
 from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
 from service.commands.maps.backup import export, import_
 from service.commands.maps.places import places, sequences
@@ -48,7 +58,7 @@ def list_maps(url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
     """List all maps, including damaged ones."""
 
     async def work() -> list[dict[str, Any]]:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             return [page async for page in service.pages(path_of("maps"))]
 
     pages = run(work())
@@ -67,7 +77,7 @@ def list_maps(url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 @maps.command("show")
 def show_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Show one map."""
-    _show_map(ask(Target(url, data_dir), "GET", path_of("maps", map_id)).json(), as_json)
+    _show_map(ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id)).json(), as_json)
 
 
 @maps.command("create")
@@ -86,7 +96,7 @@ def create_map(
     """Create a map. Its encoder cannot be changed later."""
     given = _given(description, keep, same_place_radius, same_place_frames, verification)
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
-    _show_map(ask(Target(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
+    _show_map(ask(CommandTarget(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
 
 
 @maps.command("edit")
@@ -118,7 +128,7 @@ def edit_map(
         raise typer.BadParameter("give at least one setting to change")
 
     async def work() -> Any:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
             # The edit is refused if somebody else has changed the map in between.
             seen = await service.request("GET", path_of("maps", map_id))
             headers = {"If-Match": seen.headers["ETag"]}
@@ -138,14 +148,14 @@ def delete_map(
     path = path_of("maps", map_id)
     if not yes:
         typer.confirm(f"Delete the map {map_id} and all its places?", abort=True)
-    ask(Target(url, data_dir), "DELETE", path)
+    ask(CommandTarget(url, data_dir), "DELETE", path)
     remark(f"The map {map_id} is deleted.")
 
 
 @maps.command("verify")
 def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Read all that is stored of a map and check it; the exit status is 1 if it is damaged."""
-    report = ask(Target(url, data_dir), "POST", path_of("maps", map_id, "verify")).json()
+    report = ask(CommandTarget(url, data_dir), "POST", path_of("maps", map_id, "verify")).json()
     if as_json:
         show_json(report)
     if not report["ok"]:

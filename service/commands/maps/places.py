@@ -10,9 +10,9 @@ import typer
 
 from service.commands.connection.client import (
     AsJson,
+    CommandTarget,
     DataDir,
     MapId,
-    Target,
     Url,
     ask,
     list_items,
@@ -38,7 +38,7 @@ def list_places(
 ) -> None:
     """List a map's places in the order of their enrolment."""
     params = {"sequence": sequence} if sequence is not None else None
-    found = list_items(Target(url, data_dir), path_of("maps", map_id, "places"), params)
+    found = list_items(CommandTarget(url, data_dir), path_of("maps", map_id, "places"), params)
     if as_json:
         show_json(found)
         return
@@ -53,7 +53,7 @@ def show_place(
     map_id: MapId, place_id: PlaceId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 ) -> None:
     """Show one place."""
-    _show_place(ask(Target(url, data_dir), "GET", path_of("maps", map_id, "places", place_id)).json(), as_json)
+    _show_place(ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "places", place_id)).json(), as_json)
 
 
 @places.command("edit")
@@ -94,7 +94,7 @@ def edit_place(
     if not changes:
         raise typer.BadParameter("give at least one field to change")
     path = path_of("maps", map_id, "places", place_id)
-    _show_place(ask(Target(url, data_dir), "PATCH", path, json=changes).json(), as_json)
+    _show_place(ask(CommandTarget(url, data_dir), "PATCH", path, json=changes).json(), as_json)
 
 
 @places.command("delete")
@@ -111,7 +111,7 @@ def delete_places(
     path = path_of("maps", map_id, "places") + ":delete"
 
     async def work() -> None:
-        async with open_service(Target(url, data_dir)) as service:
+        async with open_service(CommandTarget(url, data_dir)) as service:
 
             async def order(dry_run: bool) -> Any:
                 return (await service.request("POST", path, json={"ids": place_ids, "dry_run": dry_run})).json()
@@ -139,7 +139,7 @@ def save_thumbnail(
     data_dir: DataDir = None,
 ) -> None:
     """Save the picture that the map keeps of a place."""
-    picture = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
+    picture = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
     try:
         file.write_bytes(picture)
     except OSError as error:
@@ -187,7 +187,7 @@ sequences = typer.Typer(cls=Commands, help="List and delete the traverses of a m
 @sequences.command("list")
 def list_sequences(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """List the traverses of a map."""
-    found = list_items(Target(url, data_dir), path_of("maps", map_id, "sequences"))
+    found = list_items(CommandTarget(url, data_dir), path_of("maps", map_id, "sequences"))
     if as_json:
         show_json(found)
         return
@@ -209,5 +209,5 @@ def delete_sequence(
     path = path_of("maps", map_id, "sequences", sequence)
     if not yes:
         typer.confirm(f"Delete all places of the sequence {sequence} of the map {map_id}?", abort=True)
-    deleted = ask(Target(url, data_dir), "DELETE", path).json()
+    deleted = ask(CommandTarget(url, data_dir), "DELETE", path).json()
     remark(f"The sequence {sequence} is deleted: {deleted['places']} places.")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, path_of
+from service.commands.connection.client import AsJson, CommandTarget, DataDir, MapId, Url, ask, path_of
 from service.commands.console import number, output, remark, show, show_json, table
 from service.commands.jobs import Wait, show_outcome, submit
 
@@ -29,7 +29,7 @@ def health(
 ) -> None:
     """Report how well a map works: places that never match or match too often, gaps, drift, stretches to redo."""
     asked = {"limit": limit, "seconds": seconds}
-    report = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "health"), params=asked).json()
+    report = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "health"), params=asked).json()
     if as_json:
         show_json(report)
         return
@@ -77,21 +77,21 @@ def reencode(
 ) -> None:
     """Create a new map from the images of a map, with another encoder."""
     body = {"to": to, **({} if encoder is None else {"encoder": encoder})}
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
 
 
 def rebuild(
     map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 ) -> None:
     """Rebuild the search index of a large map from its descriptors, while it is searched."""
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
 
 
 def keypoints(
     map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 ) -> None:
     """Find the keypoints of places that have none, in the pictures that the map keeps."""
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "keypoints"), {}, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "keypoints"), {}, wait), as_json)
 
 
 def align(
@@ -117,7 +117,7 @@ def align(
     if undo and with_:
         raise typer.BadParameter("--undo cannot be combined with --with")
     body = {"sequence": sequence, "with": [] if undo else with_ or None, "poses": poses, "dry_run": dry_run}
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "align"), body, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "align"), body, wait), as_json)
 
 
 def prune(
@@ -140,7 +140,7 @@ def prune(
     given = {"similarity": similarity, "sequence": sequence, "queries": queries}
     body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     body |= {"max_recall_loss": max_recall_loss, "dry_run": not yes}
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
     if not yes:
         remark("Nothing is deleted without --yes: this is what would be.")
 
@@ -164,4 +164,4 @@ def merge(
     """Add the places of another map to this one; without --yes only report what would be added."""
     body: dict[str, Any] = {"from": other, "on_conflict": on_conflict, "dry_run": not yes}
     body |= {} if prefix is None else {"prefix": prefix}
-    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "merge"), body, wait), as_json)
+    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "merge"), body, wait), as_json)

@@ -13,7 +13,7 @@ from core.judgement.alignment import (
     LARGEST,
     LEAST_FRAMES,
     ORDINARY,
-    Pairs,
+    AlignedPairs,
     SharedStretch,
     best_pairs,
     best_path,
@@ -87,9 +87,9 @@ def test_frames_and_places_that_resemble_everything_do_not_count() -> None:
     assert found.gains.max() == pytest.approx(-ORDINARY, abs=1e-3)
 
 
-def every_pair(gains: Values) -> Pairs:
+def every_pair(gains: Values) -> AlignedPairs:
     rows, others = gains.shape
-    return Pairs(np.tile(np.arange(others), (rows, 1)), gains, others, np.ones(rows, np.bool_))
+    return AlignedPairs(np.tile(np.arange(others), (rows, 1)), gains, others, np.ones(rows, np.bool_))
 
 
 def test_the_best_path_is_the_best_of_all() -> None:
@@ -121,7 +121,7 @@ def test_a_path_goes_on_through_pairs_that_were_not_kept() -> None:
     """They count as ordinary ones, as long as the sum stays positive."""
     columns = np.array([[2, 8], [3, 9], [0, 7], [5, 6]])
     gains = np.array([[2.0, 0.1], [2.0, 0.1], [-1.0, -1.0], [2.0, 0.1]])
-    path, total = best_path(Pairs(columns, gains, 10, np.ones(4, np.bool_)))
+    path, total = best_path(AlignedPairs(columns, gains, 10, np.ones(4, np.bool_)))
     assert path.tolist() == [[0, 2], [1, 3], [2, 4], [3, 5]]
     assert total == pytest.approx(6 - ORDINARY)
 

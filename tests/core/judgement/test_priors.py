@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.judgement.priors import (
-    Box,
     Constraint,
     Disc,
     Facing,
+    GeographicBox,
     InSequences,
     NotLately,
     Period,
@@ -101,17 +101,19 @@ def test_a_box(south: float, west: float, north: float, east: float, latitude: f
     if min(edges) < 1e-6 or abs(latitude) > 89.9 or abs(abs(longitude) - 180) < 1e-6:
         return
     expected = inside_height and inside_width
-    assert held(Box(west, south, east, north), Pose(latitude=latitude, longitude=longitude)) == [expected]
+    assert held(GeographicBox(west, south, east, north), Pose(latitude=latitude, longitude=longitude)) == [expected]
 
 
 def test_boxes_at_the_edges_of_the_map() -> None:
-    fiji = Box(177, -20, -178, -15)
+    fiji = GeographicBox(177, -20, -178, -15)
     inside = [Pose(latitude=-17, longitude=longitude) for longitude in (177, 180, -180, -179, -178)]
     assert held(fiji, *inside) == [True] * 5
     assert held(fiji, Pose(latitude=-17, longitude=0), Pose(latitude=-17, longitude=176.9)) == [False, False]
-    assert held(Box(-180, -90, 180, 90), *inside, Pose(latitude=90, longitude=3)) == [True] * 6
-    assert held(Box(10, 80, 20, 90), Pose(latitude=90, longitude=-77)) == [True], "every meridian meets the pole"
-    meridian = Box(30, -10, 30, 10)
+    assert held(GeographicBox(-180, -90, 180, 90), *inside, Pose(latitude=90, longitude=3)) == [True] * 6
+    assert held(GeographicBox(10, 80, 20, 90), Pose(latitude=90, longitude=-77)) == [True], (
+        "every meridian meets the pole"
+    )
+    meridian = GeographicBox(30, -10, 30, 10)
     assert held(meridian, Pose(latitude=1, longitude=30), Pose(latitude=1, longitude=-150)) == [True, False]
     assert held(fiji, Pose(x=0, y=0), None) == [False, False]
 

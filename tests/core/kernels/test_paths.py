@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.judgement.alignment import Pairs, best_pairs, best_path, best_path_by_rows, of_matrix
+from core.judgement.alignment import AlignedPairs, best_pairs, best_path, best_path_by_rows, of_matrix
 
 
-def pairs_of(seed: int) -> Pairs:
+def pairs_of(seed: int) -> AlignedPairs:
     """Pairs of some frames, few or many of each, with a path among them, and rows that are not free."""
     random = np.random.default_rng(seed)
     rows, columns = random.integers(1, 60, 2)
@@ -18,7 +18,7 @@ def pairs_of(seed: int) -> Pairs:
     if len(pairs.columns[0]) > 3:
         chosen = np.sort(random.permuted(np.tile(np.arange(pairs.columns.shape[1]), (rows, 1)), axis=1)[:, :3], axis=1)
         if seed % 2:
-            pairs = Pairs(
+            pairs = AlignedPairs(
                 np.take_along_axis(pairs.columns, chosen, axis=1),
                 np.take_along_axis(pairs.gains, chosen, axis=1),
                 pairs.others,
@@ -39,6 +39,6 @@ def test_paths_are_those_found_by_rows() -> None:
 
 
 def test_without_a_gain_there_is_no_path() -> None:
-    nothing = Pairs(np.zeros((3, 1), np.int64), np.full((3, 1), -1.0), 1, np.ones(3, np.bool_))
+    nothing = AlignedPairs(np.zeros((3, 1), np.int64), np.full((3, 1), -1.0), 1, np.ones(3, np.bool_))
     path, total = best_path(nothing)
     assert path.shape == (0, 2) and total == 0

@@ -26,7 +26,7 @@ from pathlib import Path
 import psycopg
 
 from core.errors import StorageFailure
-from core.milvus.collection import Connection
+from core.milvus.collection import MilvusConnection
 from tests.core.milvus.object_server import PORTS, object_store
 
 ROOT = Path(__file__).parents[3]
@@ -179,7 +179,7 @@ class Servers:
         psycopg.connect(self.postgres_address, connect_timeout=5).close()
 
     def _ask_milvus(self) -> None:
-        connection = Connection(self.milvus_address, "", "", None)
+        connection = MilvusConnection(self.milvus_address, "", "", None)
         try:
             connection.check()
         finally:

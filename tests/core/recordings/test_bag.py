@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnknownTopic
-from core.recordings import Frame, Poses, open_recording
+from core.recordings import Poses, RecordedFrame, open_recording
 from tests.core.recordings.bags import (
     CAMERA,
     ODOMETRY,
@@ -41,7 +41,7 @@ def pixels_of(png: bytes, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), flags))
 
 
-def loaded(path: Path, topic: str | None = None) -> tuple[list[Frame], list[bytes], list[str]]:
+def loaded(path: Path, topic: str | None = None) -> tuple[list[RecordedFrame], list[bytes], list[str]]:
     """The frames of a bag, their bytes and what is remarked."""
     with open_recording(path, topic) as recording:
         return recording.frames, [frame.load() for frame in recording.frames], recording.remarks

@@ -11,18 +11,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.places import Pose
-from core.recordings import Frame
+from core.recordings import RecordedFrame
 from core.recordings.frame import NANOSECONDS
 from core.recordings.keyframes import SLACK, Left, Spacing, keyframes, moving, pose_noise
 
 
-def frame(number: int, x: float | None = None, heading: float | None = None, seconds: float | None = None) -> Frame:
+def frame(
+    number: int, x: float | None = None, heading: float | None = None, seconds: float | None = None
+) -> RecordedFrame:
     pose = None if x is None else Pose(x=x, y=0, heading=heading)
     taken = None if seconds is None else round(seconds * NANOSECONDS)
-    return Frame(str(number), str(number), bytes, pose, nanoseconds=taken)
+    return RecordedFrame(str(number), str(number), bytes, pose, nanoseconds=taken)
 
 
-def chosen(frames: Sequence[Frame], **measures: float) -> list[int]:
+def chosen(frames: Sequence[RecordedFrame], **measures: float) -> list[int]:
     return [int(one.id) for one in keyframes(frames, Spacing(**measures))]
 
 
@@ -80,7 +82,7 @@ def test_change_is_measured_from_the_last_keyframe() -> None:
     angles = {str(index): np.radians(angle) for index, angle in enumerate((0, 20, 40, 70, 90, 95))}
     asked: list[str] = []
 
-    def describe(one: Frame) -> NDArray[np.float32] | None:
+    def describe(one: RecordedFrame) -> NDArray[np.float32] | None:
         asked.append(one.id)
         angle = angles[one.id]
         return None if one.id == "4" else np.array([np.cos(angle), np.sin(angle)], np.float32)
@@ -94,12 +96,12 @@ def test_change_is_measured_from_the_last_keyframe() -> None:
 
 
 def test_poses_in_metres_and_in_degrees_are_far_apart() -> None:
-    north = Frame("1", "1", bytes, Pose(latitude=1, longitude=1))
+    north = RecordedFrame("1", "1", bytes, Pose(latitude=1, longitude=1))
     assert [one.id for one in keyframes([frame(0, 0), north], Spacing(metres=1e6))] == ["0", "1"]
 
 
 def test_measures_on_the_earth_are_in_metres() -> None:
-    frames = [Frame(str(index), "", bytes, Pose(latitude=index * 1e-5, longitude=0)) for index in range(10)]
+    frames = [RecordedFrame(str(index), "", bytes, Pose(latitude=index * 1e-5, longitude=0)) for index in range(10)]
     assert chosen(frames, metres=3.0) == [0, 3, 6, 9]  # a hundred-thousandth of a degree is 1.11 m
     assert pytest.approx(1.11, abs=0.01) == float(
         np.linalg.norm((frames[1].pose or Pose(x=0, y=0)).position() - (frames[0].pose or Pose(x=0, y=0)).position())
@@ -126,9 +128,11 @@ def test_noise_of_poses_moves_no_robot(noise: float, every: int) -> None:
         noises = np.random.default_rng(seed).normal(0, noise, (2, 300 // every + 1))
         x, y = (np.interp(np.arange(300), every * np.arange(len(one)), one) for one in noises)
 
-        def frames(speed: float, x: NDArray[np.float64] = x, y: NDArray[np.float64] = y) -> list[Frame]:
+        def frames(speed: float, x: NDArray[np.float64] = x, y: NDArray[np.float64] = y) -> list[RecordedFrame]:
             return [
-                Frame(str(n), "", bytes, Pose(x=0.1 * speed * n + x[n], y=y[n]), nanoseconds=n * NANOSECONDS // 10)
+                RecordedFrame(
+                    str(n), "", bytes, Pose(x=0.1 * speed * n + x[n], y=y[n]), nanoseconds=n * NANOSECONDS // 10
+                )
                 for n in range(300)
             ]
 
@@ -141,5 +145,5 @@ def test_noise_of_poses_moves_no_robot(noise: float, every: int) -> None:
 def test_poses_on_the_earth_have_noise_in_metres() -> None:
     degrees = np.random.default_rng(0).normal(0, 1 / 111_195, (400, 2))
     poses = [Pose(latitude=60 + a, longitude=20 + b / np.cos(np.radians(60))) for a, b in degrees]
-    assert pose_noise([Frame("", "", bytes, pose) for pose in poses]) == pytest.approx(1.0, abs=0.1)
-    assert pose_noise([Frame("", "", bytes, pose) for pose in poses[:5]]) == 0
+    assert pose_noise([RecordedFrame("", "", bytes, pose) for pose in poses]) == pytest.approx(1.0, abs=0.1)
+    assert pose_noise([RecordedFrame("", "", bytes, pose) for pose in poses[:5]]) == 0

@@ -13,8 +13,8 @@ from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import (
     FEWEST_STANDING,
     MOST_NEIGHBOURS,
+    RemovalTrial,
     Thinning,
-    Trial,
     best_thinning,
     first_looks,
     neighbour_pairs,
@@ -125,11 +125,11 @@ def test_a_dense_line_is_thinned_and_a_sparse_one_is_not() -> None:
     assert thinned(30, pairs, np.full(29, 0.4, np.float32), 0.5).all()
 
 
-def trial(positions: list[list[int]], right: list[list[bool]], candidates: int = 0, **more: object) -> Trial:
+def trial(positions: list[list[int]], right: list[list[bool]], candidates: int = 0, **more: object) -> RemovalTrial:
     shape = np.array(positions).shape
     scores = more.get("scores", [list(np.linspace(0.9, 0.1, shape[1]))] * shape[0])
     gains = more.get("gains", np.zeros(shape))
-    return Trial(
+    return RemovalTrial(
         np.array(positions, np.int64),
         np.array(scores, np.float32),
         np.array(gains, np.float32),

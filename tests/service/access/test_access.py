@@ -22,7 +22,7 @@ from service.access.gate import WEBSOCKET, Endpoint, endpoints_of, is_loopback_h
 from service.access.keys import KeyStore
 from service.access.roles import OPERATIONS, covers
 from service.app.application import create_app
-from service.commands.connection.client import Target, open_service
+from service.commands.connection.client import CommandTarget, open_service
 from service.settings import Settings
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
@@ -158,7 +158,7 @@ async def test_a_damaged_file_of_keys_stops_the_start(tmp_path: Path) -> None:
 @pytest.mark.anyio
 async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> None:
     KeyStore(tmp_path).create("ann", "query")
-    async with open_service(Target(None, tmp_path)) as service:
+    async with open_service(CommandTarget(None, tmp_path)) as service:
         assert (await service.get("/v1/maps"))["items"] == []
         await service.request("POST", "/v1/maps", json={"id": "lab"})
 

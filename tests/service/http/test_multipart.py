@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors.faults import BodyTooLarge, MalformedBody
-from service.http.multipart import FormReader, Part
+from service.http.multipart import FormPart, FormReader
 
 BOUNDARY = "seam"
 TYPE = f'multipart/form-data; boundary="{BOUNDARY}"'
@@ -19,7 +19,7 @@ def form(*parts: tuple[str, bytes]) -> bytes:
     return b"".join(pieces) + b"--%s--\r\n" % BOUNDARY.encode()
 
 
-def read(body: bytes, size: int = 1 << 16, max_parts: int = 8, max_part_bytes: int = 1000) -> list[Part]:
+def read(body: bytes, size: int = 1 << 16, max_parts: int = 8, max_part_bytes: int = 1000) -> list[FormPart]:
     reader = FormReader(TYPE, max_parts, max_part_bytes)
     for start in range(0, len(body), size):
         reader.feed(body[start : start + size])
@@ -48,7 +48,7 @@ def test_any_chunking_gives_the_same_parts(contents: list[bytes], size: int) -> 
 def test_headers_of_a_part() -> None:
     head = disposition("bild", "flur 7 – süd.jpg") + "\r\nContent-Type: Image/JPEG; x=y\r\nX-Other: 1"
     (part,) = read(form((head, b"data")))
-    assert part == Part("bild", "flur 7 – süd.jpg", "image/jpeg", b"data", False)
+    assert part == FormPart("bild", "flur 7 – süd.jpg", "image/jpeg", b"data", False)
 
 
 def test_a_part_over_the_limit_is_marked_and_not_kept() -> None:

@@ -20,7 +20,7 @@ from service.queries.statistics import (
     FILE,
     MOST_WEEKS,
     SPARE_PLACES,
-    Counts,
+    AnswerCounts,
     PlaceCount,
     QueryStatistics,
     VerdictCounts,
@@ -112,7 +112,7 @@ def test_old_weeks_are_dropped(tmp_path: Path, maps: Maps) -> None:
     counted = counting(tmp_path, maps)
     monday = date(2020, 1, 6)
     weeks = {m: Week.of(m, "unknown", 0.1, 0.1) for m in (monday + timedelta(weeks=n) for n in range(MOST_WEEKS + 9))}
-    counted._counts[LAB] = Counts("2020-01-06T00:00:00+00:00", {}, weeks)
+    counted._counts[LAB] = AnswerCounts("2020-01-06T00:00:00+00:00", {}, weeks)
     found = counted.read(LAB).weeks
     assert [week.monday for week in found] == sorted(weeks)[9:]
     counted.close()

@@ -11,7 +11,7 @@ import pytest
 from service.settings import Settings
 from service.shared.agreement import COMMON, Agreement
 from service.shared.database import SharedDatabase
-from service.shared.replica import FILE, Replica
+from service.shared.replica import FILE, ServiceReplica
 from tests.service.encoders import COARSE, install_two_stage_encoder
 from tests.service.server import Server
 from tests.service.sessions.test_sessions import begin
@@ -33,12 +33,12 @@ def test_differences_are_told_until_they_end(database: SharedDatabase, tmp_path:
         models = tmp_path / f"models-{name}"
         if name == "other":
             install_two_stage_encoder(models)
-        replica = Replica(database, tmp_path / name)
+        replica = ServiceReplica(database, tmp_path / name)
         given = Settings(data_dir=tmp_path / name, rate_per_key=rate, models_dir=models)
         replicas.append(replica)
         services.append(Agreement(given, database, replica.id))
 
-    def until(service: Agreement, text: str, telling: list[Replica]) -> None:
+    def until(service: Agreement, text: str, telling: list[ServiceReplica]) -> None:
         ends = time.monotonic() + 60
         while text not in service.state:
             assert time.monotonic() < ends, service.state

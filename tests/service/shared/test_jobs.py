@@ -19,7 +19,7 @@ from service.jobs.context import JobContext
 from service.shared import replica as replicas
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
-from service.shared.replica import Replica
+from service.shared.replica import ServiceReplica
 from tests.service.jobs import test_jobs as embedded
 from tests.service.jobs.test_jobs import Gate, Kinds, end_of
 from tests.service.server import ROOT
@@ -48,7 +48,7 @@ class Service:
     def __init__(self, address: str, folder: Path, kinds: Kinds, shared_maps: bool = True, **limits: Any) -> None:
         folder.mkdir(exist_ok=True)
         self.database = SharedDatabase(address)
-        self.replica = Replica(self.database, folder)
+        self.replica = ServiceReplica(self.database, folder)
         self.jobs = SharedJobs(self.replica, shared_maps, **limits)
         for kind, work in kinds.items():
             self.jobs.register(kind, work)

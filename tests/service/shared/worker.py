@@ -12,7 +12,7 @@ from typing import Any
 from service.jobs.context import JobContext
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
-from service.shared.replica import Replica
+from service.shared.replica import ServiceReplica
 
 STEPS = 200
 
@@ -30,7 +30,7 @@ def walk(context: JobContext) -> Mapping[str, Any]:
 def main() -> None:
     """Do jobs."""
     address, folder = sys.argv[1], Path(sys.argv[2])
-    replica = Replica(SharedDatabase(address), folder)
+    replica = ServiceReplica(SharedDatabase(address), folder)
     jobs = SharedJobs(replica, shared_maps=True)
     jobs.register("walk", walk)
     replica.start()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.telemetry.latencies import SECONDS, Counts, RecentLatencies
+from service.telemetry.latencies import SECONDS, LatencyCounts, RecentLatencies
 
 QUERY = ("POST", "/v1/maps/{map}/query")
 
@@ -47,4 +47,4 @@ def test_what_is_older_than_the_window_is_dropped() -> None:
 
 
 def test_nothing_took_no_time() -> None:
-    assert Counts().quantile(0.5) == 0.0
+    assert LatencyCounts().quantile(0.5) == 0.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.method.encoder import Encoder
 from core.upkeep.similarity import score_pairs
-from service.upkeep.alignment import Traverses
+from service.upkeep.alignment import TraversesToAlign
 from service.upkeep.similarity import KEPT, Matrices
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.engines import ENCODER, runtime_at
@@ -137,7 +137,7 @@ def test_the_latest_matrices_are_kept_and_follow_the_traverses(tmp_path: Path) -
         ways = walk(count=700)
         visit(map_, "a", ways)
         visit(map_, "b", ways[::2], seed=2)
-        matrices, traverses = Matrices(), Traverses(map_)
+        matrices, traverses = Matrices(), TraversesToAlign(map_)
         first, second = traverses.frames("a"), traverses.frames("b")
         made = matrices.of(map_, traverses, plain, first, second)
         snapshot = traverses.snapshot
@@ -145,9 +145,9 @@ def test_the_latest_matrices_are_kept_and_follow_the_traverses(tmp_path: Path) -
         assert np.allclose(made.scores, products, atol=1e-5)
         turned = score_pairs(snapshot, plain, second, first)
         assert np.allclose(turned, products.T, atol=1e-5), "whichever is the longer"
-        assert matrices.of(map_, Traverses(map_), plain, first, second) is made
+        assert matrices.of(map_, TraversesToAlign(map_), plain, first, second) is made
         map_.forget("a3")
-        later = Traverses(map_)
+        later = TraversesToAlign(map_)
         other = matrices.of(map_, later, plain, later.frames("a"), second)
         assert other is not made and len(other.scores) == 699
         for count in range(KEPT + 1):
