@@ -109,6 +109,7 @@ def test_a_program_that_puts_itself_under_no_watch_is_waited_for_no_longer(progr
         subprocess.run([sys.executable, "-c", program, watch.wrapper[-1]])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("constant", "value", "said"),
     [

@@ -55,12 +55,14 @@ def day(tmp_path_factory: pytest.TempPathFactory, walk: Walk) -> Iterator[Day]:
     assert made.server.stop() == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("asking", ["session", "enrol"])
 def test_a_robot_that_stands_where_it_was_mapped_is_recognized(day: Day, asking: Asking) -> None:
     told = day.drive(asking, "standing on a mapped view")
     assert told.count("right") == len(told.outcomes)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("asking", ["session", "odometry"])
 def test_answers_that_are_lost_confuse_nobody(day: Day, asking: Asking) -> None:
     told = day.drive(asking, "answers lost")
@@ -69,6 +71,7 @@ def test_answers_that_are_lost_confuse_nobody(day: Day, asking: Asking) -> None:
     assert told.again == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("asking", ["single", "session"])
 def test_a_map_enrolled_twice_is_the_same_place(day: Day, asking: Asking) -> None:
     told = day.drive(asking, "map enrolled twice")
@@ -76,6 +79,7 @@ def test_a_map_enrolled_twice_is_the_same_place(day: Day, asking: Asking) -> Non
     assert told.count("right") > 0
 
 
+@pytest.mark.thorough
 def test_a_camera_upside_down_that_says_so_sees_what_one_upright_sees(day: Day) -> None:
     upright = day.drive("single", "passing", "always")
     turned = day.drive("single", "upside down, with EXIF", "always")
@@ -83,6 +87,7 @@ def test_a_camera_upside_down_that_says_so_sees_what_one_upright_sees(day: Day) 
     assert turned.outcomes[:both] == upright.outcomes[:both] == ("right",) * both
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("asking", ["single", "session"])
 def test_nothing_is_recognized_wrongly_while_a_hand_covers_the_camera(day: Day, asking: Asking) -> None:
     told = day.drive(asking, "hand over the camera")
@@ -91,12 +96,14 @@ def test_nothing_is_recognized_wrongly_while_a_hand_covers_the_camera(day: Day, 
     assert told.again == 0
 
 
+@pytest.mark.thorough
 def test_a_session_goes_on_after_a_restart(day: Day) -> None:
     told = day.drive("odometry", "restart")
     assert told.again == 0
     assert told.count("right") == len(told.outcomes)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SITUATIONS)
 def test_a_situation_is_the_same_each_time(walk: Walk, name: str) -> None:
     first, second = (list(moments(SITUATIONS[name], walk, 0.1)) for _ in range(2))

@@ -20,6 +20,7 @@ def test_the_literal_vlad_is_the_compiled_one() -> None:
     np.testing.assert_allclose(reference_vlad(features, centers).reshape(-1), made, atol=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [2.0, 0.5])
 def test_both_pipelines_give_one_vector(step: float) -> None:
     encoder = EncoderCatalogue().get(THESIS)

@@ -23,6 +23,7 @@ def made() -> Material:
     )
 
 
+@pytest.mark.thorough
 def test_rows_are_the_same_in_every_block(made: Material) -> None:
     whole = made.references(0, 50)
     assert np.array_equal(whole[20:33], made.references(20, 33))

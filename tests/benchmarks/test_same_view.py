@@ -38,6 +38,7 @@ def failed(made: list[Comparison]) -> list[Comparison]:
     return [one for one in made if one.fails(one.inliers)]
 
 
+@pytest.mark.thorough
 def test_a_drawn_picture_is_recognized_in_every_view(network: XFeat) -> None:
     made = same_views(network, scene(37), "scene 37")
     assert [one.kind for one in made] == list(VIEWS)
@@ -53,6 +54,7 @@ def test_strangers_have_no_more_evidence(network: XFeat) -> None:
         assert one.evidence == one.evidence_before < 40
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not HERE, reason="the pictures of ../shared/datasets are not here")
 def test_real_pictures_are_recognized(network: XFeat) -> None:
     """Each is compared with itself, and some with one other view, all of which have their turn."""

@@ -71,6 +71,7 @@ def taken(text: str) -> bool:
     return passes
 
 
+@pytest.mark.thorough
 @given(st.one_of(st.text(max_size=LONGEST + 2), st.text(ODD, max_size=5), st.from_regex(TEXT, fullmatch=True)))
 def test_a_name_is_what_can_be_read_and_stands_in_a_path(text: str) -> None:
     assert taken(text) == can_be(text)
@@ -95,6 +96,7 @@ def test_a_path_keeps_a_name_whatever_normalizes_it(text: str) -> None:
     assert httpx.URL(f"http://robot{path}").raw_path.decode() == path == posixpath.normpath(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("pattern", WORDS)
 def test_a_word_is_a_text(pattern: str) -> None:
     @given(st.from_regex(pattern, fullmatch=True))

@@ -16,6 +16,7 @@ def test_nobody_can_switch_reports_on(before: dict[str, str]) -> None:
     assert before == SWITCHES
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", ["core.networks.forward", "service.ray_serve.replica", "service.app.application"])
 def test_what_reports_is_imported_after_it_is_switched_off(module: str) -> None:
     code = f"import os, sys, importlib.abc\n{WATCH}\nimport {module}"

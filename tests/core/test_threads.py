@@ -30,6 +30,7 @@ def test_what_the_user_has_set_stays(before: dict[str, str], after: dict[str, st
     assert before == after
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "module",
     [

@@ -72,6 +72,7 @@ def test_long_pages_are_pages() -> None:
     assert set(LONG) < {name_of(page) for page in PAGES}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("document", PAGES, ids=name_of)
 def test_what_the_commands_name_is_there(document: Path) -> None:
     """Every ``placerec`` of a page is a command with these options, also where the page itself is not run."""
@@ -150,6 +151,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     forked.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("document", CASES)
 def test_the_commands_run_as_they_are_written(
     document: Path, shared: Server, tmp_path: Path, pictures: Path, environment: Path

@@ -18,6 +18,7 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
     assert (FOLDER / name).read_text() == PAGES[name](), "run scripts/reference"
 
 
+@pytest.mark.thorough
 def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
     service = Server(tmp_path / "service").wait()
     try:

@@ -28,12 +28,14 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StorageProce
         yield processes
 
 
+@pytest.mark.thorough
 def test_storage_killed_at_random_moments_loses_nothing(tmp_path: Path, processes: StorageProcesses) -> None:
     tally = StorageKills(tmp_path, SEED).run(processes, 8)
     assert tally.kills == 8
     assert tally.operations > 40
 
 
+@pytest.mark.thorough
 @needs_strace
 def test_storage_killed_at_calls_that_write_loses_nothing(tmp_path: Path, processes: StorageProcesses) -> None:
     every = kill_points.points(processes, tmp_path, SEED)
@@ -49,6 +51,7 @@ def test_storage_without_power_loses_nothing_that_was_acknowledged(tmp_path: Pat
     assert tally.syncs > 20
 
 
+@pytest.mark.thorough
 @needs_strace
 def test_storage_that_does_not_sync_is_found_out(tmp_path: Path) -> None:
     with StorageProcesses(tmp_path, unsynced="descriptors") as processes, pytest.raises(Lost, match="power cut"):
@@ -60,6 +63,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> ServerProcesses:
     return ServerProcesses(tmp_path_factory.mktemp("servers"))
 
 
+@pytest.mark.thorough
 def test_a_service_killed_while_clients_use_it_loses_nothing(
     tmp_path: Path, processes: StorageProcesses, servers: ServerProcesses
 ) -> None:

@@ -43,6 +43,7 @@ def test_the_pictures_are_always_the_same(pictures: Path, tmp_path: Path) -> Non
         assert path.read_bytes() == (tmp_path / path.relative_to(pictures)).read_bytes()
 
 
+@pytest.mark.thorough
 def test_it_knows_the_places_and_not_the_street(service: Server, pictures: Path) -> None:
     (pictures / "camera" / "5-broken.jpg").write_bytes(b"no frame")
     (pictures / "camera" / "notes.txt").write_text("no frame either")
@@ -57,6 +58,7 @@ def test_it_knows_the_places_and_not_the_street(service: Server, pictures: Path)
     assert broken.startswith("5-broken.jpg: frame refused: ")
 
 
+@pytest.mark.thorough
 def test_it_draws_frames_of_its_own(service: Server) -> None:
     done = run("examples/robot.py", "--url", service.client.base_url, "--map", "tour", "--deadline", 20)
     assert done.returncode == 0, done.stderr
@@ -69,6 +71,7 @@ def test_it_stops_where_no_frame_will_be_answered(service: Server) -> None:
     assert "The robot stops: " in done.stderr
 
 
+@pytest.mark.thorough
 def test_it_goes_on_without_a_service(pictures: Path) -> None:
     words = ("--url", f"http://127.0.0.1:{free_port()}", "--map", "tour", "--deadline", 0.3)
     done = run("examples/robot.py", *words, "--frames", pictures / "places")

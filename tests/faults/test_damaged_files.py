@@ -211,6 +211,7 @@ def kind(sound: Sound, suffix: str) -> list[Path]:
     return [path for path in files_of(sound) if path.name.endswith(suffix)]
 
 
+@pytest.mark.thorough
 def test_a_damaged_database_is_found(closed: Sound, tmp_path: Path) -> None:
     outcomes = run_cases(closed, tmp_path, kind(closed, ".sqlite"), 10)
     assert outcomes["quarantined"] and not outcomes["wrong until verified"]
@@ -267,6 +268,7 @@ def test_the_end_of_a_log_that_is_damaged_is_as_a_crash_leaves_it(crashed: Sound
     atlas.close()
 
 
+@pytest.mark.thorough
 def test_every_value_of_a_row_has_a_checksum(closed: Sound, tmp_path: Path) -> None:
     """Values that are changed by other means than the map, in a way that SQLite accepts."""
     moment = "'2026-01-01T00:00:00.000000+00:00'"

@@ -119,6 +119,7 @@ def wait_for_readiness(server: Server, status: int) -> httpx.Response:
     return response
 
 
+@pytest.mark.thorough
 @needs_strace
 @pytest.mark.parametrize(
     ("error", "status", "slug"), [("ENOSPC", 507, "storage-full"), ("EIO", 500, "storage-failure")]
@@ -170,6 +171,7 @@ def test_no_file_descriptor_is_left(server: Server, lab: str) -> None:
     check_recovered(server)
 
 
+@pytest.mark.thorough
 def test_a_data_directory_that_disappears_for_a_while(server: Server, lab: str) -> None:
     away = server.data_dir.with_name("away")
     server.data_dir.rename(away)
@@ -182,6 +184,7 @@ def test_a_data_directory_that_disappears_for_a_while(server: Server, lab: str) 
     check_recovered(server)
 
 
+@pytest.mark.thorough
 def test_a_clock_that_jumps(server: Server, lab: str, clock: Path) -> None:
     """By hours to either side: sessions and deadlines go on, and what is read afterwards is what was written."""
     session = server.client.post("/v1/maps/lab/sessions", json={"expires_after": 600}).json()["id"]
@@ -279,6 +282,7 @@ def test_a_frame_that_the_memory_does_not_suffice_for(server: Server, lab: str) 
     check_recovered(server)
 
 
+@pytest.mark.thorough
 def test_a_start_on_a_full_disk(tmp_path: Path) -> None:
     """It says so and ends with an error."""
     full = Server(tmp_path, wrapper=("/bin/sh", "-c", 'ulimit -f 0; exec "$@"', "sh"))

@@ -119,6 +119,7 @@ def inject(
         folder.with_suffix(".trace").unlink(missing_ok=True)
 
 
+@pytest.mark.thorough
 def test_the_write_points_are_of_every_kind(points: list[Point]) -> None:
     assert {point.call for point in points} >= {
         "openat", "pwrite64", "fsync", "fdatasync", "ftruncate", "mkdir", "rename", "unlink", "mmap",
@@ -134,6 +135,7 @@ def sample(points: Sequence[Point], count: int) -> list[Point]:
     return [point for call in calls for point in chosen.sample(by_call[call], min(count, len(by_call[call])))]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("error", ["ENOSPC", "EIO"])
 def test_a_refused_call_at_a_write_point(
     scripts: ScriptProcesses, points: list[Point], tmp_path: Path, error: str
@@ -142,6 +144,7 @@ def test_a_refused_call_at_a_write_point(
         inject(scripts, tmp_path / str(number), point, error)
 
 
+@pytest.mark.thorough
 def test_a_disk_that_is_full_for_a_while(scripts: ScriptProcesses, points: list[Point], tmp_path: Path) -> None:
     """Several calls of a kind fail in a row; then the same process goes on."""
     chosen = random.Random(SEED)

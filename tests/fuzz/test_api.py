@@ -32,6 +32,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, st
 FEW = ("--max-examples", "2", "--generation-deterministic", "--no-shrink")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("phase", "operations"), [("examples", 35), pytest.param("fuzzing", 45, marks=pytest.mark.thorough)]
 )

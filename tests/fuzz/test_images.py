@@ -31,6 +31,7 @@ def test_every_original_is_sound_but_the_animation() -> None:
             assert decode(original.data).any(), original.name
 
 
+@pytest.mark.thorough
 def test_damaged_pictures_are_decoded_or_refused() -> None:
     ends, kinds = Counter[str](), set()
     for index in range(1500):
@@ -46,6 +47,7 @@ def test_damaged_pictures_are_decoded_or_refused() -> None:
     assert min(ends[name] for name in ("decoded", "TruncatedImage", "NotAnImage", "UnsupportedFormat")) > 20, ends
 
 
+@pytest.mark.thorough
 def test_the_service_answers_each_and_stands_as_it_stood(fuzzed: Server) -> None:
     report = images.run(str(fuzzed.client.base_url), fuzzed.process.pid, ORIGINALS, seed=5, count=120, threads=3)
     assert report.wrong == [] and report.complaints == [], report.table()

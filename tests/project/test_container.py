@@ -188,6 +188,7 @@ def answering() -> Iterator[HTTPServer]:
         thread.join()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("status", "healthy"), [(200, True), (503, False)])
 def test_health_check_tells_ready_from_not(answering: HTTPServer, status: int, healthy: bool) -> None:
     answering.RequestHandlerClass.status = status  # type: ignore[attr-defined]

@@ -15,6 +15,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from scipy.sparse import coo_array
@@ -61,6 +62,7 @@ KNOWN_CROWDS = {"tests/core/storage"}
 """Folders of tests with more modules, to be divided when one of them grows."""
 
 
+@pytest.mark.thorough
 def test_no_files_import_each_other_in_a_circle() -> None:
     graph = import_graph(FILES)
     assert len(graph) > 300
@@ -133,6 +135,7 @@ def allowed(path: Path) -> set[str]:
     return {canonicalize_name(Requirement(text).name) for text in texts}
 
 
+@pytest.mark.thorough
 def test_what_is_imported_is_declared() -> None:
     known = (
         set(sys.stdlib_module_names)
@@ -172,6 +175,7 @@ print(count, *(sorted(blocked & {name.split(".")[0] for name in sys.modules})))
 """
 
 
+@pytest.mark.thorough
 def test_the_service_and_the_core_need_only_what_the_service_lock_has() -> None:
     """Every module is imported, those of an extra apart, while nothing can be imported that the lock leaves out."""
     extra = set(locked("development")) - set(locked("service"))

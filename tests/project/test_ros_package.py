@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pytest
 import yaml
 
 from placerec_client.version import VERSION
@@ -16,6 +17,7 @@ from placerec_ros.parameters import PARAMETERS
 from tests.project.sources import NODE
 
 
+@pytest.mark.thorough
 def test_what_is_built_is_a_package_of_ros(tmp_path: Path) -> None:
     shutil.copytree(NODE, tmp_path / "source", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
     words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path)]

@@ -40,6 +40,7 @@ ISOLATED = {
 """Calls in readers that run in a child process with limits."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("folder", ["core", "service", "lab"])
 def test_nothing_runs_what_it_reads(folder: str) -> None:
     """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""

@@ -65,6 +65,7 @@ def test_what_reports_would_be_seen(watch: Watch, tmp_path: Path) -> None:
     assert any(path.startswith(str(tmp_path / "home")) for path in written(watch, tmp_path)), watch.seen
 
 
+@pytest.mark.thorough
 def test_the_service(watch: Watch, tmp_path: Path) -> None:
     with watch:
         server = Server(tmp_path / "server", wrapper=wrapped(watch, tmp_path))
@@ -93,6 +94,7 @@ def use(server: Server) -> None:
         assert server.client.get(path).status_code == 200, path
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("where", ["--url", "--data-dir"])
 def test_commands(watch: Watch, tmp_path: Path, server: Server, where: str) -> None:
     """On a map of a service, whose address is all that they know, and on a data directory."""
@@ -106,6 +108,7 @@ def test_commands(watch: Watch, tmp_path: Path, server: Server, where: str) -> N
     assert written(watch, tmp_path, tmp_path / "data") == set()
 
 
+@pytest.mark.thorough
 def test_a_child_that_reads_what_others_published(watch: Watch, tmp_path: Path) -> None:
     (tmp_path / "small.onnx").write_bytes(onnx_network().SerializeToString())
     (tmp_path / "small.json").write_text(MAPS.model_dump_json())

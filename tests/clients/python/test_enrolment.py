@@ -100,6 +100,7 @@ def map_id(client: Client) -> str:
     return client.maps.create(f"line-{uuid4().hex}", encoder=SMALL).id
 
 
+@pytest.mark.thorough
 def test_two_at_a_time_in_line(server: Server, map_id: str) -> None:
     way = Mischief({})
     told = enrol(server, map_id, 26, way)
@@ -126,6 +127,7 @@ def test_enrolling_is_done_when_it_is_called(server: Server, url: str, map_id: s
     assert len(server.places(map_id)) == 12
 
 
+@pytest.mark.thorough
 def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, map_id: str) -> None:
     way = Mischief(
         {
@@ -141,12 +143,14 @@ def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, m
     assert len(way.sent) > 15  # those that were sent once more
 
 
+@pytest.mark.thorough
 def test_more_than_the_service_takes_at_a_time(server: Server, map_id: str) -> None:
     way = Mischief({4: problem(413, "body-too-large"), 8: problem(503, "deadline-exceeded", **{"Retry-After": "1"})})
     assert len(enrol(server, map_id, 30, way)) == 30
     assert list(server.places(map_id)) == [f"p{index}" for index in range(30)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("failing", [1, 2, 4])
 def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, failing: int) -> None:
     way = Mischief({failing: problem(507, "storage-full")})
@@ -164,6 +168,7 @@ WRONG: list[Any] = ["", ".", "..", "a/b", "\n", 'a"b', "ä ö", "p" * 129, "\ud8
 """What is no id of a place."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("known", [None, ()])
 def test_a_place_that_cannot_be_sent_fails_alone(
     server: Server, client: Client, map_id: str, known: Sequence[str] | None
@@ -195,6 +200,7 @@ def test_the_ids_of_places_are_those_of_the_service() -> None:
     assert batches.PLACE_ID.pattern == PLACE_IDS.pattern
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("moment", [9, pytest.param(20, marks=pytest.mark.thorough)])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, moment: int) -> None:
     server = Server(tmp_path / "service").wait()

@@ -16,6 +16,7 @@ def test_a_module_says_what_openapi_json_says(name: str) -> None:
     assert (PACKAGE / name).read_text() == models.rendered(name), "run scripts/client"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", twin.modules())
 def test_both_halves_are_the_same(name: str) -> None:
     assert (PACKAGE / "_sync" / name).read_text() == twin.rendered(name), "run scripts/client"

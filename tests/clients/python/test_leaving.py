@@ -99,6 +99,7 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
     return [one for one in caplog.records if (one.name, one.levelno) == ("placerec_client", logging.WARNING)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("fault", "on_its_way"),
     [("silence", KeyboardInterrupt), ("silence", None), ("cut-before", ValueError), ("lose-answer", KeyboardInterrupt)],

@@ -148,6 +148,7 @@ def assert_hits(words: str, plain: tuple[str, str], marker: str, name: str, sent
         assert unquote(wanted.split("/")[path.split("/").index(marker)]) == name
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("half", [Client, AsyncClient])
 def test_no_name_leads_a_call_astray(half: Any, refusing: tuple[str, Seen], tmp_path: Path) -> None:
     url, seen = refusing

@@ -95,6 +95,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str
     assert running.stop() == 0
 
 
+@pytest.mark.thorough
 def test_every_operation_has_a_call(guarded: tuple[str, str], tmp_path: Path) -> None:
     recording = Recording()
     url, key = guarded

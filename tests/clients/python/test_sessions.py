@@ -51,6 +51,7 @@ def walk(lab: Map) -> Map:
     return lab
 
 
+@pytest.mark.thorough
 def test_a_frame_whose_answer_is_lost_counts_once(server: Server, walk: Map) -> None:
     with FaultProxy(server.port, share=0.6, seed=3, faults=("lose-answer", "cut-answer", "duplicate")) as way:
         with Client(way.url, retry=Retry(60, 0.02, 0.2)) as client, client.maps[walk.id].sessions.begin() as session:
@@ -60,6 +61,7 @@ def test_a_frame_whose_answer_is_lost_counts_once(server: Server, walk: Map) -> 
         assert way.happened["lose-answer"] + way.happened["cut-answer"] > 3
 
 
+@pytest.mark.thorough
 def test_a_stream_is_taken_up_again(server: Server, walk: Map) -> None:
     with FaultProxy(server.port, share=0, messages=5) as way, Client(way.url, retry=Retry(60, 0.02, 0.2)) as client:
         with client.maps[walk.id].sessions.begin() as session, session.stream() as stream:
@@ -82,6 +84,7 @@ def odometry_at(place: int) -> Odometry:
     return Odometry(3.0, 2.0 * place - 8, 90.0, [grown, 0, 0, 0, grown, 0, 0, 0, 0], "morning")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("patience", [0, 60])
 def test_odometry_counts_once_whatever_is_lost(server: Server, walk: Map, patience: float) -> None:
     fates: list[Fault] = ["none", "lose-answer", "cut-request", "lose-answer", "lose-answer", "cut-before", "none"]
@@ -117,6 +120,7 @@ def test_odometry_counts_once_whatever_is_lost(server: Server, walk: Map, patien
         assert report.frames == (len(WAY) if patience else len(WAY) - 2)
 
 
+@pytest.mark.thorough
 def test_a_stream_that_is_cut_counts_odometry_once(server: Server, walk: Map) -> None:
     with FaultProxy(server.port, share=0, messages=5) as way, Client(way.url, retry=Retry(60, 0.02, 0.2)) as client:
         sessions = client.maps[walk.id].sessions
@@ -229,6 +233,7 @@ def test_a_session_that_was_begun_elsewhere_goes_on(walk: Map) -> None:
             session.send(jpeg(1, 64, 48), frame=7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("streamed", [False, True])
 def test_a_refused_frame_leaves_the_numbers_alone(walk: Map, streamed: bool) -> None:
     frame = jpeg(0, 64, 48)
@@ -251,6 +256,7 @@ def test_a_refused_frame_leaves_the_numbers_alone(walk: Map, streamed: bool) -> 
         assert send(frame).frame == 21
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("streamed", [False, True])
 def test_frames_at_the_same_time_are_sent_in_their_order(url: str, walk: Map, streamed: bool) -> None:
     async def work() -> list[models.SessionAnswer]:
@@ -359,6 +365,7 @@ def test_what_ends(walk: Map) -> None:
     session.delete()
 
 
+@pytest.mark.thorough
 def test_one_stream_at_a_time(server: Server, walk: Map) -> None:
     with walk.sessions.begin() as session, session.stream() as first:
         first.send(jpeg(0, 64, 48))

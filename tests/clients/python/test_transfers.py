@@ -41,6 +41,7 @@ class After:
         return "none" if self.left >= 0 else self._fault
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fault", ["cut-before", "cut-answer"])
 def test_a_download_goes_on_where_it_was(server: Server, full: Map, tmp_path: Path, fault: Fault) -> None:
     with (
@@ -57,6 +58,7 @@ def test_a_download_goes_on_where_it_was(server: Server, full: Map, tmp_path: Pa
     assert (tmp_path / "again.tar").read_bytes() == (tmp_path / "lab.tar").read_bytes()
 
 
+@pytest.mark.thorough
 def test_a_download_and_an_upload_over_a_bad_network(server: Server, full: Map, tmp_path: Path) -> None:
     with FaultProxy(server.port, share=0.4, seed=5) as way, Client(way.url, retry=Retry(60, 0.02, 0.2)) as client:
         client.maps[full.id].export(tmp_path / "lab.tar")
@@ -87,6 +89,7 @@ def test_a_file_that_is_no_map(client: Client, tmp_path: Path) -> None:
         client.maps.import_(tmp_path / "text.tar").wait()
 
 
+@pytest.mark.thorough
 def test_a_job_that_fails_or_is_cancelled(full: Map, client: Client) -> None:
     with pytest.raises(problems.ImagesMissing):
         full.reencode(f"{full.id}-new").wait()

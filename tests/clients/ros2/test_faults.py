@@ -33,6 +33,7 @@ def until_answered(robot: Robot, number: int) -> None:
     until(lambda: (robot.look(number=number), robot.peer.do("sleep", seconds=0.1), robot.peer.take("answer"))[-1])
 
 
+@pytest.mark.thorough
 def test_a_service_that_was_killed_is_found_again(driving: Robot) -> None:
     robot, site = driving, driving.site
     robot.begin(deadline=5.0)
@@ -58,6 +59,7 @@ def test_a_service_that_was_killed_is_found_again(driving: Robot) -> None:
     assert robot.log().count(f"{site.url} cannot be reached") == 2, "when it began, and when it was over"
 
 
+@pytest.mark.thorough
 def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", deadline=3.0)
@@ -79,6 +81,7 @@ def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
     robot.says("The verdict is")
 
 
+@pytest.mark.thorough
 def test_a_service_that_is_cut_off_lets_the_node_end(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", deadline=60.0)
@@ -96,6 +99,7 @@ def test_a_service_that_is_cut_off_lets_the_node_end(driving: Robot, door: Door)
     assert "Traceback" not in robot.log()
 
 
+@pytest.mark.thorough
 def test_what_a_slow_service_cannot_take_is_dropped_oldest_first(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", queue_length=2)
@@ -131,6 +135,7 @@ def test_a_clock_that_is_set_back_begins_a_new_run(driving: Robot) -> None:
     assert status["level"] == 0
 
 
+@pytest.mark.thorough
 def test_a_session_that_was_ended_elsewhere_is_begun_anew(driving: Robot) -> None:
     robot, site = driving, driving.site
     robot.begin()

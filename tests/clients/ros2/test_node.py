@@ -48,6 +48,7 @@ def over_http(
         return answers
 
 
+@pytest.mark.thorough
 def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
     site, robot = image.site, image
     stamps = [robot.BASE + 0.1 * number for number in range(len(site.again))]
@@ -93,6 +94,7 @@ def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
         assert last["covariance"] == pytest.approx(localized[-1]["answer"]["single"]["pose"]["covariance"])
 
 
+@pytest.mark.thorough
 def test_nothing_is_published_while_not_localized(image: Robot) -> None:
     robot = image
     robot.begin()
@@ -110,6 +112,7 @@ def test_nothing_is_published_while_not_localized(image: Robot) -> None:
     assert robot.peer.take("pose") == []
 
 
+@pytest.mark.thorough
 def test_a_late_subscriber_hears_no_old_pose(image: Robot) -> None:
     robot = image
     robot.begin()
@@ -132,6 +135,7 @@ def test_a_late_subscriber_hears_no_old_pose(image: Robot) -> None:
     assert robot.peer.take("pose") == []
 
 
+@pytest.mark.thorough
 def test_every_transition_is_clean(image: Robot) -> None:
     robot = image
     for _ in range(3):
@@ -159,6 +163,7 @@ def test_every_transition_is_clean(image: Robot) -> None:
     until(lambda: httpx.get(sessions, headers=headers).json()["items"] == [])  # each run was ended
 
 
+@pytest.mark.thorough
 def test_it_can_be_shut_down_from_every_state(site: Site) -> None:
     ways = {"one": [], "two": ["configure"], "three": ["configure", "activate"]}
     states = {"one": "unconfigured", "two": "inactive", "three": "active"}
@@ -174,6 +179,7 @@ def test_it_can_be_shut_down_from_every_state(site: Site) -> None:
     assert not any("Traceback" in node.log() for node in nodes.values())
 
 
+@pytest.mark.thorough
 def test_a_node_that_starts_by_itself(image: Robot) -> None:
     """With autostart and the key of the environment, under another name."""
     robot = image
@@ -190,6 +196,7 @@ def test_a_node_that_starts_by_itself(image: Robot) -> None:
     assert robot.site.keys["query"] not in node.log()
 
 
+@pytest.mark.thorough
 def test_a_node_speaks_to_its_service_and_to_ros_alone(image: Robot, tmp_path: Path) -> None:
     """Each address that it uses is the service's, or one of DDS on this machine; it writes where ROS logs."""
     robot, watch = image, Watch(tmp_path)
@@ -248,6 +255,7 @@ def test_a_parameter_that_would_be_ignored_is_refused(robot: Robot) -> None:
     }
 
 
+@pytest.mark.thorough
 def test_a_parameter_that_may_change_is_applied(image: Robot) -> None:
     robot = image
     robot.begin(picture_period=3600.0)
@@ -266,6 +274,7 @@ def test_a_parameter_that_may_change_is_applied(image: Robot) -> None:
     robot.peer.do("deafen", topic="annotated/compressed")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("key", "map_id"), [("/**", "lab"), ("/robot1/other", "lab"), ("other", "")])
 def test_the_file_of_parameters_holds_in_a_namespace(robot: Robot, key: str, map_id: str, tmp_path: Path) -> None:
     """The file as it is shipped, and under the keys that ROS takes for a node's full name."""
@@ -281,6 +290,7 @@ def test_the_file_of_parameters_holds_in_a_namespace(robot: Robot, key: str, map
         assert node.stop() == 0, node.log()
 
 
+@pytest.mark.thorough
 def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) -> None:
     other = Peer(robot.site.folder / "other")  # a process of ROS has one type for a topic
     try:
@@ -301,6 +311,7 @@ def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) ->
     assert robot.log().count("has the type std_msgs") == 2, "when it began, and when it was over"
 
 
+@pytest.mark.thorough
 def test_pictures_that_cannot_be_used_are_said_once(image: Robot) -> None:
     robot = image
     robot.begin()
@@ -336,6 +347,7 @@ def camera_info(robot: Robot, **fields: object) -> None:
     robot.peer.do("publish", topic="/camera_info", kind="CameraInfo", stamp=robot.BASE, **{**plain, **fields})
 
 
+@pytest.mark.thorough
 def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
     robot, server = image, image.site.server
     mask = {"polygons": [[[0, 0.9], [1, 0.9], [1, 1], [0, 1]]]}
@@ -357,6 +369,7 @@ def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
     )
 
 
+@pytest.mark.thorough
 def test_without_camera_info_it_goes_on_and_says_so(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
@@ -377,6 +390,7 @@ def test_without_camera_info_it_goes_on_and_says_so(image: Robot) -> None:
     assert until(named)[0].startswith("ros-")
 
 
+@pytest.mark.thorough
 def test_a_key_that_may_not_define_cameras_is_said(image: Robot) -> None:
     robot = image
     robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
@@ -397,6 +411,7 @@ def odometry(robot: Robot, x: float, y: float, heading: float, ahead: int = 0, s
     robot.peer.do("sleep", seconds=settle)
 
 
+@pytest.mark.thorough
 def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None:
     """The odometry's frame is turned by 90° and lies at (5, -2) of the map: x of the map is y of the odometry."""
     robot = image
@@ -418,6 +433,7 @@ def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None
     assert (found["x"], found["y"]) == pytest.approx((pose["x"], pose["y"] + 2.0), abs=0.5)
 
 
+@pytest.mark.thorough
 def test_odometry_counts_once_if_answers_are_lost(image: Robot) -> None:
     robot, site = image, image.site
     fates: list[Fault] = ["none", "none", "lose-answer", "lose-answer", "cut-before", "none", "lose-answer", "none"]
@@ -453,6 +469,7 @@ def test_odometry_counts_once_if_answers_are_lost(image: Robot) -> None:
     assert answer["probability"] == pytest.approx(expected["probability"], abs=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.peer.do("advertise", topic="/odom", kind="Odometry")
@@ -492,6 +509,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     assert not refused["success"] and "not localized" in refused["message"]
 
 
+@pytest.mark.thorough
 def test_relocalize_forgets_the_belief(image: Robot) -> None:
     robot = image
     robot.begin()
@@ -504,6 +522,7 @@ def test_relocalize_forgets_the_belief(image: Robot) -> None:
     assert after["answer"]["session"] != before["answer"]["session"]
 
 
+@pytest.mark.thorough
 def test_annotated_pictures_are_made_for_those_who_look(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.begin(picture_period=0.1)
@@ -528,6 +547,7 @@ def test_annotated_pictures_are_made_for_those_who_look(image: Robot) -> None:
     assert queries() - before == made <= 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("role", "parameters", "said"),
     [

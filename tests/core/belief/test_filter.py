@@ -59,6 +59,7 @@ evidences = st.lists(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(evidences, st.sampled_from([0.0, 0.5, 1.0, 2.0]), st.booleans())
 def test_it_is_the_sum_over_all_paths(told: list[tuple[list[int], float, float]], advance: float, back: bool) -> None:

@@ -33,6 +33,7 @@ def test_the_same_place_is_what_the_verdict_takes_for_it(frames: int, aligned: b
         np.testing.assert_array_equal(graph.same_place(place), expected)
 
 
+@pytest.mark.thorough
 def test_only_what_lives_is_in_it_in_the_order_of_the_sequences() -> None:
     where = walk(4, 4)
     graph = place_graph(where, np.array([6, 1, 3, 4]), 8, Neighborhood(1, 1))

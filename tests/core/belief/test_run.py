@@ -47,6 +47,7 @@ def seen_at(row: int, places: int, random: np.random.Generator) -> Evidence:
     return Evidence(np.append(others, row).astype(np.int64), gains, NOWHERE)
 
 
+@pytest.mark.thorough
 def test_a_robot_is_found_and_found_again_when_carried_off() -> None:
     random, graph = np.random.default_rng(3), graph_of(walk(400), Neighborhood(5, 3))
     run, found = Run(DEFAULT, graph), []

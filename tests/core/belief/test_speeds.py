@@ -41,6 +41,7 @@ def seen_at(row: int, random: np.random.Generator) -> Evidence:
     return Evidence(np.array([*gains]), np.array([*gains.values()], np.float32), 1.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("advance", "frames"),
     [(10.0, 37), (3.0, 100), (1.0, 80), (0.3, 80), (0.1, 80), (0.0, 60), (-0.3, 80), (-1.0, 100), (-3.0, 100)],

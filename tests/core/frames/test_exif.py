@@ -122,6 +122,7 @@ def test_the_block_that_is_mutated_below_is_whole() -> None:
     assert moment is not None
 
 
+@pytest.mark.thorough
 @settings(max_examples=400)
 @given(st.lists(st.tuples(st.integers(0, END - START - 1), st.integers(0, 255)), min_size=1, max_size=8))
 def test_a_broken_block_never_raises(changes: list[tuple[int, int]]) -> None:

@@ -100,6 +100,7 @@ MOTIONS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["rough", "wall", "slanted wall", "curved wall"])
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
 def test_the_covariance_of_a_turn_covers_its_error(kind: Kind, motion: Motion) -> None:

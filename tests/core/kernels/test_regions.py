@@ -34,6 +34,7 @@ def assert_same_regions(activations: Array, step: float, count: int) -> None:
     np.testing.assert_allclose(made.energies, energy[chosen - 1], rtol=1e-6)
 
 
+@pytest.mark.thorough
 @settings(max_examples=150)
 @given(
     activations=arrays(

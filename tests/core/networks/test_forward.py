@@ -56,6 +56,7 @@ def packaged() -> ShallowNetwork:
     return load_network(PACKAGED / "placerec-hybrid.network.safetensors", OUTPUTS)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [1, 3])
 def test_the_packaged_network_gives_what_torch_gives(packaged: ShallowNetwork, count: int) -> None:
     assert_same(packaged, images(count, 227))

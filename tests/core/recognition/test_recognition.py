@@ -65,6 +65,7 @@ def enrolment(place_id: str, encoding: Encoding) -> Enrolment:
     )
 
 
+@pytest.mark.thorough
 def test_neighbours_that_fill_the_shortlist_do_not_hide_rivals(
     tmp_path: Path, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -99,6 +99,7 @@ def place_of(answer: Answer) -> str | None:
     return None if answer.place is None else answer.place.id.partition(".")[0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [1, 5, 20, LOOKS])
 def test_a_stop_is_recognized_however_long_it_was(
     atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding], count: int
@@ -111,6 +112,7 @@ def test_a_stop_is_recognized_however_long_it_was(
         assert place_of(ask(map_, encoder, walk[place])) == str(place)
 
 
+@pytest.mark.thorough
 def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Encoder, walk: list[Encoding]) -> None:
     """Their looks are more than a compact search finds; a verdict needs the others, and a session the neighbours."""
     spots = (1, 5, 9, 10, 11)
@@ -127,6 +129,7 @@ def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Enco
     assert set(answer.candidates.whereabouts.ordinal.tolist()) == set(range(PLACES))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("apart", [20.0, 400.0])
 def test_equal_doors_one_after_the_other_are_rivals(atlas: Atlas, encoder: Encoder, apart: float) -> None:
     """Where the second stage does not examine all frames, either."""

@@ -62,6 +62,7 @@ def ask(map_: Map, encoder: Encoder, seed: int, verify: Verify, looked: list[int
     return answer
 
 
+@pytest.mark.thorough
 def test_never_is_the_answer_of_two_stages(lab: Map, encoder: Encoder) -> None:
     looked: list[int] = []
     asked = ask(lab, encoder, 3, "never", looked)

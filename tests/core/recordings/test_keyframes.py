@@ -120,6 +120,7 @@ def test_a_robot_whose_poses_say_that_it_moves_does_not_stand() -> None:
     assert [one.id for one in moving(frames, lambda one: 0, lambda a, b: True)] == ["0", "3", "6", "9"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("every", [1, 10], ids=["each frame has a pose of its own", "poses are interpolated"])
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 3.0])
 def test_noise_of_poses_moves_no_robot(noise: float, every: int) -> None:

@@ -65,6 +65,7 @@ def by_index(lab: Map, where: dict[str, Scalar]) -> list[str]:
     return sorted(place.id for place in lab.places_at(rows.tolist()) if place is not None)
 
 
+@pytest.mark.thorough
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(st.tuples(st.integers(0, 5), st.sampled_from(["enrol", "fields", "forget"]), objects), max_size=12),

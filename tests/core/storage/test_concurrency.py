@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from core.errors import MapExists, StorageFailure, UnknownMap, UnknownPlace
 from core.storage import Atlas, Map
@@ -20,6 +21,7 @@ def run_together(*works: Callable[[], None]) -> None:
             future.result()
 
 
+@pytest.mark.thorough
 def test_writers_and_searchers(lab: Map) -> None:
     """What a writer was told is seen at once by whoever looks next; nobody sees half a write."""
     writing = threading.Event()

@@ -161,6 +161,7 @@ def spoil_a_pose(folder: Path) -> None:
     run(folder, "UPDATE places SET x = 1 WHERE id = 'p3'")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [

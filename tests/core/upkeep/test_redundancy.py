@@ -87,6 +87,7 @@ def graphs(draw: st.DrawFn) -> Graph:
     return places, pairs, np.array(scores, np.float32) / np.float32(10), draw(st.integers(0, 11)) / 10
 
 
+@pytest.mark.thorough
 @given(graphs())
 @settings(max_examples=300)
 def test_whatever_goes_has_a_stand_in_that_stays(graph: Graph) -> None:

@@ -129,6 +129,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.npz" for name in made}
 
 
+@pytest.mark.thorough
 def test_a_rival_learns_eight_bits_and_knows_its_frames(files: dict[str, Path]) -> None:
     name = "squeezenet-gem"
     system = build(name, models=EncoderCatalogue(), weights=files[name])

@@ -62,6 +62,7 @@ def flexible_mask(maps: Array, tensors: dict[str, Array]) -> Array:
     return np.asarray(np.log1p(np.exp(total)))
 
 
+@pytest.mark.thorough
 def test_context_flexible_attention_of_a_file(tmp_path: Path) -> None:
     frame = blocks(224, 224)
     tensors = flexible()

@@ -99,6 +99,7 @@ def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
 # AMOSNet and HybridNet
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "model", "mean"),
     [
@@ -186,6 +187,7 @@ def test_places365_is_fc7_by_the_cosine(tmp_path: Path, generation: str, form: s
 HALVES = (slice(0, 114), slice(114, 227))
 
 
+@pytest.mark.thorough
 def test_fully_connected_layers_that_do_not_fit(tmp_path: Path) -> None:
     path = write(tmp_path / "a.caffemodel", trunk() + fully_connected(values=13), "a_mean.npy")
     with pytest.raises(InvalidModel, match=r"a\.caffemodel: fc6 does not fit the maps"):

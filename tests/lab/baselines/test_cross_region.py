@@ -80,6 +80,7 @@ def scene(seed: int) -> Pixels:
     return np.kron(coarse, np.ones((10, 10, 1), np.int64)).astype(np.uint8)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["cross-region-vlad", "cross-region-bow-2.6k"])
 def test_places_are_told_apart_after_training(name: str) -> None:
     system = build(name, models=EncoderCatalogue())

@@ -43,6 +43,7 @@ def test_a_blank_frame_scores_zero() -> None:
     assert Hog(ABOUT).index([blank]).score([blank]).tolist() == [[0.0]]
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason="the corridor images are not on this machine")
 def test_corridor_comes_out_as_published() -> None:
     system = Hog(ABOUT)

@@ -67,6 +67,7 @@ def test_each_says_its_title_paper_and_constants(models: EncoderCatalogue) -> No
         assert re.search(r"\b(19|20)\d\d\b", about.paper), about.name
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", FREE)
 def test_what_needs_no_weights_is_built(name: str, models: EncoderCatalogue) -> None:
     system = build(name, models=models)
@@ -75,6 +76,7 @@ def test_what_needs_no_weights_is_built(name: str, models: EncoderCatalogue) -> 
     assert build(name, models=models).identity == system.identity
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", FREE)
 def test_a_map_of_one_place_and_a_blank_query_have_scores(name: str, models: EncoderCatalogue) -> None:
     system = build(name, models=models)
@@ -131,6 +133,7 @@ def test_what_uses_no_network_takes_no_weights(name: str, models: EncoderCatalog
         build(name, models=models, weights=Path(__file__))
 
 
+@pytest.mark.thorough
 def test_listing_leaves_the_slow_libraries_alone() -> None:
     script = (
         "import sys; from core.method.catalogue import EncoderCatalogue; from lab.baselines.registry import systems; "

@@ -96,6 +96,7 @@ def test_only_the_best_places_are_verified(models: EncoderCatalogue) -> None:
     assert (gains[:CANDIDATES] > 0.5 * WEIGHT).all()  # each is the same picture
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verify", ["auto", "always", "never"])
 def test_a_default_encoder_is_judged_by_what_the_service_answers(
     verify: Verify, models: EncoderCatalogue, tmp_path: Path
@@ -121,6 +122,7 @@ def test_a_default_encoder_is_judged_by_what_the_service_answers(
     atlas.close()
 
 
+@pytest.mark.thorough
 def test_by_default_a_best_match_that_fits_is_verified_alone(models: EncoderCatalogue) -> None:
     systems_ = [build(DEFAULT_ENCODER, models=models, verify=verify) for verify in ("never", "auto", "always")]
     described = [systems_[1].describe(scene(seed)) for seed in range(24)]

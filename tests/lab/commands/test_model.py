@@ -59,6 +59,7 @@ def test_another_input_size(placerec: Placerec, caffe_files: tuple[Path, Path], 
     placerec(*imported, "--name", "odd", "--input-size", "wide", status=2)
 
 
+@pytest.mark.thorough
 def test_what_is_refused(placerec: Placerec, caffe_files: tuple[Path, Path], tmp_path: Path) -> None:
     model, mean = caffe_files
     models = ("--models-dir", tmp_path)

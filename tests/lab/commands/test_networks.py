@@ -33,6 +33,7 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     use(monkeypatch, onnx_import.__name__)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("preset", "dimension"), [("salad", 6), ("anyloc", 32 * 6)])
 def test_from_a_published_network_to_the_verdict(
     preset: str, dimension: int, placerec: Placerec, server: Server, pictures: Path, tmp_path: Path
@@ -65,6 +66,7 @@ def test_from_a_published_network_to_the_verdict(
     assert server.client.delete(f"/v1/maps/{name}").status_code == 204
 
 
+@pytest.mark.thorough
 def test_an_evaluation_and_a_second_stage(placerec: Placerec, pictures: Path, tmp_path: Path) -> None:
     models = ("--models-dir", tmp_path / "models")
     (tmp_path / "small.onnx").write_bytes(onnx_network().SerializeToString())

@@ -24,6 +24,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_the_same_seed_makes_the_same_encoder(placerec: Placerec, pictures: Path, tmp_path: Path) -> None:
     train = ("vocabulary", "train", pictures, "--name", "mine", *SMALL)
     for folder in ("a", "b"):
@@ -47,6 +48,7 @@ def test_the_same_seed_makes_the_same_encoder(placerec: Placerec, pictures: Path
     assert summary.training["seed"] == 0
 
 
+@pytest.mark.thorough
 def test_options_reach_the_definition_and_a_map_uses_it(
     placerec: Placerec, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,6 +88,7 @@ def test_options_reach_the_definition_and_a_map_uses_it(
     assert answer["encoder"].startswith("raw@")
 
 
+@pytest.mark.thorough
 def test_names_are_guarded(placerec: Placerec, pictures: Path, tmp_path: Path) -> None:
     models = ("--models-dir", tmp_path)
     taken = placerec("vocabulary", "train", pictures, "--name", "m-region-vlad", *models, status=1)

@@ -55,6 +55,7 @@ def with_opencv(layers: list[Layer], content: bytes, images: Array) -> list[Arra
     return [np.asarray(output) for output in net.forward([f"relu{number}" for number in range(1, 7)])]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("generation", "form"), [("new", "new"), ("old", "old"), ("new", "double"), ("new", "unpacked")]
 )
@@ -200,6 +201,7 @@ REFUSED: dict[str, tuple[list[Layer], str]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_said_exactly_is_refused_by_name(imported: Any, case: str) -> None:
     layers, reason = REFUSED[case]
@@ -241,6 +243,7 @@ TARGETS = [
 ]
 
 
+@pytest.mark.thorough
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(TARGETS), st.data())
 def test_a_mutated_model_is_refused_or_imported(

@@ -84,6 +84,7 @@ def state() -> dict[str, object]:
     }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("zipped_layout", [True, False])
 def test_what_pytorch_writes_is_read_to_the_bit(state: dict[str, object], tmp_path: Path, zipped_layout: bool) -> None:
     path = tmp_path / "model_best.pth.tar"
@@ -103,6 +104,7 @@ def test_what_pytorch_writes_is_read_to_the_bit(state: dict[str, object], tmp_pa
     }
 
 
+@pytest.mark.thorough
 def test_a_state_dict_alone_and_its_safetensors_sibling(tmp_path: Path) -> None:
     tensors = {"encoder.0.weight": torch.rand(2, 3), "pool.centroids": torch.rand(4)}
     torch.save(tensors, tmp_path / "plain.pth")
@@ -115,6 +117,7 @@ def test_a_state_dict_alone_and_its_safetensors_sibling(tmp_path: Path) -> None:
             found["pool"]
 
 
+@pytest.mark.thorough
 def test_a_whole_module_is_refused_with_what_to_do(tmp_path: Path) -> None:
     for zipped_layout in (True, False):
         torch.save(nn.Linear(2, 2), tmp_path / "whole.pth", _use_new_zipfile_serialization=zipped_layout)
@@ -200,6 +203,7 @@ def test_what_is_small_in_the_file_cannot_be_endless(tmp_path: Path) -> None:
         read_checkpoint(zipped(tmp_path / "a.pth", named(**folders)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("described", [tensor([1_000_000_000], [0]), tensor([2], [1], numbers=storage(count=2**40))])
 def test_one_number_repeated_or_a_huge_announcement_takes_no_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, described: bytes
@@ -209,6 +213,7 @@ def test_one_number_repeated_or_a_huge_announcement_takes_no_memory(
         read_checkpoint(zipped(tmp_path / "a.pth", named(w=described)))
 
 
+@pytest.mark.thorough
 def test_what_is_packed_small_takes_no_more_memory_than_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,6 +54,7 @@ def test_what_the_child_does_becomes_one_kind_of_error(tmp_path: Path, what: str
         read(tmp_path, what)
 
 
+@pytest.mark.thorough
 def test_a_child_that_does_not_end_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(isolation, "SECONDS", 2)
     with pytest.raises(InvalidModel, match="takes too long"):
@@ -109,6 +110,7 @@ def read_onnx(path: Path) -> bytes:
     return import_onnx(path, MAPS)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("reader", "count", "write", "read_it"),
     [

@@ -113,6 +113,7 @@ def test_little_nesting_is_read(tmp_path: Path) -> None:
     assert number.tolist() == [[1.0]]
 
 
+@pytest.mark.thorough
 def test_what_is_packed_small_takes_no_more_memory_than_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

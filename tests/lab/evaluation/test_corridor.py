@@ -62,6 +62,7 @@ def answers(encoder: Encoder, queries: list[Encoding], references: list[Encoding
     return score_matrix(encoder, products, asked, known)
 
 
+@pytest.mark.thorough
 def test_the_default_is_ahead_of_every_published_technique(
     encoder: Encoder, queries: list[Encoding], references: list[Encoding], truth: NDArray[np.bool_]
 ) -> None:
@@ -87,6 +88,7 @@ def pairs(
     return scored(queries), scored(references)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", [1, 2, 5, 10, 30])
 def test_strangers_are_not_recognized_in_maps_of_any_size(
     encoder: Encoder, pairs: tuple[NDArray[np.float32], NDArray[np.float32]], truth: NDArray[np.bool_], size: int

@@ -39,6 +39,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> TraversePair:
     return TraversePair("walk", references, queries, tolerance_truth(PLACES, PLACES, 0), np.arange(PLACES))
 
 
+@pytest.mark.thorough
 def test_known_places_and_strangers_are_asked_in_maps_of_every_size(walk: TraversePair, tmp_path: Path) -> None:
     system = build("m-region-vlad", models=EncoderCatalogue())
     cache = EvaluationCache(tmp_path)

@@ -71,6 +71,7 @@ def assert_honest(found: Measurement) -> None:
     assert worth.brier <= 0.7 * worth.brier_of_base_rate, worth
 
 
+@pytest.mark.thorough
 def test_corridor(encoder: Encoder, corridor: list[Trials]) -> None:
     exact, same_place = (measured(encoder, of, precision) for of, precision in zip(corridor, (0.95, 0.98), strict=True))
     assert_honest(exact)

@@ -59,12 +59,14 @@ def test_a_run_in_two_sittings_equals_one(photographs: Path, teacher_weights: Pa
     assert all(0 < float(row["held_out_loss"]) < 4 for row in rows)
 
 
+@pytest.mark.thorough
 def test_the_loss_falls(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
     small_run(photographs, teacher_weights, tmp_path, crops=160, checkpoint_every=10)
     losses = [float(row["loss"]) for row in csv.DictReader((tmp_path / "log.csv").open())]
     assert losses[-1] < losses[0] - 0.1
 
 
+@pytest.mark.thorough
 def test_a_run_goes_on_from_earlier_weights(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
     first = small_run(photographs, teacher_weights, tmp_path / "one", crops=64)
     second = small_run(photographs, teacher_weights, tmp_path / "two", crops=4000, start=first, stop_after=5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from lab.training.ground_truth import REACH, corrected_truth, match_count, passes, smooth_path
@@ -36,6 +37,7 @@ def test_matches_need_a_clear_nearest() -> None:
     assert match_count(features[:0], features) == 0
 
 
+@pytest.mark.thorough
 def test_a_drifting_truth_is_put_right() -> None:
     generator = np.random.default_rng(1)
     street = cv2.resize(generator.integers(0, 256, (60, 700, 3), np.uint8), (1400, 120), interpolation=cv2.INTER_CUBIC)

@@ -90,6 +90,7 @@ def test_what_is_fitted_makes_probabilities_of_small_maps_honest() -> None:
     assert errors[1] < 0.9 * errors[0]
 
 
+@pytest.mark.thorough
 def test_an_environment_is_widened_until_strangers_of_small_maps_are_refused() -> None:
     """Of two kinds of traverses, one whose places score much alike."""
     alike = [("plain 0", traverse(0.12, 0)), ("alike 0", traverse(0.25, 1))]
@@ -153,6 +154,7 @@ def test_auto_verifies_where_two_stages_leave_doubt() -> None:
     assert {found.verified for found in whole} <= {0, 1, CANDIDATES}
 
 
+@pytest.mark.thorough
 def test_terms_that_are_fitted_to_some_traverses_hold_on_others() -> None:
     terms = fit_geometry(CALIBRATION, [("made 0", verifiable(0.1, 0)), ("made 1", verifiable(0.18, 1))], repeats=2)
     assert terms.slope > 0 > terms.intercept

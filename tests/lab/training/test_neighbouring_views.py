@@ -44,6 +44,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_neighbours_are_drawn_repeatably_from_walks(walks: Path) -> None:
     made, again = (list(neighbouring_views(walks, 227, 4, seed=1)) for _ in "ab")
     assert made and len(made) == len(again)

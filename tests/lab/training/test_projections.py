@@ -40,6 +40,7 @@ def network(*layers: str) -> ShallowNetwork:
     return ShallowNetwork(student_definition(), layers).eval().requires_grad_(False)
 
 
+@pytest.mark.thorough
 def test_projections_are_fitted_layer_by_layer_and_repeatably(photographs: Path) -> None:
     made, again = (fit_projections(network("pool2", "conv3"), {"pool2": 5, "conv3": 7}, photographs, 6) for _ in "ab")
     assert {layer: one.matrix.shape for layer, one in made.items()} == {"pool2": (256, 5), "conv3": (384, 7)}
@@ -67,6 +68,7 @@ def encoder(stage: AgreementDefinition, photographs: Path) -> Encoder:
     return Encoder("small", extractor, definition, Vocabulary(centers, extractor.origin), UNCALIBRATED)
 
 
+@pytest.mark.thorough
 def test_projections_of_cells_are_fitted_to_the_stage_and_repeatably(photographs: Path) -> None:
     stage = STAGE.model_copy(update={"layers": ("pool2", "conv3"), "weights": (0.5, 0.5)})
     small = encoder(stage, photographs)

@@ -243,6 +243,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
     assert not made.server.lines(level="error")
 
 
+@pytest.mark.thorough
 def test_a_key_of_some_maps_sees_no_other(keyed: Keyed) -> None:
     with keyed.as_(keyed.query) as robot:
         assert [item["id"] for item in robot.get("/v1/maps").json()["items"]] == ["lab"]
@@ -271,6 +272,7 @@ def known(client: httpx.Client) -> bool:
     return eventually(lambda: client.get("/v1/maps").status_code == 200, every=1)
 
 
+@pytest.mark.thorough
 def test_a_map_is_made_only_under_an_id_of_the_key(keyed: Keyed) -> None:
     _, token = keyed.store.create("founder", "admin", ["hall", "lab"])
     with keyed.as_(token) as founder:
@@ -311,6 +313,7 @@ def stream(keyed: Keyed, token: str | None, map_id: str, session: str) -> Client
     return connect(there, compression=None, additional_headers={} if token is None else bearer(token))
 
 
+@pytest.mark.thorough
 def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
     key, token = keyed.store.create("streamer", "query", ["lab"])
     alike = keyed.as_(token)
@@ -334,6 +337,7 @@ def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
 
 
+@pytest.mark.thorough
 def test_a_key_counts_and_ends_beside_a_running_service(keyed: Keyed) -> None:
     key, token = keyed.store.create("passing", "query")
     with keyed.as_(token) as passing:

@@ -231,6 +231,7 @@ def test_the_first_key_of_an_open_service_turns_keys_on(tmp_path: Path) -> None:
         assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_a_first_key_may_lock_everybody_out_if_that_is_said(tmp_path: Path) -> None:
     server = Server(tmp_path).wait()
     try:
@@ -243,6 +244,7 @@ def test_a_first_key_may_lock_everybody_out_if_that_is_said(tmp_path: Path) -> N
         assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_other_machines_cannot_create_the_first_key(tmp_path: Path) -> None:
     # Written like this the address does not count as this machine's own, although it is.
     server = Server(tmp_path, settings={"host": "127.1", "allow_anonymous": "true"}).wait()

@@ -50,6 +50,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     server.stop()
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 @pytest.mark.parametrize("prefix", [pytest.param("", marks=pytest.mark.thorough), "/robots/placerec"])
 def test_a_browser_shows_every_operation(published: Server, prefix: str, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import httpx
+import pytest
 
 from service.access.keys import KeyStore
 from tests.service.scenes import jpeg
@@ -29,6 +30,7 @@ def test_the_state_at_a_glance(server: Server, traverse: str) -> None:
     assert state["settings"]["port"] == server.port
 
 
+@pytest.mark.thorough
 def test_who_only_queries_sees_no_memory_and_no_settings(tmp_path: Path) -> None:
     store = KeyStore(tmp_path / "data")
     _, admin = store.create("ops", "admin")

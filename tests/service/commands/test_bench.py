@@ -12,6 +12,7 @@ from tests.service.scenes import encoded, scene
 from tests.service.server import Server
 
 
+@pytest.mark.thorough
 def test_the_figures(placerec: Placerec, tmp_path: Path) -> None:
     file = tmp_path / "out" / "bench.json"
     shown = placerec("bench", "--rounds", 3, "--places", 20, "--encoder", "region-vlad", "--json", file).stdout
@@ -26,6 +27,7 @@ def test_the_figures(placerec: Placerec, tmp_path: Path) -> None:
     assert "16 together" in shown and figures["batched_frames_per_second"] == pytest.approx(1e3 / times["batch"])
 
 
+@pytest.mark.thorough
 def test_a_frame_of_ones_own(placerec: Placerec, tmp_path: Path) -> None:
     (tmp_path / "frame.png").write_bytes(encoded(scene(0), ".png"))
     placerec("bench", "--image", tmp_path / "frame.png", "--rounds", 3, "--places", 2, "--encoder", "region-vlad")
@@ -34,6 +36,7 @@ def test_a_frame_of_ones_own(placerec: Placerec, tmp_path: Path) -> None:
     assert refused.stderr.count("Error: ") == 1
 
 
+@pytest.mark.thorough
 def test_a_running_service(placerec: Placerec, tmp_path: Path, server: Server, traverse: str) -> None:
     file, url = tmp_path / "bench.json", str(server.client.base_url)
     words = ("--robots", 1, "--robots", 4, "--seconds", 0.5, "--json", file)

@@ -30,6 +30,7 @@ def there(server: Server) -> list[str]:
     return ["--url", str(server.client.base_url)]
 
 
+@pytest.mark.thorough
 def test_by_a_traverse_with_its_figures(placerec: Placerec, server: Server, strip: str, there: list[str]) -> None:
     words = ("calibrate", strip, "--sequence", "tuesday", "--precision", 0.8)
     dry = placerec(*words, "--dry-run", *there)

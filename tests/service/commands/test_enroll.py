@@ -25,6 +25,7 @@ from tests.service.server import ROOT, Server
 HEADER = "file,id,x,y,z,heading,latitude,longitude,timestamp\n"
 
 
+@pytest.mark.thorough
 def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> None:
     done = placerec("enroll", monday, "--map", "lab", "--create")
     assert "4 of 4 frames are places of lab, sequence monday: 4 created; 0 with a pose" in done.stdout
@@ -70,6 +71,7 @@ def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, se
     assert server.client.get(f"/v1/maps/{map_id}/places/2").json()["pose"] is None
 
 
+@pytest.mark.thorough
 def test_poses_come_from_exif(placerec: Placerec, tmp_path: Path) -> None:
     folder = tmp_path / "outdoor"
     folder.mkdir()
@@ -96,6 +98,7 @@ def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) 
     assert "1.jpg" not in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
     odd = monday / "ä ö.jpg"
     odd.write_bytes(jpeg(5))
@@ -108,6 +111,7 @@ def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, mo
     assert "1 of 1 frames are places of lab" in placerec("enroll", monday, "--map", "lab").stdout
 
 
+@pytest.mark.thorough
 def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
     refused = placerec("enroll", monday, "--map", "lab", status=1)
     assert "There is no map 'lab'. Give --create to create it." in refused.stderr
@@ -120,6 +124,7 @@ def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> 
     assert "0 of 4 frames are enrolled" in wrong.stderr
 
 
+@pytest.mark.thorough
 def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Placerec, monday: Path) -> None:
     placerec("enroll", monday, "--map", "lab", "--create")
     tuesday = monday.rename(monday.with_name("tuesday"))
@@ -131,6 +136,7 @@ def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Place
     assert [(one["name"], one["places"]) for one in sequences] == [("monday", 4), ("tuesday", 4)]
 
 
+@pytest.mark.thorough
 def test_file_names_become_ids(placerec: Placerec, tmp_path: Path) -> None:
     folder = tmp_path / "odd names"
     folder.mkdir()
@@ -228,6 +234,7 @@ def many(folder: Path, count: int) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_many_frames_keep_their_order_and_are_not_sent_twice(
     placerec: Placerec, tmp_path: Path, server: Server, map_id: str
 ) -> None:
@@ -251,6 +258,7 @@ def test_many_frames_keep_their_order_and_are_not_sent_twice(
     assert server.client.get(f"/v1/maps/{map_id}/places/5").json()["pose"]["x"] == 1.0
 
 
+@pytest.mark.thorough
 def test_a_service_that_takes_little_at_a_time(
     placerec: Placerec, tmp_path: Path, tight_server: Server, tight_map: str
 ) -> None:

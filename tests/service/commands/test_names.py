@@ -60,6 +60,7 @@ def words_of(command: str, parameters: list[Any], names: dict[str, str], folder:
     return [*options, "--", *arguments]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("command", "parameters"), list(commands()), ids=lambda one: one if isinstance(one, str) else ""
 )

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import blank, encoded, scene, seen_again
 from tests.service.server import Server
 
 
+@pytest.mark.thorough
 def test_a_second_look_is_recognized_where_the_threshold_lets_it(
     placerec: Placerec, monday: Path, tmp_path: Path
 ) -> None:
@@ -36,6 +39,7 @@ def test_a_second_look_is_recognized_where_the_threshold_lets_it(
     assert f"{again['score']:.3f}" in table
 
 
+@pytest.mark.thorough
 def test_over_http(placerec: Placerec, server: Server, traverse: str, tmp_path: Path) -> None:
     (tmp_path / "again.jpg").write_bytes(encoded(seen_again(scene(5))))
     done = placerec("query", tmp_path / "again.jpg", "-m", traverse, "--url", server.client.base_url, "--json")

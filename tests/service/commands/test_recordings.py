@@ -53,6 +53,7 @@ def stored(data: Path, name: str) -> tuple[list[dict[str, Any]], Any]:
         atlas.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "writer",
     [
@@ -88,6 +89,7 @@ def small_walk(frames: int) -> list[Said]:
     return [compressed(START + index * SECOND, jpeg(index, 96, 72)) for index in range(frames)]
 
 
+@pytest.mark.thorough
 def test_killed_in_the_middle_and_run_again_nothing_is_sent_twice_or_missing(
     placerec: Placerec, tmp_path: Path, server: Server, map_id: str
 ) -> None:
@@ -113,6 +115,7 @@ def test_killed_in_the_middle_and_run_again_nothing_is_sent_twice_or_missing(
     ]
 
 
+@pytest.mark.thorough
 def test_a_truncated_bag_enrols_what_it_holds_and_the_whole_one_the_rest(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_ros1(tmp_path / "walk.bag", small_walk(60))
     whole = bag.read_bytes()
@@ -127,6 +130,7 @@ def test_a_truncated_bag_enrols_what_it_holds_and_the_whole_one_the_rest(placere
     assert f"{60 - count} created, {count} unchanged" in second.stdout and f"{60 - count} sent" in second.stdout
 
 
+@pytest.mark.thorough
 def test_a_video_is_enrolled_by_its_keyframes(placerec: Placerec, tmp_path: Path) -> None:
     write_video(tmp_path / "walk.mp4")
     timed = placerec("enroll", tmp_path / "walk.mp4", "--map", "timed", "--create", "--every-seconds", 1)
@@ -147,6 +151,7 @@ def test_of_a_video_the_frames_of_a_stop_are_left_out_unless_wanted(placerec: Pl
     assert "12 of 12 frames are places" in whole.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("where", ["--url", "--data-dir"])
 def test_what_the_mask_of_a_camera_covers_is_no_stop(
     placerec: Placerec, tmp_path: Path, server: Server, where: str
@@ -177,6 +182,7 @@ BODY = {"polygons": [[[0, 0.2], [1, 0.2], [1, 1], [0, 1]]]}
 """What covers four fifths of the picture."""
 
 
+@pytest.mark.thorough
 def test_keyframes_of_a_bag_follow_its_poses(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(6))
     words = ("enroll", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)
@@ -186,6 +192,7 @@ def test_keyframes_of_a_bag_follow_its_poses(placerec: Placerec, tmp_path: Path)
     assert "No frame of walk can be judged by the --every options" in none.stderr
 
 
+@pytest.mark.thorough
 def test_a_folder_of_other_formats_equals_one_of_png(placerec: Placerec, tmp_path: Path) -> None:
     for name in ("bmp", "png", "ppm"):
         (tmp_path / name).mkdir()
@@ -200,6 +207,7 @@ def test_a_folder_of_other_formats_equals_one_of_png(placerec: Placerec, tmp_pat
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_poses_come_from_satellites_and_files(placerec: Placerec, tmp_path: Path) -> None:
     seen = small_walk(3)
     told = [fix(START + index * SECOND, 48 + index, 2) for index in range(3)]
@@ -243,6 +251,7 @@ def test_options_that_do_not_go_together_are_refused(placerec: Placerec, monday:
     assert "goes with --trajectory" in alone.stderr
 
 
+@pytest.mark.thorough
 def test_a_damaged_picture_in_a_bag_fails_alone_and_is_named(placerec: Placerec, tmp_path: Path) -> None:
     said = [
         *small_walk(2),
@@ -255,6 +264,7 @@ def test_a_damaged_picture_in_a_bag_fails_alone_and_is_named(placerec: Placerec,
     assert f"Error: {CAMERA} at 1700000010.000000000: " in done.stderr
 
 
+@pytest.mark.thorough
 def test_two_cameras_of_a_bag_do_not_overwrite_each_other(placerec: Placerec, tmp_path: Path) -> None:
     rear = [compressed(START + index * SECOND, jpeg(10 + index, 96, 72), "/rear") for index in range(2)]
     bag = write_mcap(tmp_path / "walk.mcap", [*small_walk(2), *rear])
@@ -284,6 +294,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path) -> None:
     assert peaks[1] < peaks[0] + 16_000, peaks  # kilobytes
 
 
+@pytest.mark.thorough
 def test_frames_of_bags_videos_and_folders_are_queried(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(4))
     placerec("enroll", bag, "--map", "lab", "--create")
@@ -302,6 +313,7 @@ def test_frames_of_bags_videos_and_folders_are_queried(placerec: Placerec, tmp_p
     assert "has no topic '/rear'" in bad.stderr
 
 
+@pytest.mark.thorough
 def test_a_map_is_calibrated_by_labelled_frames_of_a_bag(placerec: Placerec, tmp_path: Path) -> None:
     placerec("enroll", write_mcap(tmp_path / "walk.mcap", small_walk(11)), "--map", "lab", "--create")
     again = [
@@ -365,6 +377,7 @@ def test_recordings_are_evaluated_as_their_frames_are(placerec: Placerec, tmp_pa
     assert "again.bag has no topic '/rear'" in placerec(*wrong, status=1).stderr
 
 
+@pytest.mark.thorough
 def test_pictures_of_other_formats_are_evaluated(placerec: Placerec, tmp_path: Path) -> None:
     for folder, suffix in (("known", ".pgm"), ("asked", ".tif")):
         (tmp_path / folder).mkdir()

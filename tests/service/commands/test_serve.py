@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.service.server import ROOT, Server
 
 
@@ -21,12 +23,14 @@ def refused(*words: object, **settings: object) -> str:
     return done.stderr
 
 
+@pytest.mark.thorough
 def test_it_does_not_start_on_a_port_in_use(server: Server, tmp_path: Path) -> None:
     said = refused("--port", server.port, "--data-dir", tmp_path)
     assert f"Error: Cannot listen on port {server.port} of 127.0.0.1" in said
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 def test_it_is_not_exposed_without_keys(tmp_path: Path) -> None:
     said = refused("--host", "0.0.0.0", "--port", 0, data_dir=tmp_path / "data")
     assert "PLACEREC_HOST" in said and "PLACEREC_ALLOW_ANONYMOUS" in said
@@ -38,6 +42,7 @@ def test_a_wrong_setting_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.thorough
 def test_it_stops_when_told_and_gives_the_data_back(tmp_path: Path) -> None:
     first = Server(tmp_path)
     first.wait("/livez")

@@ -18,6 +18,7 @@ from tests.service.map_jobs import wait_until
 from tests.service.server import Server
 
 
+@pytest.mark.thorough
 def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed: Server) -> None:
     page = admin.go("keys")
     page.get_by_role("button", name="Create a key").click()
@@ -68,6 +69,7 @@ def test_nobody_locks_all_admins_out_by_accident(admin: Operator) -> None:
     page.get_by_role("row").filter(has_text="admin-key").get_by_text("in force").wait_for()
 
 
+@pytest.mark.thorough
 def test_the_first_key_is_used_at_once(visit: Visit, tmp_path_factory: pytest.TempPathFactory) -> None:
     server = Server(tmp_path_factory.mktemp("open")).wait("/livez")
     try:
@@ -204,6 +206,7 @@ def test_who_changed_what_is_listed_and_filtered(admin: Operator, keyed: Server)
     page.get_by_role("dialog").get_by_text("request id").wait_for()
 
 
+@pytest.mark.thorough
 def test_jobs_are_listed_with_their_results_and_cancelled(admin: Operator, keyed: Server) -> None:
     keyed.create_map("working")
     keyed.enrol("working", "p0", frame(0))
@@ -226,6 +229,7 @@ def test_jobs_are_listed_with_their_results_and_cancelled(admin: Operator, keyed
         assert state in ("succeeded", "cancelled")
 
 
+@pytest.mark.thorough
 def test_the_state_of_the_service_is_shown(admin: Operator, visit: Visit) -> None:
     page = admin.go("service")
     page.get_by_text("ready", exact=True).wait_for()

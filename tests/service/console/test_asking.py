@@ -28,6 +28,7 @@ def pictures(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.thorough
 def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Path) -> None:
     page = visit("query").go(f"maps/{LAB}/try")
     page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
@@ -48,6 +49,7 @@ def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Pat
     expect(page.locator(".stages")).to_contain_text("total")
 
 
+@pytest.mark.thorough
 def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alone(
     admin: Operator, pictures: Path
 ) -> None:
@@ -81,6 +83,7 @@ def test_the_pictures_of_frames_that_are_cleared_are_given_up(admin: Operator, p
     assert eventually(lambda: page.evaluate("living.size") == 0)
 
 
+@pytest.mark.thorough
 def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str], pictures: Path) -> None:
     page = admin.go(f"maps/{LAB}/try")
     page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
@@ -97,6 +100,7 @@ def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str]
     assert shlex.split(text.replace("\\\n", ""))[0] == "curl"
 
 
+@pytest.mark.thorough
 def test_the_webcam_is_asked(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/try")
     page.get_by_role("button", name="Use the webcam").click()
@@ -106,6 +110,7 @@ def test_the_webcam_is_asked(admin: Operator) -> None:
     page.get_by_text("Drop pictures here").wait_for()
 
 
+@pytest.mark.thorough
 def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, keyed: Server) -> None:
     page = admin.go(f"maps/{LAB}/live")
     page.get_by_label("frames as thumbnails").check()
@@ -123,6 +128,7 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
 
 
+@pytest.mark.thorough
 def test_live_answers_are_paused_and_filtered(admin: Operator, keyed: Server) -> None:
     page = admin.go(f"maps/{LAB}/live")
     page.get_by_text("listening").wait_for()
@@ -145,6 +151,7 @@ def test_live_answers_are_paused_and_filtered(admin: Operator, keyed: Server) ->
     expect(lines).to_have_count(2)
 
 
+@pytest.mark.thorough
 def test_a_query_key_sees_live_answers_without_frames_and_names(visit: Visit, keyed: Server) -> None:
     page = visit("query").go(f"maps/{LAB}/live")
     page.get_by_text("listening").wait_for()
@@ -155,6 +162,7 @@ def test_a_query_key_sees_live_answers_without_frames_and_names(visit: Visit, ke
     expect(page.get_by_label("frames as thumbnails")).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_a_robot_is_drawn_where_its_session_is(admin: Operator, keyed: Server) -> None:
     page = admin.go(f"maps/{LAB}/plan")
     session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]

@@ -80,6 +80,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, str
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_the_console_stays_within_the_rate(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
     operator = visit(None, server=server)
@@ -91,6 +92,7 @@ def test_the_console_stays_within_the_rate(visit: Visit, slow: tuple[Server, str
     expect(page.locator(".trouble")).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_a_lost_connection_is_said_and_mended_without_reloading(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
     operator = visit(None, server=server)
@@ -115,6 +117,7 @@ def cable(slow: tuple[Server, str]) -> Iterator[Cable]:
     made.close()
 
 
+@pytest.mark.thorough
 def test_live_answers_go_on_after_the_last_one_that_was_heard(
     visit: Visit, slow: tuple[Server, str], cable: Cable
 ) -> None:

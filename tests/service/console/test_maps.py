@@ -39,6 +39,7 @@ def test_the_list_tells_how_large_a_map_is_and_how_it_answers(admin: Operator) -
     expect(row.locator("time")).to_have_attribute("title", re.compile("UTC$"))
 
 
+@pytest.mark.thorough
 def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> None:
     page = admin.go("maps")
     page.get_by_role("button", name="Create a map").click()
@@ -69,6 +70,7 @@ def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> 
     assert keyed.client.get("/v1/maps/made-here").status_code == 404
 
 
+@pytest.mark.thorough
 def test_an_edit_of_what_somebody_else_changed_is_refused_and_told(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go("maps")
     page.get_by_role("button", name=f"Edit {spare}").click()
@@ -82,6 +84,7 @@ def test_an_edit_of_what_somebody_else_changed_is_refused_and_told(admin: Operat
     assert keyed.client.get(f"/v1/maps/{spare}").json()["description"] == "theirs"
 
 
+@pytest.mark.thorough
 def test_a_map_is_exported_and_imported_again(admin: Operator, keyed: Server, spare: str, tmp_path: Path) -> None:
     page = admin.go("maps")
     page.get_by_role("button", name=f"Export {spare}").click()
@@ -111,6 +114,7 @@ def test_a_file_that_is_no_map_is_refused_in_the_dialog(admin: Operator, tmp_pat
     page.get_by_role("dialog").get_by_role("alert").get_by_text("Request", exact=False).wait_for()
 
 
+@pytest.mark.thorough
 def test_places_are_filtered(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/places")
     tiles = page.get_by_role("list", name="Places").get_by_role("listitem")
@@ -132,6 +136,7 @@ def test_places_are_filtered(admin: Operator) -> None:
     expect(tiles).to_have_count(PLACES - 6)
 
 
+@pytest.mark.thorough
 def test_places_come_in_pages(admin: Operator, keyed: Server) -> None:
     keyed.create_map("paged", verification=False)
     for number in range(61):
@@ -146,6 +151,7 @@ def test_places_come_in_pages(admin: Operator, keyed: Server) -> None:
     page.get_by_role("link", name="q00").wait_for()
 
 
+@pytest.mark.thorough
 def test_a_place_is_shown_with_its_picture_neighbours_and_what_matched_it(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/places/monday-03")
     picture = page.get_by_role("img", name="Place monday-03").first
@@ -158,6 +164,7 @@ def test_a_place_is_shown_with_its_picture_neighbours_and_what_matched_it(admin:
     page.get_by_role("region", name="Answers").get_by_role("row").nth(1).wait_for()
 
 
+@pytest.mark.thorough
 def test_a_place_is_edited_and_the_edit_undone(admin: Operator, keyed: Server, spare: str) -> None:
     before = keyed.client.get(f"/v1/maps/{spare}/places/p1").json()
     page = admin.go(f"maps/{spare}/places/p1")
@@ -176,6 +183,7 @@ def test_a_place_is_edited_and_the_edit_undone(admin: Operator, keyed: Server, s
     assert {**after, "updated_at": None} == {**before, "updated_at": None}
 
 
+@pytest.mark.thorough
 def test_metadata_that_is_no_json_is_told_before_it_is_sent(admin: Operator, spare: str) -> None:
     page = admin.go(f"maps/{spare}/places/p1")
     page.get_by_role("button", name="Edit").click()
@@ -184,6 +192,7 @@ def test_metadata_that_is_no_json_is_told_before_it_is_sent(admin: Operator, spa
     page.get_by_role("dialog").get_by_text("Write the metadata as a JSON object.").wait_for()
 
 
+@pytest.mark.thorough
 def test_one_place_is_deleted_by_its_name(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go(f"maps/{spare}/places/p2")
     page.get_by_role("button", name="Delete").click()
@@ -193,6 +202,7 @@ def test_one_place_is_deleted_by_its_name(admin: Operator, keyed: Server, spare:
     assert "p2" not in keyed.places(spare)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("way", ["chosen", "filtered"])
 def test_many_places_are_deleted_together(visit: Visit, keyed: Server, spare: str, way: str) -> None:
     operator = visit("enrol")
@@ -215,6 +225,7 @@ def test_many_places_are_deleted_together(visit: Visit, keyed: Server, spare: st
     assert keyed.places(spare).keys() == {"p0", "p2"}
 
 
+@pytest.mark.thorough
 def test_the_plan_chooses_what_is_clicked_and_goes_along_the_traverse(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/plan")
     canvas = page.get_by_role("img", name=re.compile(f"Plan of {LAB}"))
@@ -235,6 +246,7 @@ def test_the_plan_chooses_what_is_clicked_and_goes_along_the_traverse(admin: Ope
     chosen.get_by_role("link", name="monday-05").wait_for()
 
 
+@pytest.mark.thorough
 def test_traverses_are_drawn_in_their_colours_and_can_be_left_out(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/plan")
     count = """canvas => {
@@ -258,6 +270,7 @@ def test_traverses_are_drawn_in_their_colours_and_can_be_left_out(admin: Operato
     assert eventually(lambda: painted() == 0)
 
 
+@pytest.mark.thorough
 def test_without_poses_the_traverses_are_strips(admin: Operator, keyed: Server) -> None:
     keyed.create_map("unposed")
     for number in range(3):

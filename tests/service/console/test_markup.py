@@ -48,6 +48,7 @@ def hostile(keyed: Server) -> Iterator[str]:
     keyed.client.delete("/v1/maps/hostile")
 
 
+@pytest.mark.thorough
 def test_descriptions(admin: Operator, hostile: str) -> None:
     page = admin.go("maps")
     check_plain(admin)
@@ -63,6 +64,7 @@ def test_names_and_values_of_metadata(admin: Operator, hostile: str) -> None:
     expect(page.get_by_role("dialog").get_by_label("Metadata")).to_have_value(written)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("view", ["plan", "places", "traverses", "try", "calibration", "health"])
 def test_names_of_traverses(admin: Operator, hostile: str, view: str) -> None:
     admin.go(f"maps/{hostile}/{view}")
@@ -72,6 +74,7 @@ def test_names_of_traverses(admin: Operator, hostile: str, view: str) -> None:
     assert admin.page.evaluate("window.pwned") is None
 
 
+@pytest.mark.thorough
 def test_names_of_files(admin: Operator, tmp_path: Path) -> None:
     name = "<b id='pwned'>1.jpg"
     (tmp_path / name).write_bytes(jpeg(1))
@@ -110,6 +113,7 @@ def test_reasons_that_the_service_gives(admin: Operator, keyed: Server) -> None:
     expect(admin.page.get_by_role("alert")).to_contain_text(re.compile("(.*" + re.escape(MARKUP) + "){4}", re.DOTALL))
 
 
+@pytest.mark.thorough
 def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
     # The service refuses such names of keys, cameras and places; a page that trusted it would be one fault from ruin.
     key = {"id": MARKUP, "name": MARKUP, "role": "query", "maps": [MARKUP], "state": "in force", "own": False}
@@ -164,6 +168,7 @@ def recent(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Op
         yield operator
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("field", RECENT)
 def test_texts_of_recent_answers(recent: Operator, field: str) -> None:
     row = recent.page.get_by_role("region", name="Answers").get_by_role("row").nth(1 + RECENT.index(field))
@@ -194,6 +199,7 @@ def kept(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Oper
         yield operator
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("field", KEPT)
 def test_texts_of_kept_frames(kept: Operator, field: str) -> None:
     kept.page.get_by_role("button", name=f"Frame {KEPT.index(field)}", exact=True).click()
@@ -234,6 +240,7 @@ def live(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Oper
         yield operator
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("field", [*LINE, *DETAILS])
 def test_texts_of_live_answers(live: Operator, field: str) -> None:
     lines = live.page.get_by_role("list", name="Answers").get_by_role("listitem")
@@ -249,6 +256,7 @@ def test_texts_of_live_answers(live: Operator, field: str) -> None:
     expect(dialog).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_addresses_of_pictures_of_live_answers(admin: Operator) -> None:
     admin.foresee("401", "404")
     told(admin.page, [live_event(picture=MARKUP), live_event(explanation=f"/v1/{MARKUP}")])
@@ -262,6 +270,7 @@ def test_addresses_of_pictures_of_live_answers(admin: Operator) -> None:
     assert page.evaluate("window.pwned") is None
 
 
+@pytest.mark.thorough
 def test_names_of_maps(admin: Operator, keyed: Server) -> None:
     admin.foresee("404", "422")
     known = keyed.client.get("/v1/maps").json()
@@ -273,6 +282,7 @@ def test_names_of_maps(admin: Operator, keyed: Server) -> None:
     check_plain(admin, f"The answers of {MARKUP}")
 
 
+@pytest.mark.thorough
 def test_names_of_sessions_on_the_plan(admin: Operator) -> None:
     pose = {"x": 1, "y": 2, "heading": 0, "spread": 1}
     told(admin.page, [live_event(verdict="recognized", session=MARKUP, pose=pose)])

@@ -26,6 +26,7 @@ CALL = """async (name) => {
 }"""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [*REFUSED, *QUOTED], ids=ascii)
 def test_a_name_stays_one_segment(admin: Operator, name: str) -> None:
     admin.foresee("404", "422")
@@ -39,6 +40,7 @@ def test_a_name_stays_one_segment(admin: Operator, name: str) -> None:
         assert sent == [f"/v1/maps/no-map/sequences/{quote(name, safe='')}"] and told[0] == "Problem"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("view", ["..", "../places", "../live", "a%2Fb/plan", f"{LAB}/places/.."])
 def test_an_address_with_dots_shows_nothing(admin: Operator, view: str) -> None:
     page = admin.go("maps")

@@ -52,6 +52,7 @@ def test_an_admin_says_which_frames_are_kept(admin: Operator, keyed: Server) -> 
     assert sorted(kept["verdicts"]) == ["ambiguous", "unknown"] and kept["most_frames"] == 50
 
 
+@pytest.mark.thorough
 def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful: str, tmp_path: Path) -> None:
     operator = visit("enrol")
     page = operator.go(f"maps/{doubtful}/review")
@@ -90,6 +91,7 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     assert sum(one["place"] is None for one in again) == 1
 
 
+@pytest.mark.thorough
 def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     admin: Operator, keyed: Server, doubtful: str
 ) -> None:

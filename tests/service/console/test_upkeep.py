@@ -21,6 +21,7 @@ def yard(keyed: Server) -> Iterator[str]:
     keyed.client.delete("/v1/maps/yard")
 
 
+@pytest.mark.thorough
 def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, keyed: Server, yard: str) -> None:
     page = admin.go(f"maps/{yard}/calibration")
     page.get_by_text("Nothing was measured yet").wait_for()
@@ -59,6 +60,7 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
 
 
+@pytest.mark.thorough
 def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     admin: Operator, keyed: Server, yard: str
 ) -> None:
@@ -88,6 +90,7 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     assert after["threshold"] == pytest.approx(before["threshold"])
 
 
+@pytest.mark.thorough
 def test_a_threshold_is_not_applied_over_somebody_elses(admin: Operator, keyed: Server, yard: str) -> None:
     order = {
         "method": "sequence",
@@ -107,6 +110,7 @@ def test_a_threshold_is_not_applied_over_somebody_elses(admin: Operator, keyed: 
     told.wait_for(state="detached")
 
 
+@pytest.mark.thorough
 def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yard: str) -> None:
     operator = visit("enrol")
     page = operator.go(f"maps/{yard}/traverses")
@@ -144,6 +148,7 @@ def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> No
     assert keyed.places("short").keys() == {"s1"}
 
 
+@pytest.mark.thorough
 def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> None:
     world.copy(keyed, "pruned")
     for number in range(6):  # a third view of a place, without which the other two do as well
@@ -164,6 +169,7 @@ def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> 
     assert len(keyed.places("pruned")) < enrolled
 
 
+@pytest.mark.thorough
 def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -> None:
     for name, numbers in (("target", (0, 1)), ("source", (2, 3))):
         keyed.create_map(name)

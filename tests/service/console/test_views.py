@@ -44,6 +44,7 @@ def open_to(role: str, needed: str) -> bool:
     return LEVELS.index(role) >= LEVELS.index(needed)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("role", LEVELS[:2])
 def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) -> None:
     operator = visit(role)
@@ -75,6 +76,7 @@ OF_MAP_REST, OF_SERVICE_REST = (
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "views",
     [
@@ -124,6 +126,7 @@ def check_with_axe(operator: Operator, where: str, only: list[str] | None = None
     assert serious == [], where
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", ["phone", "wall"])
 def test_a_view_that_begins_on_this_screen_is_not_wider(visit: Visit, size: str) -> None:
     operator = visit("admin", size=size)
@@ -191,6 +194,7 @@ def test_a_service_without_keys_needs_none(visit: Visit, server: Server, travers
     page.get_by_text("There are no keys").wait_for()
 
 
+@pytest.mark.thorough
 def test_a_view_that_is_not_there_says_so(admin: Operator) -> None:
     page = admin.go("nowhere")
     expect(page.get_by_role("heading", level=1)).to_have_text("There is no such view")

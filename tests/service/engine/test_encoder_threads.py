@@ -320,6 +320,7 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
     await queue.encode(encoder.identity, jpeg(1), RequestDeadline(time.monotonic() + 60, stays))
 
 
+@pytest.mark.thorough
 @pytest.mark.anyio
 async def test_a_frame_that_is_too_late_ends_its_request(queue: EncoderQueue) -> None:
     """The deadline passes while the caller is busy with earlier frames; the last ones find it over in their turn."""
@@ -359,6 +360,7 @@ async def test_nobody_waits_for_an_encoder_in_vain(
 # Over HTTP
 
 
+@pytest.mark.thorough
 def test_robots_together_get_the_answers_of_robots_alone(server: Server, traverse: str) -> None:
     frames = [jpeg(seed) for seed in range(8)]
     alone = [server.query(traverse, data) for data in frames]
@@ -385,6 +387,7 @@ def test_a_batch_over_http_has_an_answer_or_a_problem_for_each_frame(server: Ser
             assert item["answer"]["matches"][0]["place"]["id"] == f"p{index % 8}"
 
 
+@pytest.mark.thorough
 def test_bulk_does_not_keep_a_robot_waiting(server: Server, traverse: str, map_id: str, tmp_path: Path) -> None:
     entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(40)]
     files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(40)]

@@ -173,6 +173,7 @@ def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> No
     assert 'placerec_problems_total{type="queue-full"}' in tight_server.client.get("/metrics").text
 
 
+@pytest.mark.thorough
 def test_a_busy_server_is_alive_and_keeps_deadlines(server: Server) -> None:
     large, enough = encoded(scene(1, 3000, 3000)), threading.Event()
     durations: list[float] = []

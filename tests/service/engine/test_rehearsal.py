@@ -18,6 +18,7 @@ CACHE = "[cache] "
 """How lines begin by which Numba tells that it loads a compiled loop, or has compiled one."""
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(600)  # of a slow machine whose cache is empty
 def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")

@@ -50,6 +50,7 @@ def lab(quick: Server, request: pytest.FixtureRequest) -> str:
     return name
 
 
+@pytest.mark.thorough
 def test_a_query_is_told_as_it_was_answered(quick: Server, lab: str) -> None:
     assert quick.client.put(f"/v1/maps/{lab}/cameras/front", json={}).is_success
     with listening(quick, lab) as ear:
@@ -320,6 +321,7 @@ def test_a_job_that_names_a_map_of_others_is_not_told(keyed: Keyed) -> None:
     assert len({one.data["job"] for one in admin.heard if one.name == "job"}) == 2
 
 
+@pytest.mark.thorough
 def test_a_stream_ends_when_its_key_is_revoked(keyed: Keyed) -> None:
     key, token = keyed.store.create("guest", "query", ["lab"])
     until = time.monotonic() + 90
@@ -338,6 +340,7 @@ def test_a_stream_ends_when_its_key_is_revoked(keyed: Keyed) -> None:
         assert guest.names() == ["listening"]
 
 
+@pytest.mark.thorough
 def test_listeners_do_not_keep_the_service_from_stopping(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     server = Server(tmp_path, {"encoder": COARSE, "shutdown_timeout": 120}).wait()
@@ -348,6 +351,7 @@ def test_listeners_do_not_keep_the_service_from_stopping(tmp_path: Path) -> None
         assert ear.ended.wait(60) and time.monotonic() - began < 60, "requests under way would have had two minutes"
 
 
+@pytest.mark.thorough
 def test_two_hundred_queries_from_eight_callers_are_each_told_once(quick: Server, lab: str) -> None:
     with listening(quick, lab, parameters={"kinds": "query", "pictures": "true"}) as ear:
 

@@ -22,6 +22,7 @@ def problem(data: bytes) -> tuple[int, str]:
     return told["status"], told["type"].removeprefix("urn:placerec:problem:")
 
 
+@pytest.mark.thorough
 def test_the_loris_and_the_half_sent_are_gone_and_a_robot_is_answered_meanwhile(strict: Server) -> None:
     strict.create_map("busy")
     assert strict.enrol("busy", "p1", jpeg(1)).status_code == 201
@@ -51,6 +52,7 @@ def test_the_loris_and_the_half_sent_are_gone_and_a_robot_is_answered_meanwhile(
     assert eventually(lambda: open_files(strict) <= before + 3)
 
 
+@pytest.mark.thorough
 def test_a_connection_that_says_nothing_is_closed(strict: Server) -> None:
     silent, blank, kept = opened(strict), opened(strict), opened(strict)
     blank.sendall(b"\r\n")
@@ -126,6 +128,7 @@ def test_what_is_broken_behind_a_request_does_not_cut_its_answer_off(strict: Ser
     assert found.startswith(b"HTTP/1.1 200 OK") and b"connection: close" in found.lower()
 
 
+@pytest.mark.thorough
 def test_a_caller_that_does_not_read_is_cut_off(strict: Server) -> None:
     before = ended(strict, "write-timeout")
     with opened(strict, receive_buffer=4096) as connection:

@@ -87,6 +87,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Server, lis
     return folder, server, seen, raised.value.rcvd.code if raised.value.rcvd else None
 
 
+@pytest.mark.thorough
 def test_what_was_begun_is_answered(stopped: tuple[Path, Server, list[Seen], int | None]) -> None:
     _, server, seen, code = stopped
     answered = {request: status for one in seen for request, status in one.statuses.items()}
@@ -125,6 +126,7 @@ def test_what_was_acknowledged_is_there_after_a_restart(
         assert b"urn:placerec:problem:stopping" in rest(slow)
 
 
+@pytest.mark.thorough
 def test_what_does_not_end_in_time_is_given_up_and_told_so(tmp_path: Path) -> None:
     server = Server(tmp_path, settings={"shutdown_timeout": 0.5, "read_timeout": 300, "request_timeout": 300})
     with opened(server.wait("/livez")) as slow, opened(server) as refused:

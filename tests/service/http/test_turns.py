@@ -102,6 +102,7 @@ def run(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
     return runs
 
 
+@pytest.mark.thorough
 def test_who_reads_slowly_and_steadily_gets_all_and_who_stops_is_cut_off(run: Callable[[Any], Any]) -> None:
     async def slow() -> None:
         async with serving(write_timeout=0.5) as (connections, dial):
@@ -138,6 +139,7 @@ def test_who_has_not_read_its_answer_is_not_waiting(run: Callable[[Any], Any]) -
     run(crowded())
 
 
+@pytest.mark.thorough
 def test_when_the_rest_of_a_refused_body_has_come_the_connection_goes_on(run: Callable[[Any], Any]) -> None:
     async def refused() -> None:
         async with serving(read_timeout=0.3, head_timeout=0.3) as (connections, dial):

@@ -56,6 +56,7 @@ def labelled(
     return client.post(f"/v1/maps/{map_id}/calibrate", files=parts)
 
 
+@pytest.mark.thorough
 def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, walked: str) -> None:
     before = server.client.get(f"/v1/maps/{walked}")
     dry = calibrate(server.client, walked).json()
@@ -100,6 +101,7 @@ def test_stated_pairs_stand_in_for_poses(server: Server, walked: str) -> None:
     assert "right" in problem["detail"]
 
 
+@pytest.mark.thorough
 def test_labelled_frames(server: Server, walked: str) -> None:
     files = {f"f{number}": encoded(seen_again(scene(number), 100 + number)) for number in range(14)}
     files |= {f"stranger{number}": jpeg(200 + number) for number in range(4)}
@@ -131,6 +133,7 @@ def test_labelled_frames_of_a_camera(server: Server, walked: str) -> None:
     assert_problem(plain, 422, "calibration-impossible")
 
 
+@pytest.mark.thorough
 def test_the_own_frames_of_a_map_calibrate_it_with_a_warning(server: Server, map_id: str) -> None:
     for number in range(12):
         for step in range(2):

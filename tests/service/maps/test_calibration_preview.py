@@ -41,6 +41,7 @@ def state_of(server: Server, map_id: str, **parameters: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_threshold_is_previewed_and_applied(server: Server, previewed: str) -> None:
     path = f"/v1/maps/{previewed}"
     fresh = state_of(server, previewed, threshold="0.1")
@@ -82,6 +83,7 @@ def test_what_does_not_fit_is_refused(server: Server, previewed: str) -> None:
     assert_problem(server.client.get("/v1/maps/absent/calibration"), 404, "unknown-map")
 
 
+@pytest.mark.thorough
 def test_a_job_is_remembered_over_a_restart_and_forgotten_with_its_map(tmp_path: Path) -> None:
     server = Server(tmp_path).wait()
     server.create_map("lab")

@@ -56,6 +56,7 @@ def test_a_camera_is_made_replaced_listed_and_forgotten(client: httpx.Client, ma
         assert_problem(gone, 404, "unknown-camera")
 
 
+@pytest.mark.thorough
 def test_the_mask_is_applied_at_enrolment_and_at_query(server: Server, map_id: str) -> None:
     put(server.client, map_id, "front", MASK)
     for number in range(8):
@@ -191,6 +192,7 @@ def test_intrinsics_are_finite(client: httpx.Client, map_id: str, number: str) -
     assert client.get(f"/v1/maps/{map_id}/cameras").json()["items"] == []
 
 
+@pytest.mark.thorough
 def test_a_map_has_a_limit_of_cameras(client: httpx.Client, map_id: str) -> None:
     for number in range(256):
         assert put(client, map_id, f"c{number}", None).status_code == 201

@@ -112,6 +112,7 @@ def test_a_range(run: Run, header: str, start: int, stop: int | None) -> None:
     run(work)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "headers"),
     [

@@ -261,6 +261,7 @@ def test_verifying(server: Server, map_id: str) -> None:
     assert report["checked_bytes"] > 2 * dimension + cells * values
 
 
+@pytest.mark.thorough
 def test_after_a_kill_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path: Path) -> None:
     server, mask = Server(tmp_path).wait(), {"polygons": [[[0, 0.6], [1, 0.6], [1, 1], [0, 1]]]}
     for name in ("bad", "good"):

@@ -309,6 +309,7 @@ def large(server: Server) -> bytes:
     return sealed({**manifest, "places": MANY, "parts": listed}, made)
 
 
+@pytest.mark.thorough
 def test_killed_at_every_stage(apart: Path) -> None:
     """Killed while a file arrives, a request makes a map and a job another: no map is incomplete, the job continues."""
     settings = {"max_imports": 3, "max_import_bytes": 1 << 28}

@@ -105,6 +105,7 @@ def files(first: int, count: int) -> dict[str, bytes]:
     return {f"f{number}": SMALL[number] for number in range(first, first + count)}
 
 
+@pytest.mark.thorough
 def test_batches_are_stored_in_order_however_they_arrive(server: Server, map_id: str) -> None:
     answers: dict[str, httpx.Response] = {}
 
@@ -126,6 +127,7 @@ def test_batches_are_stored_in_order_however_they_arrive(server: Server, map_id:
     assert list(server.places(map_id)) == [f"p{number}" for number in range(24)]
 
 
+@pytest.mark.thorough
 def test_no_batch_is_stored_out_of_order(server: Server, map_id: str) -> None:
     def post(first: int, line: dict[str, str], **options: object) -> httpx.Response:
         return send(server, map_id, numbered(first, 2), files(first, 2), params=line, **options)

@@ -20,6 +20,7 @@ def send(server: Server, map_id: str, places: object, files: Mapping[str, bytes]
     return server.client.post(f"/v1/maps/{map_id}/places", data={"places": text}, files=parts, **options)
 
 
+@pytest.mark.thorough
 def test_good_frames_are_stored_and_bad_ones_reported(server: Server, map_id: str) -> None:
     places: list[Any] = [
         {"id": "good-1", "file": "a", "x": 1, "y": 2, "heading": 3, "sequence": "s", "metadata": {"n": 1}},
@@ -167,6 +168,7 @@ def test_a_batch_over_its_limits(tight_server: Server, tight_map: str) -> None:
     assert set(tight_server.places(tight_map)) == set()
 
 
+@pytest.mark.thorough
 def test_many_queries_at_once(server: Server, traverse: str) -> None:
     files = {f"f{number}": encoded(seen_again(scene(number))) for number in range(4)}
     files["bad"] = b"no image"

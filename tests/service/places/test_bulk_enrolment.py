@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from tests.service.conftest import TIGHT
 from tests.service.encoders import COARSE, install_coarse_encoder
@@ -43,6 +44,7 @@ def staged(server: Server) -> list[str]:
     return [path.name for path in folder.iterdir()] if folder.is_dir() else []
 
 
+@pytest.mark.thorough
 def test_a_form_becomes_a_job_and_bad_frames_fail_alone(server: Server) -> None:
     server.create_map("bulk", encoder=COARSE)
     listed = [
@@ -101,6 +103,7 @@ def test_malformed_forms_are_refused_and_leave_nothing(server: Server) -> None:
     assert staged(server) == [] and not server.client.get("/v1/jobs?map=refusing").json()["items"]
 
 
+@pytest.mark.thorough
 def test_a_killed_job_is_resumed(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     coarse = {"encoder": COARSE}
@@ -124,6 +127,7 @@ def test_a_killed_job_is_resumed(tmp_path: Path) -> None:
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_a_cancelled_job_keeps_what_is_enrolled_and_the_next_job_runs(server: Server) -> None:
     for name in ("cancelled", "next"):
         server.create_map(name, encoder=COARSE)

@@ -91,6 +91,7 @@ def check_whole(server: Server, map_id: str) -> dict[str, dict[str, Any]]:
     return found
 
 
+@pytest.mark.thorough
 def test_writers_merges_and_prunes_of_one_map(busy: Server) -> None:
     seed = 20261121
     busy.create_map("hub", encoder=COARSE)

@@ -30,6 +30,7 @@ def answers(server: Server, map_id: str, frames: list[bytes]) -> list[dict[str, 
     return found
 
 
+@pytest.mark.thorough
 def test_the_main_job(tmp_path: Path) -> None:
     """A traverse is enrolled, another localized, the process killed and started again: the same answers."""
     server = Server(tmp_path).wait()
@@ -79,6 +80,7 @@ def test_the_corridor(tmp_path: Path) -> None:
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> None:
     """One kill; tests/durability kills the service again after it has recovered."""
     frames = [jpeg(number) for number in range(6)]
@@ -202,6 +204,7 @@ def test_a_full_file_system_is_reported_and_nothing_is_half_written(tmp_path: Pa
     server.kill()
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
 def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
     trace, folder = tmp_path / "trace", tmp_path.resolve() / "server"

@@ -76,6 +76,7 @@ def test_a_form_may_not_contradict_the_query_string(server: Server, map_id: str)
     assert_problem(server.client.put(path, data={"x": "1"}, files=[("x", (None, b"2"))]), 422, "invalid-request")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -195,6 +196,7 @@ def test_editing_is_a_merge_patch(server: Server, map_id: str) -> None:
     assert server.client.get(path).json() == cleared.json()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "changes",
     [

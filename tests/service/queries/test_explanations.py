@@ -75,6 +75,7 @@ def test_a_blank_frame_is_explained_too(client: httpx.Client) -> None:
     assert answer["score"] == 0 and answer["explanation"]["query_regions"] == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("keep", ["thumbnail", "image", "none"])
 def test_a_query_can_be_explained(server: Server, keep: str) -> None:
     map_id = f"why-{keep}"

@@ -56,6 +56,7 @@ def numbers(*which: int) -> set[str]:
     return {f"p{number}" for number in which}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("parameters", "expected"),
     [

@@ -29,6 +29,7 @@ def plan(server: Server, map_id: str) -> Plan:
     return Plan(url, map_id, scenes, [jpeg(40)], fixed, robots=2, operators=0, rate=5)
 
 
+@pytest.mark.thorough
 def test_a_fleet_has_no_complaints_about_a_working_service(server: Server, map_id: str) -> None:
     fleet = Fleet(plan(server, map_id))
     asyncio.run(fleet.work(1.5, exports=False))
@@ -37,6 +38,7 @@ def test_a_fleet_has_no_complaints_about_a_working_service(server: Server, map_i
     assert fleet.seen.statuses["query 200"] + fleet.unsent >= 14
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("told", [False, True])
 def test_a_place_that_is_lost_or_comes_back_is_reported(server: Server, map_id: str, told: bool) -> None:
     fleet = Fleet(plan(server, map_id))
@@ -49,6 +51,7 @@ def test_a_place_that_is_lost_or_comes_back_is_reported(server: Server, map_id: 
     assert ("came back" if told else "not the best match") in complaint
 
 
+@pytest.mark.thorough
 def test_operators_enrol_and_delete_and_the_counts_agree(server: Server, map_id: str) -> None:
     scenes = [Scene(jpeg(number), jpeg(number)) for number in range(40)]
     fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 8, [], {}, 1, 1, rate=2, enrol_rate=8))

@@ -15,6 +15,7 @@ from tests.service.scenes import blank, encoded, jpeg, stranger
 from tests.service.server import Server, assert_problem
 
 
+@pytest.mark.thorough
 def test_the_latest_answers_and_the_mix_of_the_day(server: Server, map_id: str) -> None:
     for number in range(3):
         server.enrol(map_id, f"p{number}", jpeg(number), x=3 * number, y=0, heading=90)
@@ -56,6 +57,7 @@ def test_the_latest_answers_and_the_mix_of_the_day(server: Server, map_id: str) 
     assert lately["items"][-1]["rank"] == 1 and lately["best"] >= 2 and lately["recognized"] >= 1 and lately["last_at"]
 
 
+@pytest.mark.thorough
 def test_an_answer_knows_camera_and_session(server: Server, map_id: str) -> None:
     for number in range(3):
         server.enrol(map_id, f"p{number}", jpeg(number), x=3 * number, y=0, heading=90)
@@ -102,6 +104,7 @@ def test_a_new_map_of_the_same_name_has_no_answers(server: Server, map_id: str) 
     assert found == {"items": [], "next_cursor": None, "kept": 0, "hours": []}
 
 
+@pytest.mark.thorough
 def test_only_admins_see_who_asked(tmp_path: Path) -> None:
     store = KeyStore(tmp_path / "data")
     _, admin = store.create("ops", "admin")

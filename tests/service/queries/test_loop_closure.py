@@ -46,6 +46,7 @@ def test_an_unknown_frame_becomes_a_place(server: Server, map_id: str) -> None:
     assert (stored["sequence"], stored["timestamp"]) == ("run", "2026-11-20T10:00:00Z")
 
 
+@pytest.mark.thorough
 def test_a_known_frame_does_not_become_a_place(server: Server, map_id: str) -> None:
     fill(server, map_id)
     server.enrol(map_id, "p1", jpeg(1), x=0, y=0)
@@ -67,6 +68,7 @@ def test_the_very_picture_of_a_place_does_not_become_another(server: Server, map
     assert answer["change"] is None and count(server, map_id) == 1
 
 
+@pytest.mark.thorough
 def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
     fill(server, map_id)
     first = close(server, map_id, "p1", jpeg(1), x=0, y=0)
@@ -79,6 +81,7 @@ def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
     assert count(server, map_id) == len(BACKGROUND) + 1
 
 
+@pytest.mark.thorough
 def test_of_eight_robots_at_one_new_place_one_enrols_it(server: Server, map_id: str) -> None:
     fill(server, map_id)
     looks = [encoded(seen_again(scene(1), seed)) for seed in range(8)]
@@ -94,6 +97,7 @@ def test_of_eight_robots_at_one_new_place_one_enrols_it(server: Server, map_id: 
     assert count(server, map_id) == len(BACKGROUND) + 1
 
 
+@pytest.mark.thorough
 def test_a_robot_does_not_find_its_own_last_frames(server: Server, map_id: str) -> None:
     fill(server, map_id)
     looks = [encoded(seen_again(scene(1), seed)) for seed in range(3)]
@@ -118,6 +122,7 @@ def test_a_blank_frame_is_no_place(server: Server, map_id: str) -> None:
     assert count(server, map_id) == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("level", "noise"), [(20, 10), (128, 30)])
 def test_what_a_covered_camera_shows_is_no_place(server: Server, map_id: str, level: int, noise: int) -> None:
     fill(server, map_id)
@@ -146,6 +151,7 @@ def test_invalid_loop_closures(server: Server, map_id: str) -> None:
     assert count(server, map_id) == 0
 
 
+@pytest.mark.thorough
 def test_a_place_that_the_map_has_twice_is_not_enrolled_a_third_time(server: Server, map_id: str) -> None:
     """Two sequences without poses: the counterparts are rivals, which explains that neither can be recognized."""
     for sequence in ("monday", "tuesday"):

@@ -54,6 +54,7 @@ def reviewed(server: Server, map_id: str, frames: int) -> list[str]:
     return [one["answer"]["verdict"] for one in server.client.get(f"/v1/maps/{map_id}/review").json()["items"]]
 
 
+@pytest.mark.thorough
 def test_a_frame_that_one_map_recognizes_is_kept_for_review_by_no_other(fleet: Server) -> None:
     every = {"review": {"verdicts": ["recognized", "ambiguous", "unknown"]}}
     for name in ("hall", "yard"):
@@ -132,6 +133,7 @@ def test_a_place_that_two_maps_have_is_ambiguous(fleet: Server) -> None:
     assert one["verdict"] == "recognized"
 
 
+@pytest.mark.thorough
 def test_one_geographic_place_in_two_maps_is_recognized(server: Server) -> None:
     for name in ("by-day", "by-night"):
         server.create_map(name)
@@ -183,6 +185,7 @@ def rig_map(server: Server) -> str:
     return "rig"
 
 
+@pytest.mark.thorough
 def test_two_cameras_are_more_certain_than_one(server: Server, rig_map: str) -> None:
     both = ask_rig(server, {"a": again(4), "b": again(204)}, maps=rig_map, k=4)
     assert both["verdict"] == "recognized" and both["place"]["pose"]["x"] == 40
@@ -233,6 +236,7 @@ def test_invalid_queries_of_several_maps(fleet: Server) -> None:
     assert_problem(fleet.client.post("/v1/query", content=b"{}"), 415, "unsupported-media-type")
 
 
+@pytest.mark.thorough
 def test_answers_count_for_the_health_of_the_map_that_has_the_place(fleet: Server) -> None:
     def counted(map_id: str) -> tuple[int, int]:
         answers = fleet.client.get(f"/v1/maps/{map_id}/health").json()["answers"]

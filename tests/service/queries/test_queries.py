@@ -51,6 +51,7 @@ def test_a_place_that_was_never_enrolled_is_unknown(server: Server, traverse: st
     assert verdicts.count("recognized") <= 3
 
 
+@pytest.mark.thorough
 def test_two_similar_places_are_ambiguous(server: Server, map_id: str) -> None:
     server.enrol(map_id, "here", jpeg(1), x=0, y=0)
     server.enrol(map_id, "there", jpeg(1), x=500, y=0)
@@ -88,6 +89,7 @@ def test_a_frame_without_regions(server: Server) -> None:
     assert server.query("coarse-queries", jpeg(1))["score"] == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.thorough
 def test_the_best_places_are_examined_by_the_second_stage(server: Server) -> None:
     frames = {f"p{seed}": jpeg(seed) for seed in range(20, 26)}
     server.create_map("two-stages", encoder=TWO_STAGES)
@@ -151,6 +153,7 @@ def test_one_map_does_not_answer_for_another(server: Server, map_id: str, traver
     assert [match["place"]["id"] for match in server.query(map_id, jpeg(1), k=100)["matches"]] == ["other"]
 
 
+@pytest.mark.thorough
 def test_queries_while_places_come_and_go(server: Server, map_id: str) -> None:
     for number in range(4):
         server.enrol(map_id, f"stay{number}", jpeg(number))

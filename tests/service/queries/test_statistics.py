@@ -68,6 +68,7 @@ def test_counts_survive_a_restart(tmp_path: Path, maps: Maps) -> None:
     again.close()
 
 
+@pytest.mark.thorough
 @given(st.lists(st.tuples(st.sampled_from(["p1", "p2", None]), st.booleans()), max_size=40))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
 def test_the_moments_of_writing_do_not_matter(

@@ -33,6 +33,7 @@ def parts(answer: dict[str, Any]) -> list[dict[str, Any]]:
     return [match["parts"] for match in answer["matches"]]
 
 
+@pytest.mark.thorough
 def test_always_tells_the_parts_of_each_match(server: Server, verified: str) -> None:
     answer = server.query(verified, seen(3), verify="always", k=PLACES)
     assert answer["verdict"] == "recognized" and answer["place"]["id"] == "p3"
@@ -58,6 +59,7 @@ def test_the_same_frame_is_found_however_it_is_verified(server: Server, verified
     assert answer["revision"] == 1
 
 
+@pytest.mark.thorough
 def test_strangers_are_not_recognized_in_a_map_of_one_place(server: Server, map_id: str) -> None:
     server.enrol(map_id, "only", jpeg(1))
     for verify in ("auto", "always"):
@@ -86,6 +88,7 @@ REAL = (
 DATASETS = Path(__file__).parents[4] / "shared/datasets"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", FLAT)
 def test_a_place_is_recognized_by_its_own_picture(server: Server, map_id: str, seed: int) -> None:
     server.enrol(map_id, "only", jpeg(seed))
@@ -96,6 +99,7 @@ def test_a_place_is_recognized_by_its_own_picture(server: Server, map_id: str, s
         assert told["inliers"] > 0.9 * told["keypoints"] and told["evidence"] > 1000
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("picture", REAL)
 @pytest.mark.skipif(not DATASETS.is_dir(), reason="the pictures of ../shared/datasets are not here")
 def test_a_real_place_is_recognized_by_its_own_picture(server: Server, map_id: str, picture: str) -> None:
@@ -140,6 +144,7 @@ def test_the_inliers_are_explained_and_drawn(server: Server, verified: str) -> N
     assert server.query(verified, seen(3), verify="never", explain=True)["explanation"]["inliers"] == []
 
 
+@pytest.mark.thorough
 def test_a_map_without_keypoints_says_so_and_answers_by_two_stages(server: Server) -> None:
     server.create_map("without-keypoints", verification=False, keep="thumbnail")
     for seed in range(3):

@@ -66,6 +66,7 @@ def label(server: Server, map_id: str, frame: int, **order: Any) -> dict[str, An
     return found
 
 
+@pytest.mark.thorough
 def test_a_map_keeps_nothing_unless_it_was_told_to(reviewed: Server) -> None:
     made = reviewed.create_map("silent")
     assert made["review"] is None
@@ -120,6 +121,7 @@ def test_a_kept_frame_tells_how_it_was_answered(reviewed: Server, lab: str) -> N
     assert_problem(reviewed.client.get(f"/v1/maps/{lab}/review/99/picture"), 404, "unknown-frame")
 
 
+@pytest.mark.thorough
 def test_pages_go_from_the_newest_to_the_oldest(reviewed: Server, lab: str) -> None:
     for number in range(7):
         reviewed.query(lab, jpeg(100 + number))
@@ -136,6 +138,7 @@ def test_pages_go_from_the_newest_to_the_oldest(reviewed: Server, lab: str) -> N
     assert_problem(reviewed.client.get(f"/v1/maps/{lab}/review?cursor=x"), 422, "invalid-cursor")
 
 
+@pytest.mark.thorough
 def test_frames_are_labelled_enrolled_and_thrown_away(reviewed: Server, lab: str) -> None:
     for number in range(4):
         reviewed.query(lab, encoded(stranger(200 + number)))
@@ -159,6 +162,7 @@ def test_frames_are_labelled_enrolled_and_thrown_away(reviewed: Server, lab: str
     assert reviewed.client.get(f"/v1/maps/{lab}/review/labels").json()["items"][0]["place"] is None
 
 
+@pytest.mark.thorough
 def test_a_frame_is_not_thrown_away_while_it_is_enrolled(reviewed: Server, lab: str) -> None:
     for number in range(6):
         reviewed.query(lab, encoded(stranger(300 + number)))
@@ -202,6 +206,7 @@ def test_bad_labels_are_refused_and_change_nothing(reviewed: Server, lab: str) -
     assert kept(reviewed, lab, 1)[0]["label"] is None and len(reviewed.places(lab)) == 6
 
 
+@pytest.mark.thorough
 def test_sessions_and_batches_are_kept_too_and_survive_a_kill(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     server = Server(tmp_path, {"encoder": COARSE}).wait()
@@ -225,6 +230,7 @@ def test_sessions_and_batches_are_kept_too_and_survive_a_kill(tmp_path: Path) ->
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_labels_calibrate_the_map(reviewed: Server) -> None:
     reviewed.create_map("hall", same_place_radius=1.0, review={"verdicts": ["recognized", "ambiguous", "unknown"]})
     for number in range(24):
@@ -259,6 +265,7 @@ def test_labels_calibrate_the_map(reviewed: Server) -> None:
     assert calibrate(beside="none").json()["measurement"]["frames"] == 25, "a place that is gone is no truth"
 
 
+@pytest.mark.thorough
 def test_review_needs_the_role_enrol(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     store = KeyStore(tmp_path / "data")
@@ -299,6 +306,7 @@ def test_more_frames_than_can_be_written_are_dropped(tmp_path: Path, monkeypatch
     atlas.close()
 
 
+@pytest.mark.thorough
 def test_ten_labels_move_the_encoders_curve(server: Server) -> None:
     server.create_map("moved", same_place_radius=1.0, review={"verdicts": ["recognized", "ambiguous", "unknown"]})
     for number in range(6):

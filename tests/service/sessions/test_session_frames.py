@@ -61,6 +61,7 @@ async def send(runtime: Runtime, map_: Map, session: Session, number: int, **mot
     return await process_frame(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
+@pytest.mark.thorough
 async def test_a_frame_whose_answer_fails_does_not_count(runtime: Runtime, monkeypatch: pytest.MonkeyPatch) -> None:
     map_ = await walked(runtime.engine)
     session, other = (runtime.sessions.create(map_, NewSession()) for _ in range(2))
@@ -108,6 +109,7 @@ def fates(patterns: int, frames: int) -> list[list[str]]:
     return [[ANSWER] * frames, [AGAIN] * frames, [REQUEST] * (frames - 1) + [OK], *drawn]
 
 
+@pytest.mark.thorough
 async def test_odometry_counts_once_whatever_is_lost(runtime: Runtime) -> None:
     count, metres = 7, 2.0
     map_ = await walked(runtime.engine, count, metres)

@@ -37,6 +37,7 @@ def test_sessions_are_read_as_they_were_written(tmp_path: Path) -> None:
         store.write(ONE)
 
 
+@pytest.mark.thorough
 @settings(max_examples=20, deadline=None)
 @given(STEPS)
 def test_contract(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int, bytes]]) -> None:

@@ -51,6 +51,7 @@ def send(server: Server, map_id: str, session: str, data: bytes, **parameters: A
     return answer
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [{}, {"advance": 1.0}, {"lag": 2}])
 def test_a_run_along_the_traverse(server: Server, traverse: str, options: dict[str, object]) -> None:
     session = begin(server, traverse, **options)
@@ -93,6 +94,7 @@ def test_a_session_can_be_read_listed_and_ended(server: Server, traverse: str) -
     assert_problem(post(server, traverse, session, again(1)), 404, "unknown-session")
 
 
+@pytest.mark.thorough
 def test_a_frame_sent_again_counts_once(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     first = send(server, traverse, session, again(1), frame=4)
@@ -127,6 +129,7 @@ def test_the_request_that_begins_a_session_can_be_sent_again(server: Server, map
     assert begun("begin-7", lag=2) not in {first, *others}, "a session with a frame is a robot's"
 
 
+@pytest.mark.thorough
 def test_frames_go_in_one_at_a_time(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with ThreadPoolExecutor(4) as pool:
@@ -238,6 +241,7 @@ def test_odometry(server: Server, traverse: str) -> None:
     assert answer["motion"] == "odometry"
 
 
+@pytest.mark.thorough
 def test_odometry_by_pose(server: Server, traverse: str) -> None:
     session, other = begin(server, traverse, speed_limit=3.0), begin(server, traverse, speed_limit=3.0)
 
@@ -271,6 +275,7 @@ def test_a_form_gives_the_same_answer(server: Server, traverse: str) -> None:
     assert response.json()["candidates"] == expected["candidates"]
 
 
+@pytest.mark.thorough
 def test_a_robot_that_leaves_the_map_or_is_carried_off(server: Server, map_id: str) -> None:
     for number in range(24):
         server.enrol(map_id, f"p{number}", jpeg(number), sequence="monday")
@@ -288,6 +293,7 @@ def test_a_robot_that_leaves_the_map_or_is_carried_off(server: Server, map_id: s
     assert not answer["lost"]
 
 
+@pytest.mark.thorough
 def test_a_robot_that_stands_and_a_covered_camera(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     for number in range(4):
@@ -304,6 +310,7 @@ def test_a_robot_that_stands_and_a_covered_camera(server: Server, traverse: str)
     assert (uncovered["view"], uncovered["verdict"]) == (None, "recognized")
 
 
+@pytest.mark.thorough
 def test_only_the_sequences_that_are_named(server: Server, map_id: str) -> None:
     for day in ("monday", "tuesday"):
         for number in range(4):
@@ -315,6 +322,7 @@ def test_only_the_sequences_that_are_named(server: Server, map_id: str) -> None:
     assert {match["place"]["sequence"] for match in answer["single"]["matches"]} == {"tuesday"}
 
 
+@pytest.mark.thorough
 def test_places_come_and_go_during_a_run(server: Server, map_id: str) -> None:
     for number in range(8):
         server.enrol(map_id, f"p{number}", jpeg(number), x=10 * number, y=0, sequence="monday")
@@ -373,6 +381,7 @@ def test_the_graphs_of_deleted_sessions_are_dropped(tmp_path: Path) -> None:
         runtime.sessions.close()
 
 
+@pytest.mark.thorough
 def test_sessions_expire_and_are_bounded(small: Server) -> None:
     for number in range(3):
         small.enrol("lab", f"p{number}", jpeg(number))
@@ -396,6 +405,7 @@ def test_sessions_expire_and_are_bounded(small: Server) -> None:
 RESTARTED: dict[str, dict[str, object]] = {"speed unknown": {}, "advance fixed": {"advance": 1.0}}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("end", ["kill", pytest.param("stop", marks=pytest.mark.thorough)])
 def test_a_session_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
     install_coarse_encoder(tmp_path / "models")

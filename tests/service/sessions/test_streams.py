@@ -33,6 +33,7 @@ def ask(connection: ClientConnection, data: bytes, **parameters: object) -> dict
     return answer
 
 
+@pytest.mark.thorough
 def test_a_run_over_one_connection(server: Server, traverse: str) -> None:
     session, other = begin(server, traverse), begin(server, traverse)
     with stream(server, traverse, session) as connection:
@@ -46,6 +47,7 @@ def test_a_run_over_one_connection(server: Server, traverse: str) -> None:
     assert send(server, traverse, session, again(7))["frames"] == 8, "the session outlives the connection"
 
 
+@pytest.mark.thorough
 def test_odometry_by_pose(server: Server, traverse: str) -> None:
     session, other = begin(server, traverse), begin(server, traverse)
     with stream(server, traverse, session) as connection:
@@ -60,6 +62,7 @@ def test_odometry_by_pose(server: Server, traverse: str) -> None:
         assert ask(connection, again(6), frame=6, forward=2.0, **pose)["problem"]["status"] == 422
 
 
+@pytest.mark.thorough
 def test_frames_sent_ahead_are_answered_in_their_order(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
@@ -143,6 +146,7 @@ def test_a_session_deleted_during_a_stream(server: Server, traverse: str) -> Non
             connection.recv(timeout=60)
 
 
+@pytest.mark.thorough
 def test_frames_over_the_limit_and_a_service_that_stops(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     settings = {"encoder": COARSE, "max_image_bytes": 60_000, "root_path": "/placerec"}

@@ -6,6 +6,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.service.scenes import encoded, scene
 from tests.service.server import ROOT, Server
 from tests.service.wire import eventually
@@ -24,6 +26,7 @@ os.write(2, b"as before\\n")
 """
 
 
+@pytest.mark.thorough
 def test_lines_are_logged_cut_and_told_apart() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, timeout=300, check=True)
     *said, last = done.stderr.decode().splitlines()

@@ -288,6 +288,7 @@ def test_a_cancelled_alignment_leaves_nothing(runtime: Runtime, lab: Map, monkey
     assert state(runtime) == before
 
 
+@pytest.mark.thorough
 def test_aligning_over_http(server: Server) -> None:
     server.create_map("aligned", encoder=COARSE)
     enrol_frames(server, "aligned", [encoded(scene(n)) for n in range(14)], "m", sequence="monday")
@@ -303,6 +304,7 @@ def test_aligning_over_http(server: Server) -> None:
     assert there["m6"]["pose_of"] is None
 
 
+@pytest.mark.thorough
 def test_enrolling_with_alignment(server: Server) -> None:
     server.create_map("joined", encoder=COARSE)
     enrol_frames(server, "joined", [encoded(scene(n)) for n in range(14)], "m", sequence="monday")

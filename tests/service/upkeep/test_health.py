@@ -68,6 +68,7 @@ def test_a_new_map_of_the_same_name_begins_with_nothing(server: Server) -> None:
         assert server.client.delete("/v1/maps/twice-made").status_code == 204
 
 
+@pytest.mark.thorough
 def test_gaps_and_stretches_to_record_again(server: Server) -> None:
     server.create_map("gapped", encoder=COARSE, same_place_radius=1.2)
     positions = [0, 1, 2, 3, 4, 5, 25, 26, 27, 28, 29]  # metres; nobody filmed from 5 to 25
@@ -107,6 +108,7 @@ def test_health_refuses_invalid_parameters(server: Server, traverse: str, query:
     assert_problem(server.client.get("/v1/maps/none/health"), 404, "unknown-map")
 
 
+@pytest.mark.thorough
 def test_counts_survive_a_restart(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     server = Server(tmp_path, {"statistics_seconds": 0.2}).wait()

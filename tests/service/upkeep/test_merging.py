@@ -31,6 +31,7 @@ from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
 
 
+@pytest.mark.thorough
 def test_merging_first_reports_and_then_copies(server: Server) -> None:
     server.create_map("east", encoder=TWO_STAGES, keep="thumbnail")
     server.create_map("west", encoder=TWO_STAGES, keep="image")
@@ -133,6 +134,7 @@ def test_merging_what_cannot_be_merged(server: Server, traverse: str) -> None:
 MANY = 640
 
 
+@pytest.mark.thorough
 def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     with runtime_at(tmp_path) as runtime:
@@ -295,6 +297,7 @@ def test_the_problem_says_that_copied_places_could_not_be_removed(
         assert failed.problem is not None and "remain" in failed.problem["detail"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("when", ["meanwhile", "while the service is stopped"])
 def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
     with runtime_at(folder) as runtime:
@@ -347,6 +350,7 @@ def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("commits", [0, 2])
 @pytest.mark.parametrize("theirs", ["monday", "tuesday"])
 def test_what_is_enrolled_into_a_sequence_meanwhile_is_at_other_positions(
@@ -369,6 +373,7 @@ def test_what_is_enrolled_into_a_sequence_meanwhile_is_at_other_positions(
         assert max(copied) < min(meanwhile) if commits else max(meanwhile) < min(copied)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rule", ["rename", "skip"])
 def test_a_place_that_somebody_enrols_meanwhile_is_never_replaced(
     folder: Path, monkeypatch: pytest.MonkeyPatch, rule: str
@@ -393,6 +398,7 @@ def test_a_place_that_somebody_enrols_meanwhile_is_never_replaced(
         assert runtime.engine.maps.verify("lab").ok
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("which", ["lab", "hall"])
 def test_it_does_not_go_on_into_another_map_of_the_same_id(
     folder: Path, monkeypatch: pytest.MonkeyPatch, which: str

@@ -19,6 +19,7 @@ from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
 
+@pytest.mark.thorough
 def test_pruning_first_reports_and_then_does_what_it_reported(server: Server) -> None:
     server.create_map("dense", encoder=COARSE, same_place_radius=2.5)
     enrol_frames(server, "dense", walk_frames(32), sequence="monday")
@@ -43,6 +44,7 @@ def test_pruning_first_reports_and_then_does_what_it_reported(server: Server) ->
     assert server.client.post("/v1/maps/dense/verify").json()["ok"]
 
 
+@pytest.mark.thorough
 def test_pruning_measured_on_another_traverse(server: Server) -> None:
     server.create_map("second", encoder=COARSE, same_place_radius=2.5)
     enrol_frames(server, "second", walk_frames(16), sequence="monday")
@@ -66,6 +68,7 @@ def test_only_places_of_the_given_sequence_are_removed(server: Server) -> None:
     assert set(places(server, "partly")) == {f"a{n}" for n in range(12)}
 
 
+@pytest.mark.thorough
 def test_of_a_stop_further_looks_go_and_the_first_stays(server: Server) -> None:
     server.create_map("stood", encoder=COARSE, same_place_frames=1)
     way = walk_frames(24)

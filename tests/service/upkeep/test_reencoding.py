@@ -30,6 +30,7 @@ def start(server: Server, name: str, to: str, encoder: str = TWO_STAGES) -> dict
     return asked(server, name, "re-encode", to=to, encoder=encoder)
 
 
+@pytest.mark.thorough
 def test_a_map_is_re_encoded(server: Server) -> None:
     fill(server, "anew")
     server.client.patch("/v1/maps/anew/places/p1", json={"sequence": "tuesday"})  # last of its sequence from now on
@@ -121,6 +122,7 @@ def folder(tmp_path: Path) -> Path:
 MANY = 160
 
 
+@pytest.mark.thorough
 def test_kills_and_changes_in_between(folder: Path) -> None:
     """The service is killed twice and the old map changed meanwhile: the new map is listed only when it is complete."""
     server = Server(folder).wait()
@@ -158,6 +160,7 @@ def is_on_disk(server: Server, name: str) -> bool:
     return any(name in path.name for path in (server.data_dir / "maps").iterdir())
 
 
+@pytest.mark.thorough
 def test_a_cancelled_job_leaves_nothing_and_the_old_map_serves_meanwhile(server: Server) -> None:
     enrol_many(server, "cancelling", MANY)
     job = start(server, "cancelling", "cancelled-map")
@@ -172,6 +175,7 @@ def test_a_cancelled_job_leaves_nothing_and_the_old_map_serves_meanwhile(server:
     assert not is_on_disk(server, "cancelled-map") and is_on_disk(server, "cancelling")
 
 
+@pytest.mark.thorough
 def test_the_old_map_is_deleted_meanwhile(server: Server) -> None:
     enrol_many(server, "vanishing", MANY)
     job = start(server, "vanishing", "vanishing-2")
@@ -183,6 +187,7 @@ def test_the_old_map_is_deleted_meanwhile(server: Server) -> None:
     assert not is_on_disk(server, "vanishing")
 
 
+@pytest.mark.thorough
 def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(folder: Path) -> None:
     server = Server(folder, {"shutdown_timeout": 120}).wait()
     enrol_many(server, "lab", 64)

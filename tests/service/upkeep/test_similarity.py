@@ -51,6 +51,7 @@ def similarity(server: Server, query: str = "monday", reference: str = "tuesday"
     return found
 
 
+@pytest.mark.thorough
 def test_the_three_forms_are_of_one_matrix(compared: Server) -> None:
     there = "/v1/maps/lab/similarity?query=monday&reference=tuesday"
     about = similarity(compared)
@@ -100,6 +101,7 @@ def test_what_alignment_stored_is_told(compared: Server) -> None:
     assert about["aligned"] and about["counterparts"] == about["truth"]
 
 
+@pytest.mark.thorough
 def test_pairs_are_bounded(compared: Server) -> None:
     for number in range(12, 16):
         compared.enrol("lab", f"w{number}", jpeg(number), sequence="wednesday")
@@ -130,6 +132,7 @@ class Plain:
         return products
 
 
+@pytest.mark.thorough
 def test_the_latest_matrices_are_kept_and_follow_the_traverses(tmp_path: Path) -> None:
     plain = cast(Encoder, Plain())
     with runtime_at(tmp_path) as runtime:

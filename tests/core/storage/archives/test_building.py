@@ -180,6 +180,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Atlas:
     return Atlas(tmp_path_factory.mktemp("library") / "data", rows_per_segment=4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", HOSTILE)
 def test_hostile_contents_are_refused(content: bytes, library: Atlas, tmp_path: Path, case: str) -> None:
     make, complaint = HOSTILE[case]

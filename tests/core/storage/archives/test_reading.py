@@ -209,6 +209,7 @@ GREEDY_LINES: dict[str, Any] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", [*GREEDY, *GREEDY_LINES])
 def test_what_is_refused_takes_little_memory(case: str) -> None:
     """To name all that is wrong with each of these took hundreds of times the room of its text."""
@@ -253,6 +254,7 @@ def test_what_people_make_by_hand_is_good_if_it_is_right(content: bytes, tmp_pat
             check(archive)
 
 
+@pytest.mark.thorough
 def test_any_byte_that_is_changed_is_noticed(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)

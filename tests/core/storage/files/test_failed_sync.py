@@ -28,6 +28,7 @@ def run(action: str, directory: Path, call: str, error: str, when: str) -> subpr
     return subprocess.run(traced, cwd=REPOSITORY, capture_output=True, timeout=300, check=False)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("call", "error", "when"),
     [
@@ -70,6 +71,7 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
     atlas.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("when", ["3", "4", "5"])
 def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Path, when: str) -> None:
     """Its frames are in SQLite's log, whole: only their sync failed."""

@@ -66,6 +66,7 @@ def until_refused(lab: Map, dimension: int, image_bytes: int, batch: int) -> lis
     raise AssertionError
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("left", [400_000, 700_000])
 @pytest.mark.parametrize(
     ("dimension", "image_bytes", "batch"),
@@ -164,6 +165,7 @@ def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Pa
     atlas.close()
 
 
+@pytest.mark.thorough
 def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
     """By the limit that a process can set on itself, so that it runs everywhere."""
     command = [sys.executable, "-m", "tests.core.storage.worker", "fill", str(directory)]

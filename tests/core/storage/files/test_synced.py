@@ -25,6 +25,7 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     return (folder / "trace").read_text(), folder / "data"
 
 
+@pytest.mark.thorough
 def test_every_write_is_synced_before_it_is_acknowledged(trace: tuple[str, Path]) -> None:
     report = audit(*trace, is_marker)
 

@@ -291,6 +291,7 @@ def of_another_group(path: Path) -> None:
     path.write_bytes(path.with_name("codes-000003.index").read_bytes())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "spoil"),
     [

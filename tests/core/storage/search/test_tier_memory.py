@@ -65,6 +65,7 @@ def priorities(directory: Path) -> None:
     atlas.close()
 
 
+@pytest.mark.thorough
 def test_the_threads_that_search_are_not_as_nice_as_the_one_that_builds(directory: Path) -> None:
     command = [sys.executable, "-m", "tests.core.storage.search.test_tier_memory", str(directory)]
     finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=True)

@@ -101,6 +101,7 @@ def test_references_that_are_left_out_make_true_negatives(
     assert (figures["queries"], figures["references"]) == (4, 3)
 
 
+@pytest.mark.thorough
 def test_several_encoders_and_a_tolerance(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
     figures, rows = evaluated(
         placerec, traverses, tmp_path, "--tolerance", 1, "--encoder", "region-vlad", "--encoder", "m-region-vlad"
@@ -116,6 +117,7 @@ def test_several_encoders_and_a_tolerance(placerec: Placerec, traverses: tuple[P
     assert len(other) == 5
 
 
+@pytest.mark.thorough
 def test_the_default_is_judged_as_the_service_answers(
     placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -215,6 +217,7 @@ def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[P
     assert other["encoder"] != own["encoder"]
 
 
+@pytest.mark.thorough
 def test_growing_traverses_and_disturbed_queries(
     placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -230,6 +233,7 @@ def test_growing_traverses_and_disturbed_queries(
         assert curve["auc_pr"][0] == pytest.approx(figures["auc_pr"])
 
 
+@pytest.mark.thorough
 def test_the_report_is_written(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
     words = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--encoder", "hog")
     placerec("evaluate", *words, "--report", tmp_path / "report")

@@ -42,6 +42,7 @@ def test_systems_come_once_in_the_order_asked() -> None:
     assert [system.about.name for system in built] == ["seqslam", "hog"]
 
 
+@pytest.mark.thorough
 def test_all_are_those_that_need_no_file() -> None:
     models = EncoderCatalogue()
     damaged = {summary.name for summary in models.describe() if summary.damaged}

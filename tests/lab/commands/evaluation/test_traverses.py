@@ -101,6 +101,7 @@ def test_what_does_not_go_together_is_refused(placerec: Placerec, gardens: Path,
     assert "here are 8 and 8" in placerec("evaluate", *known, "--reduced", status=1).stderr.replace("\n", " ")
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not EVAL.is_dir(), reason="the traverses of ../shared/datasets are not here")
 def test_hog_on_the_corridor_comes_near_what_was_published(placerec: Placerec, tmp_path: Path) -> None:
     """0.697 by VPR-Bench's stored similarities, on the same images and truth."""
@@ -113,6 +114,7 @@ OTHERS = {"AMOSNet": (0.954, 0.847), "NetVLAD": (0.822, 0.676), "RegionVLAD": (0
 """AUC-PR and recall@1 of VPR-Bench's stored matrices, as the data sets' README has them."""
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not EVAL.is_dir(), reason="the traverses of ../shared/datasets are not here")
 def test_what_others_have_computed_stands_beside_what_was_measured(placerec: Placerec, tmp_path: Path) -> None:
     corridor = EVAL / "corridor"
@@ -130,6 +132,7 @@ def test_others_belong_to_a_data_set(placerec: Placerec, gardens: Path, tmp_path
     assert "--others goes with --dataset" in placerec("evaluate", *both, "--others", tmp_path, status=2).stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["berlin-kudamm", "17-places.vpr-bench", "gardens-point.vpr-tutorial"])
 def test_a_published_tree_is_evaluated(placerec: Placerec, tmp_path: Path, name: str) -> None:
     dataset = find_dataset(name)

@@ -149,6 +149,7 @@ def test_every_layout_has_a_tree() -> None:
     assert TREES.keys() <= every
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "publisher"), TREES, ids=lambda word: word.replace(" ", "-"))
 def test_a_published_layout_opens(tmp_path: Path, name: str, publisher: str) -> None:
     home, build = TREES[name, publisher]

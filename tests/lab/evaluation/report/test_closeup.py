@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.lab.evaluation.report.comparisons import Written, make_comparison, written_page
 
 
@@ -27,6 +29,7 @@ def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
     assert {"scores-after-system-0.png", "scores-before-system-0.png", "similarity-system-0.png"} <= names
 
 
+@pytest.mark.thorough
 def test_system_is_described(written: Written) -> None:
     page, system = written.page, written.comparison.runs[0].about.name
     section = page.named("section", "run")[0]

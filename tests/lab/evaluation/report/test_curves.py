@@ -3,6 +3,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from lab.evaluation import Comparison
 from lab.evaluation.protocol.trust import trust_figures
 from lab.evaluation.report.curves import plot_pr, plot_recall, plot_reliability, plot_roc
@@ -37,6 +39,7 @@ def with_probabilities(folder: Path) -> Comparison:
     return replace(comparison, runs=runs)
 
 
+@pytest.mark.thorough
 def test_the_diagram_and_its_table(tmp_path: Path) -> None:
     comparison = with_probabilities(tmp_path)
     page = written_page(tmp_path / "report", comparison)

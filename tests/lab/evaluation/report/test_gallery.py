@@ -39,6 +39,7 @@ def test_which_true_reference_is_shown(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.thorough
 def test_full_page_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     empty = gallery(comparison, comparison.runs[0], Thumbnails(budget=0), None, most=4)

@@ -20,6 +20,7 @@ from lab.evaluation.report.theme import DARK, LIGHT, variables
 from tests.lab.evaluation.report.comparisons import Written, make_comparison, make_run, page_of, write_images
 
 
+@pytest.mark.thorough
 def test_numbers_of_the_page_are_the_figures_passed_in(written: Written) -> None:
     comparison, page = written.comparison, written.page
     cells = [element for element in page.named("td") if "data-value" in element.attributes]
@@ -111,6 +112,7 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
             assert image.std() > 5, f"{name} is blank"
 
 
+@pytest.mark.thorough
 def test_hostile_names_are_text(tmp_path: Path) -> None:
     evil = '<script>alert("1")</script>&\N{RIGHT-TO-LEFT OVERRIDE}$\\frac{$'
     comparison = make_comparison(tmp_path, systems=1, kept=range(6))
@@ -132,6 +134,7 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     assert all(re.fullmatch(r"[a-z0-9.-]+", path.name) for path in (tmp_path / "report").iterdir())
 
 
+@pytest.mark.thorough
 def test_wrong_matches_come_first(tmp_path: Path) -> None:
     scores = np.eye(4, dtype=np.float32)
     scores[1] = [0.9, 0.1, 0, 0]  # wrong, sure
@@ -151,6 +154,7 @@ def test_wrong_matches_come_first(tmp_path: Path) -> None:
     assert headings[1].startswith("Right matches all 2")
 
 
+@pytest.mark.thorough
 def test_without_a_wrong_match_there_is_nothing_to_reject_and_without_negatives_no_roc(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, noise=0)
     html, page = page_of(tmp_path / "report", comparison)
@@ -250,6 +254,7 @@ def test_failure_while_it_is_made_writes_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.thorough
 def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StorageFailure, match=r"The report cannot be written to .*file"):

@@ -43,6 +43,7 @@ def test_scalability_sorts_its_points(tmp_path: Path) -> None:
     assert "system-0 from 0.50 at 10 to 20 at 100" in plots["scalability-time"]
 
 
+@pytest.mark.thorough
 def test_sizes_without_strangers_have_no_error(tmp_path: Path) -> None:
     cast = Cast(make_comparison(tmp_path, systems=1).runs)
     points = [

@@ -92,6 +92,7 @@ def test_a_file_is_of_one_moment_while_frames_are_enrolled(
     assert set(enrolled) == {201} and counts == sorted(counts) and counts[-1] <= len(enrolled) + 1
 
 
+@pytest.mark.thorough
 def test_backup_and_restore(
     placerec: Placerec, url: list[str], lab: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,7 @@ def where(request: pytest.FixtureRequest) -> list[str]:
     return ["--url", str(running.client.base_url)]
 
 
+@pytest.mark.thorough
 def test_a_map_from_its_making_to_its_end(placerec: Placerec, where: list[str]) -> None:
     name = f"hall-{len(where)}"
     made = placerec("maps", "create", name, "--description", "by day", "--same-place-radius", 2.5, "--json", *where)
@@ -53,6 +54,7 @@ def test_an_edit_must_change_something(placerec: Placerec) -> None:
     placerec("maps", "edit", "lab", "--default-calibration", "--margin", 0.1, status=2)
 
 
+@pytest.mark.thorough
 def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str], tmp_path: Path) -> None:
     name = f"places-{len(where)}"
     placerec("enroll", monday, "--map", name, "--create", *where)
@@ -93,6 +95,7 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     assert json.loads(placerec("maps", "sequences", "list", name, "--json", *where).stdout) == []
 
 
+@pytest.mark.thorough
 def test_damage_is_found(placerec: Placerec, monday: Path, tmp_path: Path) -> None:
     placerec("enroll", monday, "--map", "lab", "--create")
     largest = max((path for path in (tmp_path / "data").rglob("*") if path.is_file()), key=lambda p: p.stat().st_size)

@@ -34,6 +34,7 @@ def tuesday(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, tuesday: Path) -> None:
     lab, hall, anew = (f"{name}-{len(where)}" for name in ("looked-after", "taken-in", "made-anew"))
     for name, folder in ((lab, monday), (hall, tuesday)):
@@ -76,6 +77,7 @@ def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, 
     placerec("jobs", "show", "none", *where, status=1)
 
 
+@pytest.mark.thorough
 def test_aligning_traverses(placerec: Placerec, where: list[str], tmp_path: Path) -> None:
     name = f"aligned-{len(where)}"
     placerec("maps", "create", name, "--encoder", COARSE, *where)
@@ -99,6 +101,7 @@ def test_aligning_traverses(placerec: Placerec, where: list[str], tmp_path: Path
     placerec(*asked, "--undo", "--with", "day0", status=2)
 
 
+@pytest.mark.thorough
 def test_a_job_that_fails_ends_in_a_sentence(placerec: Placerec, where: list[str]) -> None:
     name = f"empty-{len(where)}"
     placerec("maps", "create", name, "--encoder", COARSE, *where)
