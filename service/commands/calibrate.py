@@ -16,7 +16,7 @@ from service.commands.console import Failure, number, output, remark, show, show
 from service.commands.encoders.models import ModelsDir, models_directory, open_catalogue
 from service.commands.encoders.pictures import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
 from service.commands.jobs import submit
-from service.commands.recordings import RecordingOptions, Topic
+from service.commands.options.recordings import RecordingOptions, Topic
 
 SHOWN_POINTS = 9
 

@@ -20,7 +20,7 @@ from service.commands.connection.batches import FrameToSend, SendingOutcome, enr
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress
 from service.commands.jobs import show_outcome, submit
-from service.commands.recordings import (
+from service.commands.options.recordings import (
     PANEL,
     EveryChange,
     EveryDegrees,

@@ -23,7 +23,7 @@ from service.commands.connection.client import (
     run,
 )
 from service.commands.console import Failure, complain, number, show, table
-from service.commands.recordings import (
+from service.commands.options.recordings import (
     EveryChange,
     EveryDegrees,
     EveryMetres,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.markup import escape
 
 from lab.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
@@ -16,7 +18,75 @@ from lab.evaluation.protocol.results import results_csv
 from service.commands.console import number, remark, show, table, write_file
 from service.commands.encoders.models import name_of
 
+if TYPE_CHECKING:
+    from lab.evaluation.cache import EvaluationCache
+    from lab.evaluation.run import Extras
+
 RULES = {"mean_of_negatives": "mean of true negatives", "full_precision": "best wrong match"}
+
+_option = partial(typer.Option, rich_help_panel="Output")
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """What is measured beside the accuracy, and what is written."""
+
+    json_file: Annotated[Path | None, _option("--json", metavar="OUT.json", help="Write the figures.")] = None
+    results: Annotated[
+        Path | None,
+        _option(metavar="OUT.csv", help="Write one row per query; further encoders go to OUT.ENCODER.csv."),
+    ] = None
+    report: Annotated[Path | None, _option(metavar="DIR", help="Write an HTML page with curves and images.")] = None
+    scalability: Annotated[
+        bool, _option("--scalability", help="Also measure traverses of growing length (thesis, Fig. 3.9).")
+    ] = False
+    severity: Annotated[bool, _option("--severity", help="Also measure queries that are disturbed in steps.")] = False
+    cache: Annotated[
+        Path | None,
+        _option(
+            metavar="DIR",
+            help="Directory of the cache. Default: placerec/evaluations in the user's cache directory.",
+        ),
+    ] = None
+    no_cache: Annotated[bool, _option("--no-cache", help="Measure everything again and keep nothing.")] = False
+
+    def check(self) -> None:
+        """Check that the options go together.
+
+        Raises:
+            typer.BadParameter: they do not.
+        """
+        if self.no_cache and self.cache is not None:
+            raise typer.BadParameter("give --cache or --no-cache, not both")
+
+    def open_cache(self) -> EvaluationCache:
+        """The cache that the options ask for."""
+        from lab.evaluation.cache import EvaluationCache, default_folder
+
+        return EvaluationCache(None if self.no_cache else self.cache or default_folder())
+
+    def extras(self, seed: int) -> Extras:
+        """What is measured beside the accuracy; ``seed`` draws the disturbances."""
+        from lab.evaluation.run import Extras
+
+        return Extras(self.scalability, self.severity, seed, map_sizes=self.report is not None)
+
+    def write(self, comparison: Comparison, runs: Sequence[Run], elsewhere: Sequence[Run]) -> None:
+        """Write the files that the options name.
+
+        Args:
+            runs: of the systems, in the order of the command line.
+            elsewhere: of systems that others have computed.
+        """
+        if self.json_file is not None:
+            write_json(self.json_file, comparison_json(comparison, [*runs, *elsewhere]))
+        if self.results is not None:
+            write_results(self.results, [(run.identity, run.outcomes) for run in runs])
+        if self.report is not None:
+            from lab.evaluation.report import write_report
+
+            write_report(self.report, comparison)
+            remark(f"The report is written: {self.report / 'index.html'}")
 
 
 def show_figures(figures: Sequence[Evaluation], title: str, verified: Sequence[str | None] | None = None) -> None:

@@ -4,94 +4,110 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from core.errors import InvalidGroundTruth
-from core.frames.traverses import Truth, read_kept_references
+from core.frames.traverses import read_kept_references
 from lab.commands.evaluation.output import remark_notes, show_figures, show_thresholds, write_json, write_results
-from lab.commands.evaluation.traverses import TruthOptions
+from lab.commands.evaluation.truth import TruthOptions
 from lab.evaluation import Evaluation, Outcome, judge, summarize
 from lab.evaluation.protocol.results import read_results, summarize_results
 from service.commands.console import Failure
 
+_option = partial(typer.Option, rich_help_panel="Results that other tools have saved")
+
 
 @dataclass(frozen=True)
 class SavedOptions:
-    """Files of results, or files of similarities and what is true of them."""
+    """Files of results, or files of similarities."""
 
-    results: list[Path]
-    similarities: list[Path]
-    transposed: bool
-    truth: TruthOptions
-    limit_references: Path | None
+    from_results: Annotated[
+        list[Path] | None,
+        _option(
+            metavar="FILE.csv", help="Rows query,retrieved,score,matched, with or without a header; may be repeated."
+        ),
+    ] = None
+    from_similarity: Annotated[
+        list[Path] | None,
+        _option(
+            metavar="FILE.npy",
+            help="A matrix with a row per query and a column per reference; needs --ground-truth or --tolerance; "
+            "may be repeated.",
+        ),
+    ] = None
+    transposed: Annotated[bool, _option("--transposed", help="The matrix has a row per reference instead.")] = False
 
-    def check(self, others: Mapping[str, object], output: Path | None) -> None:
+    def given(self) -> bool:
+        """Whether there are any files."""
+        return bool(self.from_results or self.from_similarity)
+
+    def check(self, truth: TruthOptions, limit: Path | None, output: Path | None, others: Mapping[str, object]) -> None:
         """Check that no option is given that needs images or systems.
 
         Args:
-            others: the options that need them, by name, with their values.
+            limit: lists the kept references.
             output: where rows would be written.
+            others: the options that need images or systems, by name, with their values.
 
         Raises:
             typer.BadParameter: one is.
         """
-        if self.results and self.similarities:
+        if self.from_results and self.from_similarity:
             raise typer.BadParameter("give --from-results or --from-similarity, not both")
-        asked = [f"--{name}" for name, value in others.items() if value]
-        if self.truth.poses:
-            asked.append("--poses")
-        if self.results:
-            more = {"ground-truth": self.truth.given(), "results": output, "limit-references": self.limit_references}
-            asked += [f"--{name}" for name, value in more.items() if value]
-            if self.transposed:
-                asked.append("--transposed")
+        needless = {**others, "poses": truth.poses}
+        if self.from_results:
+            needless |= {"ground-truth": truth.given(), "results": output, "limit-references": limit}
+            needless["transposed"] = self.transposed
+        asked = [f"--{name}" for name, value in needless.items() if value]
         if asked:
-            source = "--from-results" if self.results else "--from-similarity"
+            source = "--from-results" if self.from_results else "--from-similarity"
             raise typer.BadParameter(f"{source} cannot go with {', '.join(asked)}: there are only saved figures")
-        if self.similarities:
-            if (self.truth.ground_truth is None) == (self.truth.tolerance is None):
+        if self.from_similarity:
+            if (truth.ground_truth is None) == (truth.tolerance is None):
                 raise typer.BadParameter("--from-similarity goes with --ground-truth or --tolerance, one of them")
-            self.truth.check()
-            if output is not None and len(set(self._names())) < len(self.similarities):
+            truth.check()
+            if output is not None and len({path.stem for path in self.from_similarity}) < len(self.from_similarity):
                 raise typer.BadParameter("--results needs files of different names: it names its own after them")
 
-    def show(self, json_file: Path | None, results: Path | None) -> None:
-        """Write the table and the files that the options name."""
-        if self.results:
-            figures = [summarize_results(path.name, read_results(path)) for path in self.results]
+    def show(self, truth: TruthOptions, limit: Path | None, json_file: Path | None, output: Path | None) -> None:
+        """Write the table and the files that the options name.
+
+        Args:
+            limit: lists the kept references of matrices.
+            json_file: where figures are written.
+            output: where rows are written.
+        """
+        if self.from_results:
+            figures = [summarize_results(path.name, read_results(path)) for path in self.from_results]
             _show(figures, "Saved results", json_file)
             return
-        judged = [self._judge(path) for path in self.similarities]
+        paths = self.from_similarity or []
+        judged = [self._judge(path, truth, limit) for path in paths]
         _show([figures for figures, _ in judged], "Saved similarities", json_file)
-        if results is not None:
-            write_results(results, list(zip(self._names(), [outcomes for _, outcomes in judged], strict=True)))
+        if output is not None:
+            outcomes = [outcomes for _, outcomes in judged]
+            write_results(output, list(zip([path.stem for path in paths], outcomes, strict=True)))
 
-    def _names(self) -> list[str]:
-        """The names under which the rows of each matrix are written."""
-        return [path.stem for path in self.similarities]
-
-    def _judge(self, path: Path) -> tuple[Evaluation, list[Outcome]]:
+    def _judge(self, path: Path, truth: TruthOptions, limit: Path | None) -> tuple[Evaluation, list[Outcome]]:
         import numpy as np
 
         from lab.evaluation.protocol.results import read_similarity
 
         scores = read_similarity(path, self.transposed)
         queries, references = scores.shape
-        kept = np.arange(references, dtype=np.int64)
-        if self.limit_references is not None:
-            kept = read_kept_references(self.limit_references, references)
-        outcomes = judge(scores[:, kept], kept, self._truth(path, queries, references))
-        return summarize(path.name, outcomes, len(kept), {}), outcomes
-
-    def _truth(self, path: Path, queries: int, references: int) -> Truth:
+        kept = np.arange(references, dtype=np.int64) if limit is None else read_kept_references(limit, references)
         try:
-            return self.truth.of_counts(queries, references)
+            true = truth.of_counts(queries, references)
         except InvalidGroundTruth as error:
             raise Failure(
                 f"{error} {path.name} was read as {queries} queries by {references} references; --transposed turns it."
             ) from error
+        outcomes = judge(scores[:, kept], kept, true)
+        return summarize(path.name, outcomes, len(kept), {}), outcomes
 
 
 def _show(figures: Sequence[Evaluation], title: str, json_file: Path | None) -> None:

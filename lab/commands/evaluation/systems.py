@@ -3,20 +3,76 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.box import HEAVY_HEAD
 from rich.markup import escape
 
 from service.commands.console import output, show, table
-from service.commands.encoders.models import default_encoder, name_of
+from service.commands.encoders.models import ModelsDir, default_encoder, name_of, open_catalogue
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderCatalogue
     from core.recognition.question import Verify
     from lab.baselines.system import About, System
+
+SYSTEMS = "Systems"
+"""Their panel in the help."""
+
+_option = partial(typer.Option, rich_help_panel=SYSTEMS)
+
+
+@dataclass(frozen=True)
+class SystemOptions:
+    """The systems that are compared, and what they are made of."""
+
+    encoder: Annotated[
+        list[str] | None,
+        _option(
+            metavar="NAME",
+            help="Encoder (name or identity) or system (name); may be repeated. Default: the service's encoder.",
+        ),
+    ] = None
+    verify: Annotated[
+        Literal["auto", "always", "never"],
+        _option(
+            help="When the geometry of the best matches is verified, as of a query to the service: where the scores "
+            "leave doubt, always, or never. It holds for encoders of two stages whose name says nothing of stages.",
+        ),
+    ] = "auto"
+    every: Annotated[bool, _option("--all", help="All systems that need no weights file, or whose file is given.")] = (
+        False
+    )
+    weights: Annotated[
+        list[str] | None, _option(metavar="NAME=FILE", help="The weights file of a system; may be repeated.")
+    ] = None
+    training: Annotated[
+        Path | None,
+        _option(
+            metavar="DIR",
+            help="Images (subdirectories included) for systems that learn. Default: the kept references.",
+        ),
+    ] = None
+    models_dir: ModelsDir = None
+    listed: Annotated[bool, _option("--list", help="List systems and data sets, and do nothing else.")] = False
+
+    @property
+    def keyframe_encoder(self) -> str | None:
+        """The encoder by which keyframes are chosen: the first; None for the default."""
+        return self.encoder[0] if self.encoder else None
+
+    def weights_files(self) -> dict[str, Path]:
+        """The weights files by name, as :func:`parse_weights`."""
+        return parse_weights(self.weights or [])
+
+    def build(self) -> list[System]:
+        """The systems, as :func:`build_systems`."""
+        catalogue = open_catalogue(self.models_dir)
+        return build_systems(self.encoder or [], self.every, self.weights_files(), catalogue, self.verify)
 
 
 def parse_weights(given: list[str]) -> dict[str, Path]:

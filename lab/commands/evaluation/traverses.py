@@ -1,94 +1,120 @@
-"""``placerec evaluate``: the traverses, their ground truth, and the images to learn from."""
+"""``placerec evaluate``: the traverses, and the images to learn from."""
 
 from __future__ import annotations
 
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from core.frames.traverses import (
-    Truth,
-    find_images,
-    find_images_below,
-    read_ground_truth,
-    read_kept_references,
-    tolerance_truth,
-)
+from core.frames.traverses import find_images, find_images_below, read_kept_references
+from lab.commands.evaluation.systems import SYSTEMS
+from lab.commands.evaluation.truth import TruthOptions
 from service.commands.console import progress
-from service.commands.recordings import RecordingOptions
+from service.commands.options.recordings import (
+    PANEL,
+    EveryChange,
+    EveryDegrees,
+    EveryMetres,
+    EverySeconds,
+    LargestGap,
+    PoseTopic,
+    RecordingOptions,
+    Topic,
+    TrajectoryFile,
+    TrajectoryTimes,
+)
 
 if TYPE_CHECKING:
     from lab.evaluation.data.pairs import TraversePair
     from lab.evaluation.subject import Training
 
+_option = partial(typer.Option, rich_help_panel="Traverses")
+_of_query = partial(typer.Option, help="The same of the traverse to recognize.", rich_help_panel=PANEL)
+
 
 @dataclass(frozen=True)
-class TruthOptions:
-    """The ground truth options: one of three ways."""
+class RecordingsOptions:
+    """The options of two recordings: of the known traverse, of the one to recognize, and those that hold for both."""
 
-    tolerance: int | None
-    ground_truth: Path | None
-    poses: bool
-    metres: float | None
-    degrees: float | None
+    topic: Topic = None
+    query_topic: Annotated[str | None, _of_query()] = None
+    pose_topic: PoseTopic = None
+    query_pose_topic: Annotated[str | None, _of_query()] = None
+    trajectory: TrajectoryFile = None
+    query_trajectory: Annotated[Path | None, _of_query(metavar="FILE")] = None
+    trajectory_times: TrajectoryTimes = None
+    query_trajectory_times: Annotated[Path | None, _of_query(metavar="FILE")] = None
+    largest_gap: LargestGap = None
+    every_metres: EveryMetres = None
+    every_degrees: EveryDegrees = None
+    every_seconds: EverySeconds = None
+    every_change: EveryChange = None
 
-    def check(self) -> None:
-        """Check that exactly one way is chosen.
+    @property
+    def of_reference(self) -> RecordingOptions:
+        """Those of the known traverse."""
+        return self._of(self.topic, self.pose_topic, self.trajectory, self.trajectory_times)
 
-        Raises:
-            typer.BadParameter: none is, or more than one.
-        """
-        given = [self.tolerance is not None, self.ground_truth is not None, self.poses]
-        if sum(given) != 1:
-            raise typer.BadParameter("give one of --tolerance, --ground-truth and --poses")
-        if not self.poses and (self.metres is not None or self.degrees is not None):
-            raise typer.BadParameter("--metres and --degrees go with --poses")
-        if self.poses and self.metres is None:
-            raise typer.BadParameter("--poses needs a distance: --metres N, and --degrees N where headings count")
+    @property
+    def of_query(self) -> RecordingOptions:
+        """Those of the traverse to recognize."""
+        return self._of(self.query_topic, self.query_pose_topic, self.query_trajectory, self.query_trajectory_times)
 
-    def given(self) -> bool:
-        """Whether any of the options is given."""
-        chosen = (self.tolerance, self.ground_truth, self.metres, self.degrees)
-        return self.poses or any(value is not None for value in chosen)
-
-    def of_counts(self, queries: int, references: int) -> Truth:
-        """The truth by numbers of images alone."""
-        if self.ground_truth is not None:
-            return read_ground_truth(self.ground_truth, queries, references)
-        return tolerance_truth(queries, references, self.tolerance or 0)
-
-    def of_images(self, queries: list[Path], references: list[Path]) -> Truth:
-        """The truth of two traverses."""
-        if not self.poses:
-            return self.of_counts(len(queries), len(references))
-        from lab.evaluation.data.poses import read_poses, within_truth
-
-        assert self.metres is not None, "checked"
-        return within_truth(read_poses(queries), read_poses(references), self.metres, self.degrees)
+    def _of(
+        self, topic: str | None, pose_topic: str | None, trajectory: Path | None, times: Path | None
+    ) -> RecordingOptions:
+        keyframes = (self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
+        return RecordingOptions(topic, pose_topic, trajectory, times, self.largest_gap, *keyframes)
 
 
 @dataclass(frozen=True)
 class TraverseOptions:
-    """Two recordings and their truth, or a data set in a directory."""
+    """Two recordings, or a data set in a directory, and what is taken of them."""
 
-    reference: Path | None
-    query: Path | None
-    truth: TruthOptions
-    dataset: str | None
-    data: Path | None
-    reduced: bool
-    limit_references: Path | None
-    seed: int
-    reference_frames: RecordingOptions
-    query_frames: RecordingOptions
+    reference: Annotated[
+        Path | None, _option(metavar="DIR", help="The known traverse: a directory of images, a bag or a video.")
+    ] = None
+    query: Annotated[
+        Path | None,
+        _option(metavar="DIR", help="The traverse to recognize: a directory of images, a bag or a video."),
+    ] = None
+    dataset: Annotated[
+        str | None,
+        _option(metavar="NAME", help="A data set under a protocol by its name instead; see --list."),
+    ] = None
+    data: Annotated[
+        Path | None,
+        _option(
+            metavar="DIR",
+            help="The directory that holds the data set's traverses, or any directory of its published tree.",
+        ),
+    ] = None
+    others: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="With --dataset: also judge the similarities that others have computed, NAME.npy for each system, "
+            "queries by references; they are marked as computed elsewhere.",
+            rich_help_panel=SYSTEMS,
+        ),
+    ] = None
+    reduced: Annotated[bool, _option("--reduced", help="Keep only as many references as the thesis.")] = False
+    limit_references: Annotated[
+        Path | None,
+        _option(metavar="FILE", help="Keep only the references whose indices this file lists, one per line."),
+    ] = None
+    seed: Annotated[
+        int, _option(min=0, help="Seed of the reduced references, of training and of the disturbances.")
+    ] = 0
 
-    def check(self) -> None:
-        """Check that the options go together.
+    def check(self, truth: TruthOptions) -> None:
+        """Check that the options go together, and with those of the ground truth.
 
         Raises:
             typer.BadParameter: they do not.
@@ -98,16 +124,22 @@ class TraverseOptions:
                 raise typer.BadParameter("give --reference and --query, or --dataset with --data")
             if self.data is not None or self.reduced:
                 raise typer.BadParameter("--data and --reduced go with --dataset")
-            self.truth.check()
-        elif self.reference is not None or self.query is not None or self.truth.given():
+            truth.check()
+            if self.others is not None:
+                raise typer.BadParameter(
+                    "--others goes with --dataset: the matrices belong to its queries and references"
+                )
+        elif self.reference is not None or self.query is not None or truth.given():
             raise typer.BadParameter("--dataset brings its own traverses and truth: give only --data with it")
         elif self.data is None:
             raise typer.BadParameter("--dataset needs --data, the directory that holds its traverses")
         elif self.reduced and self.limit_references is not None:
             raise typer.BadParameter("--reduced and --limit-references both choose the references to keep: give one")
 
-    def open(self, stack: ExitStack, encoder: str | None) -> TraversePair:
-        """The traverses.
+    def open(
+        self, truth: TruthOptions, recordings: RecordingsOptions, stack: ExitStack, encoder: str | None
+    ) -> TraversePair:
+        """The traverses with their truth.
 
         Args:
             stack: closes the folders into which the frames of bags and videos are written.
@@ -124,10 +156,10 @@ class TraverseOptions:
             pair = open_dataset(find_dataset(self.dataset), self.data, self.reduced, self.seed)
         else:
             assert self.reference is not None and self.query is not None, "checked"
-            references = _images(self.reference, self.reference_frames, stack, encoder)
-            queries = _images(self.query, self.query_frames, stack, encoder)
-            truth, kept = self.truth.of_images(queries, references), all_references(references)
-            pair = TraversePair(name_pair(self.reference, self.query), references, queries, truth, kept)
+            references = _images(self.reference, recordings.of_reference, stack, encoder)
+            queries = _images(self.query, recordings.of_query, stack, encoder)
+            true, kept = truth.of_images(queries, references), all_references(references)
+            pair = TraversePair(name_pair(self.reference, self.query), references, queries, true, kept)
         if self.limit_references is None:
             return pair
         kept = read_kept_references(self.limit_references, len(pair.references))

@@ -78,15 +78,15 @@ EveryChange = Annotated[
 class RecordingOptions:
     """The options of one recording, as they are given."""
 
-    topic: str | None = None
-    pose_topic: str | None = None
-    trajectory: Path | None = None
-    trajectory_times: Path | None = None
-    largest_gap: float | None = None
-    every_metres: float | None = None
-    every_degrees: float | None = None
-    every_seconds: float | None = None
-    every_change: float | None = None
+    topic: Topic = None
+    pose_topic: PoseTopic = None
+    trajectory: TrajectoryFile = None
+    trajectory_times: TrajectoryTimes = None
+    largest_gap: LargestGap = None
+    every_metres: EveryMetres = None
+    every_degrees: EveryDegrees = None
+    every_seconds: EverySeconds = None
+    every_change: EveryChange = None
 
     @contextmanager
     def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
