@@ -13,7 +13,7 @@ from pathlib import Path
 
 from core.errors import InvalidTraverse
 from core.frames.traverses import Truth, find_images
-from lab.evaluation.data.truth_files import Reader, read_masks
+from lab.evaluation.data.truth_files import Reader, read_array, read_masks, read_matrix, read_table
 
 TRUTH_FILE = "ground_truth.csv"
 """The user's own truth; it comes before every other."""
@@ -137,10 +137,24 @@ def downloaded(name: str, queries: str = "queries", references: Names = ("databa
     return folders("VPR-datasets-downloader", f"datasets/{name}/images/test", references, (queries,))
 
 
-def vpr_bench(name: str, read_truth: Reader | None = None) -> Layout:
-    """As VPR-Bench (Zaffar et al., IJCV 2021) hands it out, with its own truth where a reader is given."""
-    truth_file = "" if read_truth is None else "ground_truth_new.npy"
-    return folders("VPR-Bench", f"datasets/{name}", ("ref",), ("query",), truth_file, read_truth)
+def group(
+    home: str, references: Names, queries: Names, truth_file: str, columns: tuple[int, int] | None = None
+) -> Layout:
+    """A folder of the tree in which the thesis's group published its data sets.
+
+    Args:
+        columns: of a table in CSV, those of the numbers of the query and of its reference (from the end where below 0),
+            which is true with two frames on either side; None: the file of truth is MATLAB's.
+    """
+    known, asked = (*references, "*_ref*", "*[Rr]ef*"), (*queries, "*_test*", "*[Qq]uery*", "*[Tt]est*")
+    reader = read_matrix if columns is None else read_table(*columns, 2)
+    return folders("The thesis's group", home, known, asked, truth_file, reader)
+
+
+def vpr_bench(name: str, own_truth: bool = False) -> Layout:
+    """As VPR-Bench (Zaffar et al., IJCV 2021) hands it out, with its own truth where it is asked for."""
+    truth = ("ground_truth_new.npy", read_array) if own_truth else ()
+    return folders("VPR-Bench", f"datasets/{name}", ("ref",), ("query",), *truth)
 
 
 def vpr_tutorial(name: str, references: str, queries: str, masks: bool = False) -> Layout:

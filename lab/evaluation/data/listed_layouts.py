@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import tokenize
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,6 @@ from lab.conversion.matfiles import read_mat
 from lab.evaluation.data.layouts import Layout, Names, Traverses, existing, located, present
 from lab.evaluation.data.poses import near
 from lab.evaluation.data.truth_files import read_array, read_positions
-
-MSLS_METRES = 25.0
-MSLS_CITIES = ("cph", "sf")
 
 
 def dbstruct(home: str, files: Names, references: Names, queries: Names) -> Layout:
@@ -92,11 +88,11 @@ def gsv_cities(home: str, stem: str, truths: Names) -> Layout:
     return Layout("GSV-Cities", home, (*lists, truths), read, truths[0])
 
 
-def mapillary(cities: Sequence[str] = MSLS_CITIES) -> Layout:
+def mapillary(cities: Names, metres: float) -> Layout:
     """Mapillary Street-Level Sequences as they are downloaded: tables of each city's queries and database.
 
-    As its authors evaluate: no panoramas, the images of the subtask ``all``, true within 25 m, and without the queries
-    that have no true reference.
+    As its authors evaluate: no panoramas, the images of the subtask ``all``, true within ``metres``, and without the
+    queries that have no true reference.
     """
 
     def read(base: Path) -> Traverses:
@@ -106,13 +102,13 @@ def mapillary(cities: Sequence[str] = MSLS_CITIES) -> Layout:
         for city in cities:
             references, at_references = _city(base / city / "database")
             queries, at_queries = _city(base / city / "query")
-            found, _ = near(at_queries, at_references, MSLS_METRES)
+            found, _ = near(at_queries, at_references, metres)
             answerable = [index for index, true in enumerate(found) if len(true)]
             truth += [found[index] + len(known) for index in answerable]
             asked += [queries[index] for index in answerable]
             known += references
         if not asked:
-            raise InvalidGroundTruth(f"{base}: no query lies within {MSLS_METRES:g} m of a reference.")
+            raise InvalidGroundTruth(f"{base}: no query lies within {metres:g} m of a reference.")
         return Traverses(known, asked, truth)
 
     held = tuple((f"{city}/{side}/postprocessed.csv",) for city in cities for side in ("query", "database"))

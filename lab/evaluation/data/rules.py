@@ -50,15 +50,19 @@ def within(metres: float) -> Rule:
     return lambda queries, references: within_truth(read_poses(queries), read_poses(references), metres, None)
 
 
-def groups(queries: Sequence[Path], references: Sequence[Path]) -> Truth:
+def groups() -> Rule:
     """Query i is true at the i-th group of references, all groups of one size.
 
-    Raises:
-        InvalidTraverse: the references cannot be shared out evenly.
+    The rule raises InvalidTraverse where the references cannot be shared out evenly.
     """
-    size, rest = divmod(len(references), len(queries))
-    if rest or not size:
-        raise InvalidTraverse(
-            f"{len(references)} references cannot be shared out evenly over {len(queries)} queries: some are missing."
-        )
-    return [np.arange(index * size, (index + 1) * size, dtype=np.int64) for index in range(len(queries))]
+
+    def rule(queries: Sequence[Path], references: Sequence[Path]) -> Truth:
+        size, rest = divmod(len(references), len(queries))
+        if rest or not size:
+            raise InvalidTraverse(
+                f"{len(references)} references cannot be shared out evenly over {len(queries)} queries: some are "
+                "missing."
+            )
+        return [np.arange(index * size, (index + 1) * size, dtype=np.int64) for index in range(len(queries))]
+
+    return rule

@@ -18,20 +18,17 @@ from core.recordings.trajectory_files import read_trajectory
 from lab.evaluation.data.layouts import Layout, Names, Traverses, present
 from lab.evaluation.data.poses import near, within_truth
 
-KITTI_METRES, KITTI_DEGREES, KITTI_FRAMES = 10.0, 45.0, 100
-"""Ten metres, as for revisits on the road; frames of ten seconds are left out on either side."""
-
-TUM_METRES, TUM_DEGREES, TUM_FRAMES = 0.5, 30.0, 300
-"""Half a metre, as within a room; frames of ten seconds are left out on either side."""
-
 TUM_GAP = 0.1
 """Seconds between two poses that a frame may lie between."""
 
-BAIDU_METRES = 10.0
 
+def kitti(sequence: str, metres: float, degrees: float, frames: int) -> Layout:
+    """A sequence of KITTI's odometry benchmark (Geiger et al., CVPR 2012), as its archives unpack.
 
-def kitti(sequence: str) -> Layout:
-    """A sequence of KITTI's odometry benchmark (Geiger et al., CVPR 2012), as its archives unpack."""
+    Args:
+        metres, degrees: two images within both show one place.
+        frames: before and after an image, which is not matched against them.
+    """
     cameras = tuple(f"sequences/{sequence}/image_{camera}" for camera in (2, 0, 3, 1))
     poses = f"poses/{sequence}.txt"
 
@@ -43,13 +40,17 @@ def kitti(sequence: str) -> Layout:
         if not by_frame or len(trajectory) != len(images):
             raise InvalidGroundTruth(f"{base / poses} has {len(trajectory)} poses, and {folder} {len(images)} images.")
         found = trajectory.at(np.arange(len(images), dtype=np.int64) * NANOSECONDS, 0.0)
-        return _revisits(images, found, KITTI_METRES, KITTI_DEGREES, KITTI_FRAMES)
+        return _revisits(images, found, metres, degrees, frames)
 
     return Layout("KITTI", "dataset", (cameras, (poses,)), read, poses, f"sequences/{sequence}")
 
 
-def tum() -> Layout:
-    """A sequence of TUM's RGB-D benchmark (Sturm et al., IROS 2012), as its archive unpacks."""
+def tum(metres: float, degrees: float, frames: int) -> Layout:
+    """A sequence of TUM's RGB-D benchmark (Sturm et al., IROS 2012), as its archive unpacks.
+
+    Args:
+        metres, degrees, frames: as for :func:`kitti`.
+    """
 
     def read(base: Path) -> Traverses:
         images = sorted(find_images(base / "rgb"), key=lambda path: natural_key(path.name))
@@ -69,14 +70,18 @@ def tum() -> Layout:
         left_out = len(images) - len(known)
         notes = (f"{left_out} of {len(images)} images have no pose within {TUM_GAP:g} s and are left out.",)
         chosen = [images[index] for index in known]
-        found = _revisits(chosen, [poses[index] for index in known], TUM_METRES, TUM_DEGREES, TUM_FRAMES)
+        found = _revisits(chosen, [poses[index] for index in known], metres, degrees, frames)
         return Traverses(found.references, found.queries, found.truth, found.excluded, notes if left_out else ())
 
     return Layout("TUM RGB-D", "", (("rgb",), ("groundtruth.txt",)), read, "groundtruth.txt")
 
 
-def baidu() -> Layout:
-    """Baidu Mall (Sun et al., CVPR 2017): a file ``.camera`` for each image, whose last line but one is its place."""
+def baidu(metres: float) -> Layout:
+    """Baidu Mall (Sun et al., CVPR 2017): a file ``.camera`` for each image, whose last line but one is its place.
+
+    Args:
+        metres: a reference within them is true.
+    """
     sides: tuple[tuple[Names, str], ...] = (
         (("training_images_undistort",), "training_gt"),
         (("query_images_undistort",), "query_gt"),
@@ -84,7 +89,7 @@ def baidu() -> Layout:
 
     def read(base: Path) -> Traverses:
         (known, at_known), (asked, at_asked) = (_cameras(base / images[0], base / poses) for images, poses in sides)
-        return Traverses(known, asked, near(at_asked, at_known, BAIDU_METRES)[0])
+        return Traverses(known, asked, near(at_asked, at_known, metres)[0])
 
     held = (*(images for images, _ in sides), *((poses,) for _, poses in sides))
     return Layout("Baidu", "baidu_datasets", held, read)

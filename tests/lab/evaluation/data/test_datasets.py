@@ -132,7 +132,7 @@ def test_spedtest_has_groups_of_references(tmp_path: Path) -> None:
     pair = open_dataset(dataset, made(tmp_path, dataset, 6, 2))
     assert [true.tolist() for true in pair.truth] == [[0, 1, 2], [3, 4, 5]]
     with pytest.raises(InvalidTraverse, match="7 references cannot be shared out evenly over 2 queries"):
-        groups(pair.queries, [*pair.references, tmp_path / "7.png"])
+        groups()(pair.queries, [*pair.references, tmp_path / "7.png"])
 
 
 @pytest.mark.skipif(not EVAL.is_dir(), reason="the traverses of ../shared/datasets are not here")

@@ -10,7 +10,7 @@ from core.errors import InvalidGroundTruth, InvalidTraverse
 from lab.evaluation.data.datasets import find_dataset, open_dataset
 from lab.evaluation.data.layouts import existing
 from lab.evaluation.data.poses import near
-from lab.evaluation.data.presets import CHEN, DATASETS, WEATHERS
+from lab.evaluation.data.presets import DATASETS
 from lab.evaluation.data.truth_files import read_positions
 from tests.lab.evaluation.data import trees
 from tests.lab.evaluation.data.trees import Build
@@ -18,6 +18,7 @@ from tests.lab.evaluation.data.trees import Build
 GROUP = "The thesis's group"
 VG = "VPR-datasets-downloader"
 BERLIN = "Berlin_datasets"
+CHEN = "Chen_RAL_2018_Attention_dataset"
 GARDENS = "GardensPointWalking"
 TREES: dict[tuple[str, str], tuple[str, Build]] = {
     ("gardens-point", GROUP): (GARDENS, trees.side_by_side(GARDENS, "night_right", "day_left")),
@@ -104,7 +105,7 @@ TREES: dict[tuple[str, str], tuple[str, Build]] = {
             "datasets/svox/images/test",
             trees.downloaded("svox", f"queries_{weather}", "gallery"),
         )
-        for weather, _ in WEATHERS
+        for weather in ("night", "overcast", "rain", "snow", "sun")
     },
     **{
         (name, "VPR-Bench"): (f"datasets/{folder}", trees.bench(folder))
