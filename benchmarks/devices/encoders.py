@@ -1,4 +1,4 @@
-"""What a query costs with one encoder and with another: the default of 0.1.0 beside that of today.
+"""What a query costs with one encoder and with another: that of the thesis beside the default.
 
     python -m benchmarks.devices.encoders [--encoder NAME] [--encoder NAME] [--places 300] [--rounds 60]
 
@@ -30,9 +30,6 @@ from core.storage import Atlas, Map
 from core.threads import share_cores
 from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import write_map
-
-FIRST_DEFAULT = "m-region-vlad@9584cde69ac83864efd2ddb560b29b7cf88ea4e9e0c148d190beb8e55a8cde9e"
-"""The default encoder of 0.1.0."""
 
 LIMIT = 1.1
 TOGETHER, ANSWER, SERVED = "both together", "query over HTTP, until the answer", "query over HTTP, processor time"
@@ -97,7 +94,7 @@ def main(
     """Take turns and compare."""
     configure_malloc()  # as the service does
     share_cores(threads)
-    names = encoder or [FIRST_DEFAULT, DEFAULT_ENCODER]
+    names = encoder or ["m-region-vlad-thesis", DEFAULT_ENCODER]
     if len(names) != 2:
         raise typer.BadParameter("two encoders are compared")
     catalogue = EncoderCatalogue()

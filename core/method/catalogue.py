@@ -36,9 +36,6 @@ from core.networks.identity import canonical_json
 from core.networks.network import NAMES as NETWORK_NAMES
 
 PACKAGED = Path(__file__).parents[1] / "models"
-FORMER = PACKAGED / "former"
-"""Encoders that earlier versions packaged under a name that another has now.  They are found by their identity alone,
-so that maps which were made with them are used as they are."""
 FORMAT = "placerec-encoder/1"
 PROJECTION, CELLS, WHITENING = "projection.", "cells.", "whitening."
 ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
@@ -71,7 +68,7 @@ class _Header(BaseModel):
     calibration: Calibration
     training: dict[str, Any]
     dimension: int
-    local_shape: tuple[int, int] = (0, 0)
+    local_shape: tuple[int, int]
 
 
 def save_encoder(
@@ -171,14 +168,13 @@ def load_encoder(path: Path, network: Path) -> Encoder:
     try:
         with safe_open(path, "np") as file:
             tensors = {name: np.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
-        centers, golden = tensors["centers"].astype(np.float32), tensors["golden"]
+        centers, canary = tensors["centers"].astype(np.float32), (tensors["golden"], tensors["golden_local"])
     except (OSError, SafetensorError, KeyError) as error:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
     vocabulary = Vocabulary(centers, header.origin)
     backbone = open_network(network, header.definition.outputs)
     projections, cells = (_read_projections(path, tensors, prefix) for prefix in (PROJECTION, CELLS))
     extractor = FeatureExtractor(backbone, header.definition, projections, cells)
-    canary = (golden, tensors.get("golden_local", np.zeros((0, 0), np.int8)))
     whitening = None
     if header.definition.whitening is not None:
         mean, matrix = (tensors.get(f"{WHITENING}{name}", np.zeros(0)) for name in ("mean", "matrix"))
@@ -194,8 +190,8 @@ def _whose(path: Path) -> dict[str, Any]:
     name = path.name.removesuffix(ENCODER_SUFFIX)
     return {
         "name": name,
-        "source": "packaged" if path.parent in (PACKAGED, FORMER) else "installed",
-        "default": name == DEFAULT_ENCODER and path.parent != FORMER,
+        "source": "packaged" if path.parent == PACKAGED else "installed",
+        "default": name == DEFAULT_ENCODER,
     }
 
 
@@ -298,9 +294,6 @@ class EncoderCatalogue:
             raise UnknownEncoder(f"no encoder {name[:80]!r} is installed; there are {', '.join(files) or 'none'}.")
         if not digest or (identity := _read_header(files[name]).identity) == name_or_identity:
             return files[name]
-        former = FORMER / files[name].name
-        if former.is_file() and _read_header(former).identity == name_or_identity:
-            return former
         raise UnknownEncoder(
             f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
             "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."

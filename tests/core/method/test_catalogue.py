@@ -17,8 +17,6 @@ from core.method.presets import NETWORK, PRESETS
 from core.method.vocabulary import Vocabulary
 from core.networks.xfeat import PACKAGED_XFEAT
 
-FIRST_DEFAULT = "m-region-vlad@9584cde69ac83864efd2ddb560b29b7cf88ea4e9e0c148d190beb8e55a8cde9e"
-
 
 @pytest.fixture(scope="module")
 def packaged() -> Encoder:
@@ -62,17 +60,6 @@ def test_an_unknown_name_lists_what_there_is() -> None:
 def test_an_old_identity_is_refused_with_the_way_out() -> None:
     with pytest.raises(UnknownEncoder, match="Re-encode"):
         EncoderCatalogue().get("m-region-vlad@" + "0" * 64)
-
-
-def test_the_default_of_the_first_release_is_found_by_its_identity_alone(packaged: Encoder) -> None:
-    catalogue = EncoderCatalogue()
-    former = catalogue.get(FIRST_DEFAULT)
-    assert former.identity == FIRST_DEFAULT == catalogue.resolve(FIRST_DEFAULT) != packaged.identity
-    former.check_golden()
-    assert catalogue.get(DEFAULT_ENCODER).identity == packaged.identity
-    assert FIRST_DEFAULT not in {summary.identity for summary in catalogue.describe()}
-    found = catalogue.summary(FIRST_DEFAULT)
-    assert (found.identity, found.default, found.calibration) == (FIRST_DEFAULT, False, former.calibration)
 
 
 def test_an_installed_encoder_round_trips(tmp_path: Path, packaged: Encoder) -> None:

@@ -313,8 +313,7 @@ def test_packaged_encoders_reproduce_their_golden_values(name: str) -> None:
         assert encoding.descriptor[index] == pytest.approx(value, abs=0.01)
 
 
-def test_a_definition_without_later_fields_keeps_its_identity_and_a_changed_second_stage_the_descriptors() -> None:
-    """The identity is that of the default encoder of 0.1.0, which had the same first stage and a plainer second one."""
+def test_a_changed_second_stage_changes_the_identity_and_keeps_the_descriptors() -> None:
     packaged = EncoderCatalogue().get("m-region-vlad")
     plain = AgreementDefinition(
         layers=("pool2", "conv3", "conv4"), values=64, weights=(0.4, 0.4, 0.2), reach=(2, 5), candidates=30, share=0.75
