@@ -1,8 +1,8 @@
-"""SQLite files: how they are opened, created, checked and brought to the newest version of their tables.
+"""SQLite files: how they are opened, created and checked.
 
 A file names who wrote it by its ``application_id`` (0 where a kind of file has none) and the version of its tables by
-its ``user_version``.  A new or older file gets the newest tables in one transaction, so that a crash leaves it either
-as it was or complete.
+its ``user_version``.  A new file gets its tables in one transaction, so that a crash leaves it either empty or
+complete.  A file of another version is refused and left as it is.
 """
 
 from __future__ import annotations
@@ -35,15 +35,19 @@ class NotOurs(Damage):
 class UnreadVersion(Exception):
     """The tables of the file have a version that is not read: a later one, or one from before the first release."""
 
-    def __init__(self, version: int, newest: int) -> None:
-        writer = "by a later version of placerec" if version > newest else "before the first release of placerec"
-        super().__init__(f"was written {writer} (schema {version}, this one knows {newest})")
-        self.version, self.newest = version, newest
+    def __init__(self, version: int, known: int) -> None:
+        writer = "by a later version of placerec" if version > known else "before the first release of placerec"
+        super().__init__(f"was written {writer} (schema {version}, this one knows {known})")
+        self.version, self.known = version, known
 
     def refusal(self, file: str) -> DataDirectoryTooNew | DataDirectoryTooOld:
         """The error that users see, about the ``file`` of this name."""
-        kind = DataDirectoryTooNew if self.version > self.newest else DataDirectoryTooOld
-        return kind(f"{file} {self}.")
+        if self.version > self.known:
+            return DataDirectoryTooNew(f"{file} {self}.")
+        return DataDirectoryTooOld(
+            f"{file} {self} and is left as it is: enrol again in a new data directory, or go on with the version that "
+            "wrote it."
+        )
 
 
 def connect(
@@ -85,27 +89,22 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Schema:
-    """The tables of one kind of file, and how a file with older tables gets the newest ones.
+    """The tables of one kind of file.
 
     application_id: names the kind of file; 0 for kinds that have none.
-    version: of the newest tables.
-    create: statements that make the newest tables in an empty file.
-    migrations: by a version, the statements that lead from it to the next one, from the oldest that is read on.
+    version: of the tables.
+    create: statements that make them in an empty file.
     """
 
     application_id: int
     version: int
     create: Sequence[str]
-    migrations: Mapping[int, Sequence[str]] = field(default_factory=dict)
 
-    def migrate(self, connection: sqlite3.Connection, create: bool = False) -> int:
-        """Bring a file to the newest version in one transaction.
+    def prepare(self, connection: sqlite3.Connection, create: bool = False) -> None:
+        """See that a file has these tables.
 
         Args:
-            create: make the tables if the file is empty.
-
-        Returns:
-            By how many versions the file advanced.
+            create: make the tables, all or none, if the file is empty.
 
         Raises:
             NotOurs: the file is of another kind, or empty without ``create``.
@@ -116,20 +115,15 @@ class Schema:
         (owner,) = connection.execute("PRAGMA application_id").fetchone()
         query = "SELECT count(*) FROM sqlite_schema"
         if create and (version, owner) == (0, 0) and connection.execute(query).fetchone() == (0,):
-            statements = list(self.create)
-        elif version < 1 or owner != self.application_id:
-            raise NotOurs("it is a database, but not one of placerec's")
-        elif not min(self.migrations, default=self.version) <= version <= self.version:
-            raise UnreadVersion(version, self.version)
-        else:
-            statements = [one for older in range(version, self.version) for one in self.migrations[older]]
-        if version < self.version:
             with transaction(connection):
-                for statement in statements:
+                for statement in self.create:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {self.application_id}")
                 connection.execute(f"PRAGMA user_version = {self.version}")
-        return self.version - version
+        elif version < 1 or owner != self.application_id:
+            raise NotOurs("it is a database, but not one of placerec's")
+        elif version != self.version:
+            raise UnreadVersion(version, self.version)
 
 
 @dataclass(frozen=True)
@@ -149,7 +143,7 @@ class SqliteFile:
     timeout: float = 30
 
     def open(self, create: bool = True) -> sqlite3.Connection:
-        """A connection to the file, which is checked and brought to its newest version.
+        """A connection to the file, which is checked.
 
         Args:
             create: make the file if it is missing or empty, and see that it can be written to.
@@ -162,7 +156,7 @@ class SqliteFile:
         try:
             connection = connect(self.path, "rwc" if create else "rw", self.settings, self.timeout)
             try:
-                self.schema.migrate(connection, create)
+                self.schema.prepare(connection, create)
                 if self.check_whole:
                     for (line,) in connection.execute("PRAGMA quick_check").fetchall():
                         if line != "ok":

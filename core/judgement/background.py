@@ -114,7 +114,7 @@ def background(
 
 
 def unrelated(scores: NDArray[np.floating], mean: float, deviation: float) -> Background:
-    """The background as calibrations without an environment have it, which were made before there were any.
+    """The background by a calibration without an environment, as those of encoders of one's own are.
 
     Imagined places, as many as are missing to ``TOP_PLACES``, score like places of different environments.
     """

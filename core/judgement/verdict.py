@@ -72,8 +72,9 @@ class Calibration(BaseModel):
     frames, in units of the score.  ``curve`` tells how probable a decision value is right; a calibration on
     frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map does
-    not have yet; calibrations of placerec 0.1.0 have none, and mean what they meant.  ``geometry`` says how geometric
-    evidence joins the probability; without it, or without a curve, evidence changes the order of the candidates only.
+    not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
+    ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes the
+    order of the candidates only.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -89,12 +90,12 @@ class Calibration(BaseModel):
     environment: Environment | None = Field(
         default=None,
         exclude_if=lambda environment: environment is None,
-        description="Scores of other places within one environment; calibrations of version 0.1 have none.",
+        description="Scores of other places within one environment; null: not measured.",
     )
     geometry: GeometryTerms | None = Field(
         default=None,
         exclude_if=lambda terms: terms is None,
-        description="How geometric evidence joins the probability; calibrations of version 0.1 have none.",
+        description="How geometric evidence joins the probability; null: it does not.",
     )
 
     def background(

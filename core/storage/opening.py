@@ -29,7 +29,7 @@ from core.storage.database.connections import FILE, Database, connect
 from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.database.schema import (
     check_schema,
-    migrate,
+    prepare,
     rebuild_metadata_index,
     stale_metadata_index,
     wrong_sequence_ends,
@@ -73,7 +73,7 @@ def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> Non
     folder.mkdir()
     connection = connect(folder / FILE, create=True)
     try:
-        migrate(connection, create=True)
+        prepare(connection, create=True)
         with transaction(connection):
             ledger.insert_record(connection, record, rows_per_segment)
     finally:
@@ -110,7 +110,7 @@ def _check_files(folder: Path) -> None:
 
 
 def read_record(folder: Path) -> tuple[MapRecord, int]:
-    """The record of a map and how many places it has, without its places; an older database is migrated.
+    """The record of a map and how many places it has, without its places.
 
     Raises:
         DataDirectoryTooNew, DataDirectoryTooOld: its database is of a version that is not read.
@@ -120,7 +120,7 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
     _check_files(folder)
     connection = connect(folder / FILE)
     try:
-        migrate(connection)
+        prepare(connection, str(folder / FILE))
         check_schema(connection)
         (places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         return _adopt(folder, connection)[0], int(places)

@@ -218,7 +218,7 @@ class ReviewFrames:
 
 def _empty() -> sqlite3.Connection:
     connection = sqlite3.connect(":memory:", isolation_level=None)
-    _SCHEMA.migrate(connection, create=True)
+    _SCHEMA.prepare(connection, create=True)
     return connection
 
 

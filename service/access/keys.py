@@ -388,7 +388,7 @@ class KeyStore(KeyRecords):
             try:
                 os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
                 with closing(connect(temporary, "rw", {"synchronous": "EXTRA"})) as connection:
-                    _SCHEMA.migrate(connection, create=True)
+                    _SCHEMA.prepare(connection, create=True)
                 with suppress(FileExistsError):  # another process was quicker
                     os.link(temporary, self.path)
                 sync_folder(self.path.parent)

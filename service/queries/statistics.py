@@ -62,17 +62,13 @@ _TABLES = (
     " score REAL NOT NULL, score_squares REAL NOT NULL, decision REAL NOT NULL, decision_squares REAL NOT NULL,"
     f" {', '.join(f'bin{number} INTEGER NOT NULL' for number in range(SCORE_BINS))}, PRIMARY KEY (map, monday))"
     " STRICT, WITHOUT ROWID",
+    "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour INTEGER NOT NULL,"
+    " recognized INTEGER NOT NULL, ambiguous INTEGER NOT NULL, unknown INTEGER NOT NULL, PRIMARY KEY (map, hour))"
+    " STRICT, WITHOUT ROWID",
+    "CREATE TABLE calibrations (map INTEGER PRIMARY KEY REFERENCES maps (code) ON DELETE CASCADE,"
+    " at TEXT NOT NULL, report TEXT NOT NULL, trials TEXT NOT NULL) STRICT",
 )
-_LATER: Mapping[int, tuple[str, ...]] = {
-    1: (
-        "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour INTEGER NOT NULL,"
-        " recognized INTEGER NOT NULL, ambiguous INTEGER NOT NULL, unknown INTEGER NOT NULL, PRIMARY KEY (map, hour))"
-        " STRICT, WITHOUT ROWID",
-        "CREATE TABLE calibrations (map INTEGER PRIMARY KEY REFERENCES maps (code) ON DELETE CASCADE,"
-        " at TEXT NOT NULL, report TEXT NOT NULL, trials TEXT NOT NULL) STRICT",
-    )
-}
-_SCHEMA = Schema(application_id=0, version=2, create=(*_TABLES, *_LATER[1]), migrations=_LATER)
+_SCHEMA = Schema(application_id=0, version=2, create=_TABLES)
 
 
 class VerdictCounts(BaseModel):

@@ -1,6 +1,6 @@
 """The job that finds the keypoints of places that have none, in the pictures that the map keeps of them.
 
-Places lack keypoints if they were enrolled by placerec 0.1.0, or while the map did not verify.  A thumbnail serves as
+Places lack keypoints if they were enrolled while the map did not verify.  A thumbnail serves as
 well as an image, with fewer pixels.  Each commit stands by itself, so an attempt after a restart goes on with the
 places that are still without.
 """

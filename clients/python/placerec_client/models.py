@@ -413,9 +413,9 @@ class Calibration(Model):
     of unrelated frames, in units of the score. ``curve`` tells how probable a decision value is right; a calibration
     on frames that are all alike has none. ``decision`` names the decision value, of which there is one.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map
-    does not have yet; calibrations of placerec 0.1.0 have none, and mean what they meant. ``geometry`` says how
-    geometric evidence joins the probability; without it, or without a curve, evidence changes the order of the
-    candidates only.
+    does not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames
+    do. ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence
+    changes the order of the candidates only.
     """
 
     source: str

@@ -16,7 +16,7 @@ from core.disk import sqlite_file
 from core.disk.files import sync_file
 from core.disk.sqlite_file import DURABLE
 from core.storage.database import keypoints, row_checksums
-from core.storage.database.schema import check_schema, migrate
+from core.storage.database.schema import check_schema, prepare
 
 FILE = "map.sqlite"
 
@@ -65,7 +65,7 @@ class Database:
     """``map.sqlite`` of an open map.  Any thread may read; the caller ensures that only one writes at a time."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file, and migrate it if it is older.
+        """Open the file.
 
         Raises:
             DataDirectoryTooNew, DataDirectoryTooOld: it is of a version that is not read.
@@ -75,7 +75,7 @@ class Database:
         self._path = path
         self._writer = connect(path)
         try:
-            migrate(self._writer)
+            prepare(self._writer, str(path))
             check_schema(self._writer)
             sqlite_file.expect_writable(self._writer)
         except BaseException:

@@ -1,13 +1,9 @@
-"""The tables of ``map.sqlite``, and the migrations that bring older files to the newest tables.
-
-Version 7 of the tables is that of placerec 0.1.0, the first release, and the oldest that is read.  A migration is a
-list of statements that leads from one version to the next; all that a file lacks are applied in one transaction.
-"""
+"""The tables of ``map.sqlite``."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 from core.disk.files import Damage
@@ -17,12 +13,7 @@ from core.storage.database import row_checksums
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
 
-Migration = Sequence[str]
-
 T = TypeVar("T")
-
-FIRST_VERSION = 7
-"""The version of the tables of placerec 0.1.0."""
 
 LONGEST_INDEXED = 512
 """Most characters of a text in a place's metadata by which the place can be found; longer texts are only stored."""
@@ -45,8 +36,9 @@ _INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(
 _DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
 
 # The column "seal" is the checksum of a row (:mod:`core.storage.database.row_checksums`).
-_TABLES: Migration = (
-    # local_cells and local_values are the shape of the local descriptors; 0 without a second stage.
+_TABLES = (
+    # local_cells and local_values are the shape of the local descriptors; 0 without a second stage.  Which frames are
+    # kept for review is JSON; NULL: none.
     """CREATE TABLE map (
         only INTEGER PRIMARY KEY CHECK (only = 1),
         id TEXT NOT NULL,
@@ -62,6 +54,8 @@ _TABLES: Migration = (
         same_place_radius REAL NOT NULL,
         same_place_frames INTEGER NOT NULL,
         calibration TEXT,
+        verification INTEGER NOT NULL CHECK (verification IN (0, 1)),
+        review TEXT,
         revision INTEGER NOT NULL,
         created_at TEXT NOT NULL,
         updated_at TEXT NOT NULL,
@@ -82,6 +76,9 @@ _TABLES: Migration = (
         checksum INTEGER NOT NULL,
         removed INTEGER NOT NULL DEFAULT 0
     ) STRICT""",
+    # Track and station are the sequence and the ordinal at which another traverse shows what this place shows
+    # (:class:`Whereabouts`); NULL: those of the place itself.  That sequence may be gone, whose code is never used
+    # again.  pose_of is the id of the place whose pose the place got with its station; NULL: the pose is its own.
     """CREATE TABLE places (
         number INTEGER PRIMARY KEY AUTOINCREMENT,
         id TEXT NOT NULL UNIQUE,
@@ -95,6 +92,9 @@ _TABLES: Migration = (
         sequence INTEGER NOT NULL REFERENCES sequences (code),
         ordinal INTEGER NOT NULL,
         camera TEXT,
+        track INTEGER,
+        station INTEGER,
+        pose_of TEXT,
         metadata TEXT NOT NULL,
         created_at TEXT NOT NULL,
         updated_at TEXT NOT NULL,
@@ -102,16 +102,24 @@ _TABLES: Migration = (
     ) STRICT""",
     "CREATE INDEX places_of_sequence ON places (sequence, number)",
     "CREATE INDEX places_in_order ON places (sequence, ordinal)",
+    "CREATE INDEX places_at_station ON places (track, station) WHERE track IS NOT NULL",
     # Apart from the places, so that a listing need not read the pictures.
     """CREATE TABLE pictures (
         place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
         digest BLOB NOT NULL CHECK (length(digest) = 32),
         bytes BLOB NOT NULL
     ) STRICT""",
+    # Apart from the places, for the same reason.  The checksum covers the digest of the frame, too.
+    """CREATE TABLE keypoints (
+        place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
+        checksum INTEGER NOT NULL,
+        record BLOB NOT NULL
+    ) STRICT""",
     # Which camera took a frame, and what is ignored in its frames.
     """CREATE TABLE cameras (
         name TEXT PRIMARY KEY,
         mask TEXT,
+        intrinsics TEXT,
         updated_at TEXT NOT NULL,
         seal INTEGER
     ) STRICT""",
@@ -131,29 +139,7 @@ _TABLES: Migration = (
     f"CREATE TRIGGER place_values_gone AFTER DELETE ON places BEGIN {_DELETE_VALUES}; END",
 )
 
-MIGRATIONS: Sequence[Migration] = (
-    (
-        "ALTER TABLE map ADD COLUMN verification INTEGER NOT NULL DEFAULT 1 CHECK (verification IN (0, 1))",
-        # The sequence and the ordinal at which another traverse shows what this place shows (:class:`Whereabouts`);
-        # NULL: those of the place itself.  The sequence may be gone, whose code is never used again.
-        "ALTER TABLE places ADD COLUMN track INTEGER",
-        "ALTER TABLE places ADD COLUMN station INTEGER",
-        # The id of the place whose pose the place got with its station; NULL: the pose is its own.
-        "ALTER TABLE places ADD COLUMN pose_of TEXT",
-        "CREATE INDEX places_at_station ON places (track, station) WHERE track IS NOT NULL",
-        "ALTER TABLE cameras ADD COLUMN intrinsics TEXT",
-        # Apart from the places, for the same reason as pictures.  The checksum covers the digest of the frame, too.
-        """CREATE TABLE keypoints (
-            place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
-            checksum INTEGER NOT NULL,
-            record BLOB NOT NULL
-        ) STRICT""",
-        *row_checksums.sealing(0),
-    ),
-    # Which frames are kept for review, as JSON; NULL: none.
-    ("ALTER TABLE map ADD COLUMN review TEXT", *row_checksums.sealing(1)),
-)
-"""The steps from ``FIRST_VERSION`` to the newest version; new files get them, too."""
+SCHEMA = Schema(APPLICATION_ID, 9, _TABLES)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
@@ -165,37 +151,29 @@ def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
     }
 
 
-def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS, create: bool = False) -> int:
-    """Apply the ``migrations`` that a file lacks, all of them or none.
+def prepare(connection: sqlite3.Connection, file: str = "map.sqlite", create: bool = False) -> None:
+    """See that a file has the tables of a map.
 
-    With ``create`` the tables are made if the file is empty.
-
-    Returns:
-        By how many versions the file advanced.
+    Args:
+        file: its name in a refusal.
+        create: make the tables if the file is empty.
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the file.
         DataDirectoryTooOld: it was written before the first release.
-        Damage: it is not the database of a map, or it has the newest tables and yet a later version.
+        Damage: it is not the database of a map, or it has these tables and yet another version.
         sqlite3.Error: a statement failed; the file is as it was.
     """
     row_checksums.register(connection)
-    schema = _schema(migrations)
     try:
-        return schema.migrate(connection, create)
+        SCHEMA.prepare(connection, create)
     except NotOurs as error:
         raise Damage("map.sqlite is not one of placerec's databases") from error
     except UnreadVersion as error:
-        if _parts(connection) == _expected(migrations, _parts):
+        if _parts(connection) == _expected(_parts):
             claimed = f"map.sqlite says that it is of schema {error.version}"
-            raise Damage(f"{claimed}, but its tables are of {schema.version}") from error
-        raise error.refusal("A map") from error
-
-
-def _schema(migrations: Sequence[Migration]) -> Schema:
-    steps = dict(enumerate(migrations, start=FIRST_VERSION))
-    create = [*_TABLES, *(statement for step in steps.values() for statement in step)]
-    return Schema(APPLICATION_ID, FIRST_VERSION + len(steps), create, steps)
+            raise Damage(f"{claimed}, but its tables are of {SCHEMA.version}") from error
+        raise error.refusal(file) from error
 
 
 def _parts(connection: sqlite3.Connection) -> tuple[set[tuple[str, str]], dict[str, set[str]]]:
@@ -204,24 +182,24 @@ def _parts(connection: sqlite3.Connection) -> tuple[set[tuple[str, str]], dict[s
     return set(connection.execute(query)), _columns(connection)
 
 
-def _expected(migrations: Sequence[Migration], read: Callable[[sqlite3.Connection], T]) -> T:
-    """What ``read`` returns for a file that has the newest tables."""
+def _expected(read: Callable[[sqlite3.Connection], T]) -> T:
+    """What ``read`` returns for a file that has the tables of a map."""
     wanted = sqlite3.connect(":memory:", isolation_level=None)
     try:
-        migrate(wanted, migrations, create=True)
+        prepare(wanted, create=True)
         return read(wanted)
     finally:
         wanted.close()
 
 
-def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS) -> None:
-    """Check that a file has the tables and columns that ``migrations`` make.
+def check_schema(connection: sqlite3.Connection) -> None:
+    """Check that a file has the tables of a map with their columns.
 
     Raises:
         Damage: one is missing.
     """
     found = _columns(connection)
-    for table, columns in _expected(migrations, _columns).items():
+    for table, columns in _expected(_columns).items():
         if missing := columns - found.get(table, set()):
             raise Damage(f"map.sqlite lacks {', '.join(sorted(missing))} of its table {table!r}")
 

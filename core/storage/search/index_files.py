@@ -22,9 +22,6 @@ from core.storage.files.segment_files import Layout
 GROUP_ROWS = 4096
 """About so many rows have their codes in one file: some 9 MB with the default encoder."""
 
-_FORMER = ("coder.index", "lists.index")
-"""Files of earlier versions, which nothing reads."""
-
 
 def segments_per_group(layout: Layout) -> int:
     """How many segments have their codes in one file."""
@@ -101,15 +98,6 @@ class IndexFiles:
             except StaleArrays as error:
                 stale.append(f"{path.name}: {error}")
         return checked, stale
-
-    def remove_former(self) -> None:
-        """Delete what earlier versions kept beside the codes.
-
-        Raises:
-            OSError: the disk refuses.
-        """
-        for name in _FORMER:
-            (self._folder / name).unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete all index files, because the map is searched exactly.

@@ -190,7 +190,6 @@ class Indexer:
             if snapshot.table is not None:
                 self._drop_codes()
             return
-        self._files.remove_former()
         self._code_all()
         self._keep_codes()
         self._join()

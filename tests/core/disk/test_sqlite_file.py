@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -12,9 +13,7 @@ from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, co
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 
 FIRST = Schema(0x74657374, 1, ["CREATE TABLE t (a INTEGER) STRICT"])
-SECOND = Schema(
-    0x74657374, 2, ["CREATE TABLE t (a INTEGER, b INTEGER) STRICT"], {1: ["ALTER TABLE t ADD COLUMN b INTEGER"]}
-)
+SECOND = Schema(0x74657374, 2, ["CREATE TABLE t (a INTEGER, b INTEGER) STRICT"])
 
 
 def file_of(folder: Path, schema: Schema = SECOND) -> SqliteFile:
@@ -34,35 +33,43 @@ def test_a_new_file_is_durable_and_says_what_it_is(tmp_path: Path) -> None:
         assert connection.execute("SELECT * FROM t").fetchall() == [(1, 2)]
 
 
-def test_an_older_file_gets_the_newest_tables(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("written", "read", "words", "refusal"),
+    [
+        (SECOND, FIRST, "later version of placerec (schema 2, this one knows 1)", DataDirectoryTooNew),
+        (FIRST, SECOND, "before the first release of placerec (schema 1, this one knows 2)", DataDirectoryTooOld),
+    ],
+)
+def test_a_file_of_another_version_is_refused_and_not_touched(
+    tmp_path: Path, written: Schema, read: Schema, words: str, refusal: type[Exception]
+) -> None:
+    with closing(file_of(tmp_path, written).open()) as connection:
+        connection.execute("INSERT INTO t (a) VALUES (1)")
+    before = (tmp_path / "t.sqlite").read_bytes()
+    with pytest.raises(UnreadVersion, match=re.escape(words)) as error:
+        file_of(tmp_path, read).open()
+    assert error.value.version == written.version
+    assert isinstance(error.value.refusal("t"), refusal)
+    assert (tmp_path / "t.sqlite").read_bytes() == before
+
+
+def test_a_file_of_another_version_that_is_replaced_is_put_aside_whole(tmp_path: Path) -> None:
     with closing(file_of(tmp_path, FIRST).open()) as connection:
         connection.execute("INSERT INTO t VALUES (1)")
-    with closing(file_of(tmp_path).open(create=False)) as connection:
-        assert connection.execute("SELECT * FROM t").fetchall() == [(1, None)]
-    with pytest.raises(UnreadVersion, match="later version") as error:
-        file_of(tmp_path, FIRST).open()
-    assert error.value.version == 2
-    assert isinstance(error.value.refusal("t"), DataDirectoryTooNew)
+    before = (tmp_path / "t.sqlite").read_bytes()
+    with closing(file_of(tmp_path).open_or_replace()) as connection:
+        assert connection.execute("SELECT a, b FROM t").fetchall() == []
+    (aside,) = tmp_path.glob("t.sqlite.damaged-*")
+    assert aside.read_bytes() == before
 
 
-def test_a_file_older_than_the_oldest_step_is_refused(tmp_path: Path) -> None:
-    file_of(tmp_path, FIRST).open().close()
-    third = Schema(0x74657374, 3, [], {2: ["ALTER TABLE t ADD COLUMN c INTEGER"]})
-    with pytest.raises(UnreadVersion, match="before the first release") as error:
-        file_of(tmp_path, third).open()
-    assert isinstance(error.value.refusal("t"), DataDirectoryTooOld)
-    with closing(connect(tmp_path / "t.sqlite")) as connection:
-        assert pragma(connection, "user_version") == 1
-
-
-def test_a_failed_migration_changes_nothing(tmp_path: Path) -> None:
-    file_of(tmp_path, FIRST).open().close()
-    broken = Schema(0x74657374, 2, [], {1: ["ALTER TABLE t ADD COLUMN c INTEGER", "SELECT nonsense FROM t"]})
-    with closing(connect(tmp_path / "t.sqlite")) as connection:
+def test_tables_that_cannot_be_made_change_nothing(tmp_path: Path) -> None:
+    broken = Schema(0x74657374, 1, [*FIRST.create, "SELECT nonsense FROM t"])
+    with closing(connect(tmp_path / "t.sqlite", "rwc")) as connection:
         with pytest.raises(sqlite3.OperationalError):
-            broken.migrate(connection)
-        assert pragma(connection, "user_version") == 1
-        assert connection.execute("SELECT name FROM pragma_table_info('t')").fetchall() == [("a",)]
+            broken.prepare(connection, create=True)
+        assert pragma(connection, "user_version") == 0
+        assert connection.execute("SELECT name FROM sqlite_schema").fetchall() == []
 
 
 def _other_owner(path: Path) -> None:

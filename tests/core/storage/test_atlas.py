@@ -13,6 +13,7 @@ import pytest
 from core.errors import (
     DataDirectoryLocked,
     DataDirectoryTooNew,
+    DataDirectoryTooOld,
     InvalidCursor,
     InvalidIdentifier,
     MapExists,
@@ -193,6 +194,21 @@ def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
         Atlas(directory)
     edit(directory, "ALTER TABLE places DROP COLUMN floor")
     Atlas(directory).close()  # and it let go of the lock each time
+
+
+def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: Path) -> None:
+    atlas = Atlas(directory)
+    for name in ("hall", "lab"):
+        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    atlas.close()
+    edit(directory, "ALTER TABLE map DROP COLUMN review")
+    edit(directory, "PRAGMA user_version = 8")
+    before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    with pytest.raises(DataDirectoryTooOld) as error:
+        Atlas(directory)
+    assert str(error.value).startswith(f"{directory / 'maps' / 'lab' / 'map.sqlite'} was written before the first")
+    assert "enrol again in a new data directory" in str(error.value)
+    assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
 def test_the_disk_can_be_written_or_not(atlas: Atlas, directory: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -240,7 +241,9 @@ def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
 
 
-@pytest.mark.parametrize(("version", "refusal"), [(99, DataDirectoryTooNew), (2, DataDirectoryTooOld)])
+@pytest.mark.parametrize(
+    ("version", "refusal"), [(99, DataDirectoryTooNew), (1, DataDirectoryTooOld), (2, DataDirectoryTooOld)]
+)
 def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refusal: type[Exception]) -> None:
     import sqlite3
 
@@ -249,8 +252,10 @@ def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refu
     connection = sqlite3.connect(tmp_path / FILE)
     connection.execute(f"PRAGMA user_version = {version}")
     connection.close()
-    with pytest.raises(refusal):
+    before = (tmp_path / FILE).read_bytes()
+    with pytest.raises(refusal, match=re.escape(f"{tmp_path / FILE} was written")):
         Jobs(tmp_path)
+    assert (tmp_path / FILE).read_bytes() == before
 
 
 def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

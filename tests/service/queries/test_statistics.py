@@ -15,8 +15,6 @@ from core.upkeep.drift import Week
 from service.queries import statistics
 from service.queries.given_answers import MapKey
 from service.queries.statistics import (
-    _LATER,
-    _TABLES,
     FILE,
     MOST_WEEKS,
     SPARE_PLACES,
@@ -198,17 +196,18 @@ def test_counts_of_one_place(tmp_path: Path, maps: Maps) -> None:
     counted.close()
 
 
-def test_statistics_of_the_first_version_get_the_new_table(tmp_path: Path, maps: Maps) -> None:
+def test_statistics_of_an_older_version_are_put_aside_whole(
+    tmp_path: Path, maps: Maps, caplog: pytest.LogCaptureFixture
+) -> None:
     with closing(sqlite3.connect(tmp_path / FILE)) as connection:
-        for statement in (*_TABLES, "PRAGMA user_version = 1"):
-            connection.execute(statement)
-        connection.execute(
-            "INSERT INTO maps VALUES (1, 'lab', '2026-11-20T09:00:00+00:00', '2026-11-20T09:00:00+00:00')"
-        )
-        connection.execute("INSERT INTO places VALUES (1, 'p1', 7, 5, '2026-11-21T09:00:00+00:00')")
-        connection.commit()
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("CREATE TABLE maps (code INTEGER PRIMARY KEY, id TEXT NOT NULL) STRICT")
+        connection.execute("PRAGMA user_version = 1")
+    before = (tmp_path / FILE).read_bytes()
     counted = counting(tmp_path, maps)
     counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
-    assert counted.of_place(LAB, "p1").best == 8 and counted.last_day()[LAB].recognized == 1
+    assert counted.of_place(LAB, "p1").best == 1
     counted.close()
-    assert not list(tmp_path.glob("*damaged*")) and list(_LATER) == [1]
+    (aside,) = tmp_path.glob("*damaged*")
+    assert aside.read_bytes() == before
+    assert "before the first release of placerec (schema 1, this one knows 2)" in caplog.text

@@ -9,13 +9,13 @@ import pytest
 
 from core.disk.files import Damage
 from core.storage.database.connections import Database, DatabaseClosed, connect
-from core.storage.database.schema import migrate
+from core.storage.database.schema import prepare
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     connection = connect(tmp_path / "map.sqlite", create=True)
-    migrate(connection, create=True)
+    prepare(connection, create=True)
     connection.close()
     return tmp_path / "map.sqlite"
 

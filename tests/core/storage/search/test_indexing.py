@@ -324,19 +324,17 @@ def test_a_file_that_is_no_good_is_told_and_made_again(
     again.close()
 
 
-def test_caches_of_earlier_versions_are_made_again(atlas: Atlas, directory: Path, folder: Path) -> None:
+def test_codes_of_another_make_are_made_again(atlas: Atlas, directory: Path, folder: Path) -> None:
     make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
-    for name in ("codes-000001.index", "coder.index", "lists.index"):
-        bits = {"sketches": np.zeros((32, 8), np.uint64), "bits": np.zeros((32, 4), np.uint64)}
-        array_files.write_arrays(folder / name, "codes", "others", bits)
+    bits = {"sketches": np.zeros((32, 8), np.uint64), "bits": np.zeros((32, 4), np.uint64)}
+    array_files.write_arrays(folder / "codes-000001.index", "codes", "others", bits)
     again = Atlas(directory)
     lab = again.get("lab")
     assert settled(lab).rows_indexed == PLACES
     assert all(finds(lab, f"p{i}") for i in (0, 40, PLACES - 1))
     assert lab.verify().stale_caches == []
-    assert not [name for name in ("coder.index", "lists.index") if (folder / name).exists()]
     again.close()
 
 
