@@ -42,11 +42,11 @@ class SequenceLine(_Line):
 
 
 class CameraLine(_Line):
-    """A camera, what is ignored in its frames, and its intrinsics; files of format 1 have none."""
+    """A camera, what is ignored in its frames, and its intrinsics."""
 
     name: Camera
     mask: Mask | None
-    intrinsics: Intrinsics | None = None
+    intrinsics: Intrinsics | None
     updated_at: Timestamp
 
 
@@ -70,18 +70,18 @@ class PlaceLine(_Line):
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
     pose: Pose | None
-    pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None = None
+    pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None
     timestamp: Timestamp | None
     sequence: Sequence | None
     ordinal: Number
-    track: Sequence | Number | None = None
-    station: Annotated[int, Field(ge=-LARGEST, le=LARGEST, strict=True)] | None = None
+    track: Sequence | Number | None
+    station: Annotated[int, Field(ge=-LARGEST, le=LARGEST, strict=True)] | None
     camera: Camera | None
     metadata: dict[str, Any]
     regions: Number
     digest: Digest
     picture: Picture | None
-    keypoints: Annotated[int, Field(ge=0, le=MOST, strict=True)] | None = None
+    keypoints: Annotated[int, Field(ge=0, le=MOST, strict=True)] | None
     created_at: Timestamp
     updated_at: Timestamp
 

@@ -14,8 +14,6 @@ The file is a plain tar (ustar).  Its members, in this order:
     places-000002.jsonl …       and so on
 
 The bytes of a file follow from its manifest and its parts, so the SHA-256 of the manifest identifies the whole file.
-
-In version 1 there are no keypoints and no tracks.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ VERSION = 2
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
 GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"), ("keypoints", "bin"))
-"""The parts of a group; those of version 1 are the first three."""
+"""The parts of a group."""
 
 MOST_MANIFEST_BYTES = 8 << 20
 """A part takes some 165 bytes, so this is enough for 12 million places or 3 TB of pictures."""
@@ -87,22 +85,17 @@ class Manifest(BaseModel):
     @property
     def groups(self) -> int:
         """How many groups of places, descriptors, pictures and keypoints there are."""
-        return (len(self.parts) - 2) // _kinds(self.version)
+        return (len(self.parts) - 2) // len(GROUP_KINDS)
 
     def group(self, number: int) -> Sequence[ArchivePart]:
-        """Places, descriptors, pictures and, from version 2 on, keypoints of group ``number``, counted from 0."""
-        first = 2 + number * _kinds(self.version)
-        return self.parts[first : first + _kinds(self.version)]
+        """Places, descriptors, pictures and keypoints of group ``number``, counted from 0."""
+        first = 2 + number * len(GROUP_KINDS)
+        return self.parts[first : first + len(GROUP_KINDS)]
 
 
-def _kinds(version: int) -> int:
-    """How many parts a group has."""
-    return 3 if version == 1 else len(GROUP_KINDS)
-
-
-def group_names(number: int, version: int = VERSION) -> list[str]:
+def group_names(number: int) -> list[str]:
     """The names of the parts of group ``number``, counted from 0."""
-    return [f"{kind}-{number + 1:06d}.{suffix}" for kind, suffix in GROUP_KINDS[: _kinds(version)]]
+    return [f"{kind}-{number + 1:06d}.{suffix}" for kind, suffix in GROUP_KINDS]
 
 
 def written(manifest: Manifest) -> bytes:
@@ -168,11 +161,12 @@ def _expect_few(text: bytes) -> None:
 
 
 def read_manifest(text: bytes) -> Manifest:
-    """Read the manifest of a file of any known version.
+    """Read the manifest of a file.
 
     Raises:
         ArchiveTooNew: a later version of placerec wrote the file.
-        InvalidArchive: it is not a manifest of placerec, or its content is invalid.
+        InvalidArchive: it is not a manifest of placerec, its content is invalid, or it was written before the first
+            release.
     """
     _expect_few(text)
     value = strict_json(text, MANIFEST)
@@ -181,14 +175,15 @@ def read_manifest(text: bytes) -> Manifest:
     version = value.get("version")
     if type(version) is not int or version < 1:
         raise InvalidArchive(f"{MANIFEST} names no version.")
-    if version not in READERS:
+    if version > VERSION:
         raise ArchiveTooNew(
             f"The file was written by a later version of placerec (format {version}, this one knows {VERSION})."
         )
-    return READERS[version](value)
-
-
-def _read(value: dict[str, Any]) -> Manifest:
+    if version < VERSION:
+        raise InvalidArchive(
+            f"The file was written before the first release of placerec (format {version}, this one knows {VERSION}): "
+            "enrol its frames again."
+        )
     inner: Any = value
     for name, kind in (("map", ArchivedRecord), ("calibration", Calibration), ("curve", Curve)):
         inner = inner.get(name) if isinstance(inner, dict) else None
@@ -208,7 +203,7 @@ def _read(value: dict[str, Any]) -> Manifest:
         raise InvalidArchive(f"{MANIFEST}: {error}") from None
     names = [SEQUENCES, CAMERAS]
     for number in range(max(0, manifest.groups)):
-        names += group_names(number, manifest.version)
+        names += group_names(number)
     if [part.name for part in manifest.parts] != names:
         raise InvalidArchive(f"{MANIFEST}: the parts are not those of a map, in their order.")
     for number in range(manifest.groups):
@@ -217,7 +212,3 @@ def _read(value: dict[str, Any]) -> Manifest:
     if sum(part.rows for part in manifest.parts if part.name.startswith("places-")) != manifest.places:
         raise InvalidArchive(f"{MANIFEST}: the parts hold another number of places than it names.")
     return manifest
-
-
-READERS = {1: _read, 2: _read}
-"""The reader of each version; versions that were released stay."""

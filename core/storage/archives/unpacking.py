@@ -67,12 +67,11 @@ def check_sizes(manifest: Manifest) -> None:
     """
     width = layout_of(manifest).frame.itemsize
     for number in range(manifest.groups):
-        _, part, _, *more = manifest.group(number)
+        _, part, _, keypoints = manifest.group(number)
         if part.bytes != part.rows * width:
             raise InvalidArchive(f"{part.name} has {part.bytes} bytes, not {part.rows} times {width} bytes.")
-        for part in more:
-            if part.bytes > part.rows * record_bytes(MOST):
-                raise InvalidArchive(f"{part.name} has more bytes than the keypoints of {part.rows} places.")
+        if keypoints.bytes > keypoints.rows * record_bytes(MOST):
+            raise InvalidArchive(f"{keypoints.name} has more bytes than the keypoints of {keypoints.rows} places.")
 
 
 class Content(NamedTuple):
@@ -152,8 +151,8 @@ class Unpacking(ABC):
             yield line
         reader.finish()
 
-    def _group(self, places: ArchivePart, frames: ArchivePart, *more: ArchivePart) -> None:
-        lines, rows, *others = (self.archive.part(part) for part in (places, frames, *more))
+    def _group(self, places: ArchivePart, *more: ArchivePart) -> None:
+        lines, *others = (self.archive.part(part) for part in (places, *more))
         step = max(1, CHUNK_BYTES // self.layout.record.itemsize)
         chunk: list[PlaceLine] = []
         held = 0
@@ -161,15 +160,13 @@ class Unpacking(ABC):
             chunk.append(line)
             held += size
             if len(chunk) == step or held >= TEXT_BYTES:
-                self._store(chunk, rows, *others)
+                self._store(chunk, *others)
                 chunk, held = [], 0
-        self._store(chunk, rows, *others)
-        for reader in (lines, rows, *others):
+        self._store(chunk, *others)
+        for reader in (lines, *others):
             reader.finish()
 
-    def _store(
-        self, chunk: list[PlaceLine], rows: PartReader, images: PartReader, records: PartReader | None = None
-    ) -> None:
+    def _store(self, chunk: list[PlaceLine], rows: PartReader, images: PartReader, records: PartReader) -> None:
         if not chunk:
             return
         frames = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
@@ -186,7 +183,7 @@ class Unpacking(ABC):
             if not 0 < value <= LARGEST_HALF:  # this is also false for NaN
                 raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} cannot be compared.")
 
-    def _content(self, line: PlaceLine, images: PartReader, records: PartReader | None) -> Content:
+    def _content(self, line: PlaceLine, images: PartReader, records: PartReader) -> Content:
         return Content(self._picture(line, images), self._keypoints(line, records))
 
     def _picture(self, line: PlaceLine, images: PartReader) -> tuple[bytes, bytes] | None:
@@ -205,11 +202,9 @@ class Unpacking(ABC):
             raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
         return content, digest
 
-    def _keypoints(self, line: PlaceLine, records: PartReader | None) -> bytes | None:
+    def _keypoints(self, line: PlaceLine, records: PartReader) -> bytes | None:
         if line.keypoints is None:
             return None
-        if records is None:
-            raise InvalidArchive(f"The place {line.id!r} has keypoints, which files of version 1 do not hold.")
         record = records.read(record_bytes(line.keypoints))
         try:
             keypoints_of(record)

@@ -245,6 +245,19 @@ def test_a_later_version_is_told_from_damage(content: bytes, tmp_path: Path) -> 
         pass
 
 
+def test_an_older_version_is_refused_with_what_to_do(content: bytes, tmp_path: Path) -> None:
+    manifest, _ = parts_of(content)
+    parts = [part for part in manifest["parts"] if not part["name"].startswith("keypoints-")]
+    path = tmp_path / "sent.tar"
+    path.write_bytes(manifest_with(version=1, parts=parts)(content))
+    with pytest.raises(InvalidArchive) as error, Archive(path):
+        pass
+    assert str(error.value) == (
+        "The file was written before the first release of placerec (format 1, this one knows 2): enrol its frames "
+        "again."
+    )
+
+
 def test_what_people_make_by_hand_is_good_if_it_is_right(content: bytes, tmp_path: Path) -> None:
     """The cases above are refused for what is wrong with them, not for how they were made."""
     path = tmp_path / "sent.tar"
