@@ -13,13 +13,10 @@ from core.belief.evidence import Sighting
 from core.belief.motion import Odometry
 from core.belief.odometry import OdometryPose
 from core.belief.run import RunState
-from core.belief.speeds import SPEEDS, UNKNOWN
+from core.belief.speeds import SPEEDS
 from core.belief.view import HEIGHT, WIDTH, View
 
 FORMAT = 3
-"""Format 1, of version 0.1, knows nothing of views; it is read as if there had been none.  Neither it nor
-format 2 knows of speeds.  Both may have evidence of the last frames behind the probabilities, for a filter that is no
-more."""
 
 WHOLE = 255
 """Shares of speeds are kept as so many parts of 1, which is nearer than they are known."""
@@ -71,8 +68,8 @@ def from_bytes(data: bytes) -> RunState:
         if zlib.crc32(data[4:]) != checksum:
             raise DamagedRecord("the checksum is wrong")
         head: dict[str, Any] = json.loads(data[_PREFIX.size : _PREFIX.size + length])
-        if head["format"] not in (1, 2, FORMAT):
-            raise DamagedRecord("it is of another format")
+        if head["format"] != FORMAT:
+            raise DamagedRecord(f"it is of format {head['format']}, this version of placerec knows {FORMAT}")
         position = _PREFIX.size + length
 
         def array(kind: str, count: int) -> Any:
@@ -82,14 +79,12 @@ def from_bytes(data: bytes) -> RunState:
             return found
 
         rows, masses = array("<i8", head["places"]), array("<f4", head["places"])
-        for count, _ in head.get("seen", ()):
-            position += 12 * count
-        count, speeds = head.get("speeds", (0, len(SPEEDS)))
+        count, speeds = head["speeds"]
+        if speeds != len(SPEEDS):
+            raise DamagedRecord("the speeds are others")
         shares = array("u1", count * speeds).reshape(count, speeds).astype(np.float32)
-        if speeds != len(SPEEDS):  # they are learnt again
-            shares = UNKNOWN.shares
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1)
-        levels = array("u1", head.get("view", 0))
+        levels = array("u1", head["view"])
         if len(levels) not in (0, WIDTH * HEIGHT):
             raise DamagedRecord("the view has another size")
         return RunState(
@@ -101,12 +96,12 @@ def from_bytes(data: bytes) -> RunState:
             Odometry(*head["odometry"]),
             head["reach"],
             View(levels) if len(levels) else None,
-            head.get("blind", 0),
-            head.get("constant", 0),
-            head.get("pending_reach", 0.0),
-            _pose(head.get("pose")),
+            head["blind"],
+            head["constant"],
+            head["pending_reach"],
+            _pose(head["pose"]),
             shares,
-            None if head.get("sighting") is None else Sighting(*head["sighting"]),
+            None if head["sighting"] is None else Sighting(*head["sighting"]),
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error

@@ -28,7 +28,7 @@ from service.access.audit import ASKER
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NOBODY_ASKED, SessionEvent
-from service.sessions.schemas import RETIRED, NewSession
+from service.sessions.schemas import NewSession
 from service.sessions.store import SessionRecords, SessionStore, StoredSession
 from service.settings import Settings
 
@@ -452,8 +452,6 @@ def session_of(stored: StoredSession) -> Session:
     """A session without its run; raises ValueError, KeyError or TypeError if its record is damaged."""
     content = json.loads(stored.options)
     expires_after = float(content.pop("expires_after"))
-    for name in RETIRED:  # a session that an earlier version has saved goes on by the filter that there is
-        content.pop(name, None)
     options = NewSession.model_validate(content)
     return Session(
         stored.id, stored.map, stored.map_created_at, options, expires_after, stored.created, stored.used,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import zlib
 from dataclasses import replace
@@ -171,6 +170,14 @@ def test_a_record_that_was_changed_is_refused() -> None:
     for bad in (b"", data[:7], data[:-1], data[:9] + b"?" + data[10:]):
         with pytest.raises(DamagedRecord):
             from_bytes(bad)
+
+
+@pytest.mark.parametrize("written", [1, 2, 4])
+def test_a_record_of_another_format_is_refused(written: int) -> None:
+    data = to_bytes(Run(DEFAULT, graph_of(walk(10))).state())
+    rest = data[4:].replace(b'"format":3', f'"format":{written}'.encode())
+    with pytest.raises(DamagedRecord, match=f"it is of format {written}, this version of placerec knows 3"):
+        from_bytes(zlib.crc32(rest).to_bytes(4, "little") + rest)
 
 
 def recognized_at(row: int, probability: float = 0.8, *rows: int) -> Evidence:
@@ -356,19 +363,3 @@ def test_a_slow_robot_advances_while_its_view_seems_the_same() -> None:
         slow.advance(shows(10), Step(), view(0))
     slow.advance(shows(), Step(), view(1))
     assert slow.belief.given[11] > slow.belief.given[10], "after ten frames it is about one place farther"
-
-
-def test_records_of_the_first_format_are_read() -> None:
-    run = Run(DEFAULT, graph_of(walk(10)))
-    run.advance(shows(3), Step(), view(3))
-    state = run.state()
-    assert from_bytes(to_bytes(state)).view is not None
-    data = to_bytes(state)
-    length = int.from_bytes(data[4:8], "little")
-    head = json.loads(data[8 : 8 + length])
-    head = {key: value for key, value in head.items() if key not in ("view", "blind", "constant", "pending_reach")}
-    text = json.dumps(head | {"format": 1}).encode()
-    rest = len(text).to_bytes(4, "little") + text + data[8 + length : -WIDTH * HEIGHT]
-    old = from_bytes(zlib.crc32(rest).to_bytes(4, "little") + rest)
-    assert (old.view, old.blind, old.constant) == (None, 0, 0)
-    assert Run.restored(DEFAULT, run.graph, old).look(1, alive(run.graph)).candidates[0].row == 3
