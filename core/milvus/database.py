@@ -10,7 +10,7 @@ import psycopg
 from psycopg import Connection
 
 from core.errors import StoreOfAnotherVersion
-from core.milvus.ledger import OLDEST_VERSION, TABLES, VERSION, version_of
+from core.milvus.ledger import TABLES, VERSION, version_of
 from core.milvus.outage import Unreachable
 from core.milvus.postgres import Postgres
 
@@ -21,12 +21,13 @@ _LOCK = 7_061_636_572  # any number that nothing else in the database uses
 def _make_tables(connection: Connection[Any]) -> None:
     connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
     found = version_of(connection)
-    if found is None or OLDEST_VERSION <= found < VERSION:
+    if found is None:
         connection.execute(TABLES)
     elif found != VERSION:
         raise StoreOfAnotherVersion(
             f"The tables in PostgreSQL are those of version {found}, which this placerec does not read; it reads "
-            f"version {VERSION}."
+            f"version {VERSION}. They are left as they are: go on with the version that made them, or enrol again in "
+            "another database."
         )
 
 

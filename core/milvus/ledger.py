@@ -27,9 +27,8 @@ from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place
 
 TABLES = (Path(__file__).parent / "tables.sql").read_text()
 
-VERSION, OLDEST_VERSION = 2, 1
-"""Of the tables; it grows when a placerec that knows only the former ones could not use them.  Those of the oldest
-version on are made into those of this one."""
+VERSION = 2
+"""Of the tables; it grows when a placerec that knows only the former ones could not use them."""
 
 WAIT_SECONDS = 10
 """A write that waits for others to the same map is refused after so long."""

@@ -1,11 +1,13 @@
 -- What PostgreSQL has of the maps (core.milvus.ledger has the statements).
 
-CREATE TABLE IF NOT EXISTS placerec (single boolean PRIMARY KEY DEFAULT true CHECK (single), version integer NOT NULL);
-INSERT INTO placerec (version) VALUES (2) ON CONFLICT (single) DO UPDATE SET version = 2;
-ALTER TABLE placerec
-    ADD COLUMN IF NOT EXISTS objects text NOT NULL DEFAULT gen_random_uuid()::text, -- the folder of its pictures
-    ADD COLUMN IF NOT EXISTS swept bigint NOT NULL DEFAULT 0, -- no object with a smaller key is litter,
-    ADD COLUMN IF NOT EXISTS listed timestamptz;    -- as it was when all objects were last listed
+CREATE TABLE IF NOT EXISTS placerec (
+    single boolean PRIMARY KEY DEFAULT true CHECK (single),
+    version integer NOT NULL,
+    objects text NOT NULL DEFAULT gen_random_uuid()::text, -- the folder of its pictures
+    swept bigint NOT NULL DEFAULT 0,    -- no object with a smaller key is litter,
+    listed timestamptz                  -- as it was when all objects were last listed
+);
+INSERT INTO placerec (version) VALUES (2);
 
 CREATE TABLE IF NOT EXISTS maps (
     number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -17,11 +19,10 @@ CREATE TABLE IF NOT EXISTS maps (
     rows bigint NOT NULL DEFAULT 0,     -- the number of the next row
     codes integer NOT NULL DEFAULT 0,   -- the code of the next sequence or lost track
     writes bigint NOT NULL DEFAULT 0,   -- grows with every write
-    inserted bigint NOT NULL DEFAULT 0  -- Milvus's timestamp of the last insertion that counts
+    inserted bigint NOT NULL DEFAULT 0, -- Milvus's timestamp of the last insertion that counts
+    collection bigint NOT NULL DEFAULT 0 -- Milvus's id of the collection that has its descriptors; 0: none has, or it
+                                        -- was not noted
 );
-ALTER TABLE maps
-    -- Milvus's id of the collection that has its descriptors; 0: none has, or it was not noted
-    ADD COLUMN IF NOT EXISTS collection bigint NOT NULL DEFAULT 0;
 
 -- The code of the places without a sequence is -1, and their sequence has no name.
 CREATE TABLE IF NOT EXISTS sequences (
@@ -57,7 +58,6 @@ CREATE TABLE IF NOT EXISTS places (
     UNIQUE (map, id),
     UNIQUE (map, row)
 );
-DROP INDEX IF EXISTS places_of_sequence;
 CREATE INDEX IF NOT EXISTS places_at_position ON places (map, sequence, ordinal, number);
 CREATE INDEX IF NOT EXISTS places_in_order ON places (map, sequence, number);
 CREATE INDEX IF NOT EXISTS places_by_metadata ON places USING gin (tokens);
@@ -70,12 +70,11 @@ CREATE TABLE IF NOT EXISTS frames (
     local bytea NOT NULL,               -- [C, L], likewise
     keypoints bytea,
     picture bytea,                      -- unless it is in an object store
+    object text COLLATE "C" UNIQUE,     -- the name of its picture there
+    object_size bigint,
+    object_digest bytea,                -- SHA-256
     PRIMARY KEY (map, row)
 );
-ALTER TABLE frames
-    ADD COLUMN IF NOT EXISTS object text COLLATE "C" UNIQUE, -- the name of its picture there
-    ADD COLUMN IF NOT EXISTS object_size bigint,
-    ADD COLUMN IF NOT EXISTS object_digest bytea;   -- SHA-256
 ALTER TABLE frames ALTER COLUMN descriptor SET STORAGE EXTERNAL; -- compressing them would only take time
 
 -- What no place names any more; it is deleted a while later, for a query may still need it.
@@ -103,6 +102,7 @@ CREATE TABLE IF NOT EXISTS review_frames (
     size bigint NOT NULL,
     answer text NOT NULL,               -- JSON
     label text,                         -- JSON
+    object text COLLATE "C" UNIQUE,     -- the name of its picture in the store, instead of that in review_pictures
     PRIMARY KEY (map, number),
     UNIQUE (map, digest)
 );
@@ -113,7 +113,6 @@ CREATE TABLE IF NOT EXISTS review_pictures (
     PRIMARY KEY (map, number),
     FOREIGN KEY (map, number) REFERENCES review_frames ON DELETE CASCADE
 );
-ALTER TABLE review_frames ADD COLUMN IF NOT EXISTS object text COLLATE "C" UNIQUE; -- of the store, instead of that
 
 -- The objects whose row is deleted; a sweep deletes them.
 CREATE TABLE IF NOT EXISTS dead_objects (name text COLLATE "C" PRIMARY KEY);

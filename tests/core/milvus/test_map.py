@@ -158,20 +158,19 @@ def test_what_was_left_over_is_deleted(store: MilvusStore, monkeypatch: pytest.M
     assert len(lab.snapshot()) == 2
 
 
-def test_tables_of_another_version(servers: Servers, store: MilvusStore) -> None:
+@pytest.mark.parametrize("other", [VERSION - 1, VERSION + 1])
+def test_tables_of_another_version(servers: Servers, store: MilvusStore, other: int) -> None:
     made(store)
 
     def call_it(version: int) -> None:
         with psycopg.connect(servers.postgres_address) as connection:
             connection.execute("UPDATE placerec SET version = %s", (version,))
 
-    call_it(VERSION + 1)
+    call_it(other)
     later = connected(servers)
     try:
         for ask in (lambda: later.get("lab"), later.check_writable):
-            with pytest.raises(
-                StoreOfAnotherVersion, match=f"version {VERSION + 1}, which this placerec does not read"
-            ):
+            with pytest.raises(StoreOfAnotherVersion, match=f"version {other}, which this placerec does not read"):
                 ask()
     finally:
         call_it(VERSION)

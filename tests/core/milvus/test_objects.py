@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import obstore
-import psycopg
 import pytest
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
@@ -289,25 +288,3 @@ def test_what_other_stores_say(
         with pytest.raises(kind, match="The object store takes no pictures"):
             objects.check()
     objects.check()
-
-
-def test_tables_of_the_former_version(servers: Servers, store: MilvusStore, lab: MilvusMap) -> None:
-    """They get what they lack, and keep what they have."""
-    without = connected(servers, None)
-    without.get("lab").enrol([frame("a")])
-    without.close()
-    with psycopg.connect(servers.postgres_address) as connection:
-        connection.execute(
-            "DROP TRIGGER frame_deleted ON frames; DROP TRIGGER review_frame_deleted ON review_frames;"
-            "DROP TABLE dead_objects; ALTER TABLE review_frames DROP COLUMN object;"
-            "ALTER TABLE frames DROP COLUMN object, DROP COLUMN object_size, DROP COLUMN object_digest;"
-            "ALTER TABLE placerec DROP COLUMN objects, DROP COLUMN swept, DROP COLUMN listed;"
-            "UPDATE placerec SET version = 1"
-        )
-    later = connected(servers, servers.bucket)
-    again = later.get("lab")
-    again.enrol([frame("b")])
-    assert [again.picture(name) for name in "ab"] == [image_of("a"), image_of("b")]
-    later.delete("lab")
-    assert later.sweep_objects() == 1
-    later.close()
