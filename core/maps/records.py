@@ -20,8 +20,7 @@ Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
 Precision = Literal["half", "compressed"]
 
-TierSetting = Literal["auto", "exact", "compact", "inverted"]
-"""``inverted``, which settings of earlier versions may have, is another name of ``compact``."""
+TierSetting = Literal["auto", "exact", "compact"]
 
 COMPACT_FROM = 256
 """From so many places on codes are used; with fewer all are compared in less than a millisecond."""
@@ -77,8 +76,8 @@ class MapSettings(BaseModel):
     )
     index: TierSetting = Field(
         default="auto",
-        description="How the map is searched: every place compared (exact), by codes (compact; inverted, a former "
-        f"tier, is another name of it), or by what suits its size (auto): compact from {COMPACT_FROM} places.",
+        description="How the map is searched: every place compared (exact), by codes (compact), or by "
+        f"what suits its size (auto): compact from {COMPACT_FROM} places.",
     )
     review: ReviewSetting | None = Field(
         default=None, description="Which frames are kept to be reviewed by people; null: none."

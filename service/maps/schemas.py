@@ -162,7 +162,7 @@ class MapChanges(BaseModel):
     verification: bool | None = Field(strict=True, default=None)
     index: TierSetting | None = Field(
         default=None,
-        description=f"auto, exact or compact (auto from {COMPACT_FROM} places on); inverted is compact.",
+        description=f"auto, exact or compact (auto from {COMPACT_FROM} places on).",
     )
     review: ReviewChanges | None = Field(default=None, description="null: no frames are kept from now on.")
     calibration: CalibrationChanges | None = None

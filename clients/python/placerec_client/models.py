@@ -802,7 +802,7 @@ class Recall(Model):
 class IndexStatus(Model):
     """How a map is searched now, and how it will be."""
 
-    setting: Known[Literal["auto", "exact", "compact", "inverted"]]
+    setting: Known[Literal["auto", "exact", "compact"]]
     tier: Known[Literal["exact", "compact"]]
     wanted: Known[Literal["exact", "compact"]]
     state: Known[Literal["ready", "building", "unopened"]]

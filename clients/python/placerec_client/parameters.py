@@ -740,9 +740,9 @@ class NewMap(TypedDict, total=False):
     from then on.
     """
 
-    index: Literal["auto", "exact", "compact", "inverted"]
-    """How the map is searched: every place compared (exact), by codes (compact; inverted, a former tier, is another
-    name of it), or by what suits its size (auto): compact from 256 places.
+    index: Literal["auto", "exact", "compact"]
+    """How the map is searched: every place compared (exact), by codes (compact), or by what suits its size (auto):
+    compact from 256 places.
     """
 
     review: ReviewSetting | None
@@ -768,8 +768,8 @@ class MapChanges(TypedDict, total=False):
 
     verification: bool | None
 
-    index: Literal["auto", "exact", "compact", "inverted"] | None
-    """auto, exact or compact (auto from 256 places on); inverted is compact."""
+    index: Literal["auto", "exact", "compact"] | None
+    """auto, exact or compact (auto from 256 places on)."""
 
     review: ReviewChanges | None
     """null: no frames are kept from now on."""

@@ -343,7 +343,7 @@ def _choose_edit(random: Random, world: World, name: str, there: list[str], free
     changes: dict[str, Any] = random.choice([
         {"description": f"number {random.randrange(1000)}"},
         {"keep": random.choice(["none", "thumbnail", "image"])},
-        {"index": random.choice(["exact", "compact", "inverted", "auto"])},
+        {"index": random.choice(["exact", "compact", "auto"])},
     ])  # fmt: skip
     return {"do": "edit", "map": name, "changes": changes}
 

@@ -216,7 +216,7 @@ def chosen(random: Random, world: World, prefix: str) -> Operation:
 def _new_map(random: Random, name: str, unlisted: bool) -> Operation:
     settings = {
         "keep": random.choice(["none", "thumbnail", "image"]),
-        "index": random.choice(["auto", "exact", "compact", "inverted"]),
+        "index": random.choice(["auto", "exact", "compact"]),
     }
     precision = random.choice(["half", "half", "compressed"])
     return {"do": "create", "map": name, "settings": settings, "precision": precision, "unlisted": unlisted}
@@ -307,8 +307,8 @@ def _edited(random: Random, world: World, name: str, listed: list[str]) -> Opera
         {"description": f"number {random.randrange(1000)}"},
         {"keep": random.choice(["none", "thumbnail", "image"])},
         {"same_place_radius": float(random.randrange(9)), "same_place_frames": random.randrange(9)},
-        {"index": random.choice(["exact", "compact", "inverted", "auto"])},
-        {"index": random.choice(["exact", "compact", "inverted"])},
+        {"index": random.choice(["exact", "compact", "auto"])},
+        {"index": random.choice(["exact", "compact"])},
         {"verification": random.random() < 0.7},
     ])  # fmt: skip
     return {"do": "edit", "map": name, "changes": changes}

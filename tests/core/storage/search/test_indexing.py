@@ -167,12 +167,6 @@ def test_codes_are_joined_while_the_map_grows(atlas: Atlas, directory: Path, mon
     again.close()
 
 
-def test_an_older_name_of_a_tier(atlas: Atlas) -> None:
-    lab = make(atlas, index="inverted")
-    status = settled(lab)
-    assert (status.setting, status.tier, status.wanted) == ("inverted", "compact", "compact")
-
-
 def test_places_in_memory_are_ranked_by_their_codes_too(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
     lab = make(atlas)

@@ -22,7 +22,6 @@ from tests.core.storage.frames import ENCODER, frame
         ("auto", 10**7, "exact", "compact"),
         ("compact", 1, "exact", "compact"),
         ("compact", 0, "compact", "exact"),
-        ("inverted", 5, "exact", "compact"),
         ("exact", 10**7, "compact", "exact"),
     ],
 )
@@ -41,7 +40,6 @@ def test_the_tier_follows_setting_and_size(setting: TierSetting, places: int, pr
         ("exact", 10**7, False, True),
         ("compact", 5, True, False),
         ("compact", 0, False, True),
-        ("inverted", 5, True, False),
     ],
 )
 def test_what_is_in_memory_follows_setting_and_size(
