@@ -18,7 +18,7 @@ class AgreementDefinition(Model):
     are the first of the ranking or, if more places are ``screened``, the most promising of these. ``centred`` is the
     share of its mean over the frame that each value of a cell loses before it is divided by its deviation over the
     frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own, others those of the
-    regions. Encoders of 0.1.0 have none of the three.
+    regions. Encoders of other people's networks have none of the three.
     """
 
     layers: list[str]
