@@ -71,7 +71,7 @@ INFLATION = 1.5
 FOCAL, FOCAL_DEVIATION = 0.741, 0.35
 """Focal length over the longer side where it is not known, a field of view of 68 degrees, and the deviation of its
 logarithm: two deviations are fields of 37 and 107 degrees."""
-LEAST_AGREEMENT = 0.5
+LEAST_COSINE = 0.5
 """Cosine between most directions of the two cameras, turned: an essential matrix fits some answers with points behind a
 camera as well, in which they are opposed."""
 MOST_SHIFT = 3.0
@@ -196,7 +196,7 @@ def view_of_bearings(place: Array, query: Array, pixel: float) -> RelativeView |
     views = []
     for criterion, fit in sorted(zip(criteria, fits, strict=True), key=lambda pair: pair[0]):
         weight = float(np.exp((min(criteria) - criterion) / (2 * TEMPERATURE)))
-        if weight > NEGLIGIBLE and np.median((q @ fit.rotation * p).sum(axis=1)) > LEAST_AGREEMENT:
+        if weight > NEGLIGIBLE and np.median((q @ fit.rotation * p).sum(axis=1)) > LEAST_COSINE:
             view = _view(p, q, fit, _noise(p, q, fit, pixel))
             views += [(weight, view)] if view.inliers >= LEAST_INLIERS else []
     return _mixture(views) if views else None

@@ -177,7 +177,7 @@ class Runtime:
         if self.settings.objects is not None:
             checks["pictures"] = await self._check_pictures()
         if self.shared is not None:
-            checks["others"] = self.shared.agreement.state
+            checks["others"] = self.shared.differences.state
         if bad:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks

@@ -7,7 +7,7 @@ import gc
 import logging
 import threading
 import time
-from collections.abc import AsyncGenerator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass, field
 
@@ -28,13 +28,12 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
-from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders
-from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
+from service.engine.encoders import Encoded, MakeEncoders
+from service.engine.queue import EncoderQueue, RequestDeadline
 from service.engine.rehearsal import rehearse
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Answered, Searches, search_ahead
 from service.engine.stores import OpenStore
-from service.errors.faults import EncoderNotInstalled
 from service.events.events import Events
 from service.settings import Settings
 from service.telemetry.metrics import MapCollector, Metrics
@@ -205,10 +204,7 @@ class Engine:
             EncoderNotInstalled: the map's encoder is not installed.
             InvalidModel: its files are damaged.
         """
-        try:
-            return asyncio.run_coroutine_threadsafe(self.queue.load(map_.record.encoder), self.loop).result()
-        except UnknownEncoder as error:
-            raise EncoderNotInstalled(str(error)) from error
+        return asyncio.run_coroutine_threadsafe(self.queue.load(map_.record.encoder), self.loop).result()
 
     def resolve(self, name_or_identity: str | None) -> str:
         """The identity of an encoder, given its name or identity; that of the default encoder for None.
@@ -230,32 +226,6 @@ class Engine:
         found = self.maps.opened(map_id)
         return found if found is not None else await in_thread(self.maps.get, map_id)
 
-    async def encode_for(
-        self,
-        map_: Map,
-        data: bytes,
-        deadline: RequestDeadline,
-        mask: Mask | None = None,
-        after_encoding: AfterEncoding | None = None,
-        keypoints: bool = False,
-        features: bool = False,
-    ) -> Encoded:
-        """Encode a frame with a map's encoder; call it within ``queue.place``.
-
-        Args:
-            keypoints, features: whether the frame's keypoints, or the features of its regions, are wanted, too.
-
-        Raises:
-            EncoderNotInstalled: the map's encoder is not installed.
-            Others: see ``EncoderQueue.encode``.
-        """
-        try:
-            return await self.queue.encode(
-                map_.record.encoder, data, deadline, mask, after_encoding, keypoints, features
-            )
-        except UnknownEncoder as error:
-            raise EncoderNotInstalled(str(error)) from error
-
     async def ask(self, map_: Map, data: bytes, question: Question, deadline: RequestDeadline) -> Answered:
         """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, verify, judge.
 
@@ -266,39 +236,14 @@ class Engine:
             UnknownCamera: the map has no camera of the question's name.
             QueueFull: too many requests are waiting.
             StorageFailure: the map's files cannot be read.
-            Others: see ``encode_for``.
+            Others: see ``EncoderQueue.encode``.
         """
         mask = await camera_mask(map_, question.camera)
+        ahead = search_ahead(map_, question)
         with self.queue.place():
-            frame = await self.encode_for(
-                map_, data, deadline, mask, search_ahead(map_, question), features=question.explain
-            )
+            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, features=question.explain)
         (answered,) = await self.searches.answer(map_, [frame], question)
         return answered
-
-    async def encode_many(
-        self,
-        identity: str,
-        frames: Sequence[bytes],
-        deadline: RequestDeadline,
-        masks: Sequence[Mask | None] | None = None,
-        keypoints: bool = False,
-    ) -> AsyncGenerator[Outcomes]:
-        """Encode many frames by ``EncoderQueue.encode_many``; close the generator (``contextlib.aclosing``).
-
-        Args:
-            identity: the identity of the map's encoder.
-            keypoints: whether the frames' keypoints are wanted, too.
-
-        Raises:
-            EncoderNotInstalled: the encoder is not installed.
-        """
-        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
-            try:
-                async for some in outcomes:
-                    yield some
-            except UnknownEncoder as error:
-                raise EncoderNotInstalled(str(error)) from error
 
     async def encode_all(
         self,
@@ -317,7 +262,7 @@ class Engine:
             EncoderNotInstalled: the encoder is not installed.
         """
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many(identity, frames, deadline, masks)) as outcomes:
+        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_scaled)

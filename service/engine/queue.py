@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from core.errors import UnknownEncoder
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
@@ -19,7 +20,7 @@ from core.method.encoder import Encoder
 from core.threads import share_cores
 from service.engine.encoder_threads import EncoderThreads
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders, QueuedFrame, deadline_exceeded
-from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
+from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
 from service.telemetry.metrics import Metrics
 
 __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadline"]
@@ -115,7 +116,7 @@ class EncoderQueue:
         """The encoder of an identity; it is loaded, and checked against its golden values, when it is first used.
 
         Raises:
-            UnknownEncoder: no encoder of this identity is installed.
+            EncoderNotInstalled: no encoder of this identity is installed.
             InvalidModel: its files are damaged, or it does not reproduce its golden values on this machine.
         """
         if identity in self._loaded:
@@ -124,7 +125,10 @@ class EncoderQueue:
 
     def _load(self, identity: str) -> Encoder:
         if identity not in self._loaded:
-            encoder = self._catalogue.get(identity)
+            try:
+                encoder = self._catalogue.get(identity)
+            except UnknownEncoder as error:
+                raise EncoderNotInstalled(str(error)) from error
             encoder.check_golden()
             self._loaded[identity] = encoder
         return self._loaded[identity]
@@ -162,7 +166,7 @@ class EncoderQueue:
         Raises:
             DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
             InvalidImage: the frame cannot be decoded.
-            UnknownEncoder, InvalidModel: see ``load``.
+            EncoderNotInstalled, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
         frame = QueuedFrame(

@@ -139,10 +139,7 @@ async def calibrate_map(
     known: list[KnownFrame] = []
     if order.method == "labels" and not order.background:
         known, encodings = await _encode_known(engine, map_, deadline)
-    try:
-        encoder = await in_thread(engine.catalogue.get, map_.record.encoder)
-    except errors.UnknownEncoder as error:
-        raise EncoderNotInstalled(str(error)) from error
+    encoder = await engine.queue.load(map_.record.encoder)
     request.state.noted = {"map": map_id, "method": order.method}
     if order.background:
         arguments, maps = job_arguments(map_, order, expected), {map_id: creation_time(map_)}

@@ -125,7 +125,7 @@ async def enrol(
             masks = [frames[i].mask for i in new]
             identity, keypoints = map_.record.encoder, map_.record.verification
             with engine.queue.place(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many(identity, bodies, deadline, masks, keypoints)) as outcomes:
+                async with aclosing(engine.queue.encode_many(identity, bodies, deadline, masks, keypoints)) as outcomes:
                     async for some in outcomes:
                         encoded = {new[index]: outcome for index, outcome in some}
                         # Thumbnails are made, and pixels freed, while the encoder works at the next frames.

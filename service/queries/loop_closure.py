@@ -145,7 +145,9 @@ async def query_or_enrol(
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
     with engine.queue.place():
-        encoded = await engine.encode_for(map_, data, deadline, mask, keypoints=map_.record.verification)
+        encoded = await engine.queue.encode(
+            map_.record.encoder, data, deadline, mask, keypoints=map_.record.verification
+        )
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:

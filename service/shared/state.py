@@ -8,9 +8,9 @@ from service.jobs.jobs import Jobs
 from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings
-from service.shared.agreement import Agreement
 from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
+from service.shared.differences import ReplicaDifferences
 from service.shared.events import SharedEvents
 from service.shared.jobs import SharedJobs
 from service.shared.replica import ServiceReplica
@@ -29,8 +29,8 @@ class SharedState:
     def __init__(self, settings: Settings, database: SharedDatabase, shared_maps: bool) -> None:
         self._settings, self._shared_maps = settings, shared_maps
         self.replica = ServiceReplica(database, settings.data_dir)
-        self.agreement = Agreement(settings, database, self.replica.id)
-        self.replica.every(self.agreement.compare)
+        self.differences = ReplicaDifferences(settings, database, self.replica.id)
+        self.replica.every(self.differences.compare)
         self.audit = AuditTable(database, self.replica.id)
         self.events = SharedEvents(self.replica, settings.event_listeners)
 

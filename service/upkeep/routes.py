@@ -135,10 +135,7 @@ async def check_health(
     counts.
     """
     map_ = await engine.map(map_id)
-    try:
-        encoder = await engine.queue.load(map_.record.encoder)
-    except errors.UnknownEncoder as error:
-        raise EncoderNotInstalled(str(error)) from error
+    encoder = await engine.queue.load(map_.record.encoder)
     counted = await in_thread(statistics.read, map_key(map_))
     examine = partial(examine_health, map_, encoder, counted, options.seconds, options.limit)
     return await to_thread.run_sync(examine, limiter=one_at_a_time)

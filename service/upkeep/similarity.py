@@ -126,10 +126,7 @@ async def compare_traverses(
     that the picture after the JSON costs nothing.
     """
     map_ = await engine.map(map_id)
-    try:
-        encoder = await engine.queue.load(map_.record.encoder)
-    except errors.UnknownEncoder as error:
-        raise EncoderNotInstalled(str(error)) from error
+    encoder = await engine.queue.load(map_.record.encoder)
     wanted = preferred(request.headers.get("accept"), JSON, PNG, OCTETS)
     most = engine.settings.max_similarity_pairs
 

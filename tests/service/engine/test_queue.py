@@ -13,12 +13,12 @@ from statistics import median
 import httpx
 import pytest
 
-from core.errors import NotAnImage, UnknownEncoder
+from core.errors import NotAnImage
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from service.engine.queue import EncoderQueue, RequestDeadline
-from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
+from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
 from service.telemetry.metrics import Metrics
 from tests.service.engine.busy import keep_busy
 from tests.service.scenes import encoded, jpeg, scene
@@ -126,9 +126,9 @@ async def test_a_poisoned_frame_fails_alone(queue: EncoderQueue) -> None:
 
 
 async def test_an_encoder_that_is_not_there(queue: EncoderQueue) -> None:
-    with pytest.raises(UnknownEncoder):
+    with pytest.raises(EncoderNotInstalled):
         await queue.load("absent")
-    with pytest.raises(UnknownEncoder):
+    with pytest.raises(EncoderNotInstalled):
         await queue.encode("absent", jpeg(1), deadline())
 
 

@@ -56,7 +56,7 @@ CLOCK_SECONDS = 2.0
 log = logging.getLogger("placerec.shared")
 
 
-class Agreement:
+class ReplicaDifferences:
     """Tells the other services what this one has, and compares it with what they have.
 
     state: "ok", or what differs, in a sentence.

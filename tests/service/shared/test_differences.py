@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from service.settings import Settings
-from service.shared.agreement import COMMON, Agreement
 from service.shared.database import SharedDatabase
+from service.shared.differences import COMMON, ReplicaDifferences
 from service.shared.replica import FILE, ServiceReplica
 from tests.service.encoders import COARSE, install_two_stage_encoder
 from tests.service.server import Server
@@ -36,9 +36,9 @@ def test_differences_are_told_until_they_end(database: SharedDatabase, tmp_path:
         replica = ServiceReplica(database, tmp_path / name)
         given = Settings(data_dir=tmp_path / name, rate_per_key=rate, models_dir=models)
         replicas.append(replica)
-        services.append(Agreement(given, database, replica.id))
+        services.append(ReplicaDifferences(given, database, replica.id))
 
-    def until(service: Agreement, text: str, telling: list[ServiceReplica]) -> None:
+    def until(service: ReplicaDifferences, text: str, telling: list[ServiceReplica]) -> None:
         ends = time.monotonic() + 60
         while text not in service.state:
             assert time.monotonic() < ends, service.state
