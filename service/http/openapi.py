@@ -228,6 +228,16 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
 
 
+def _share_problems(operation: dict[str, Any], shared: dict[str, Any]) -> None:
+    """Move an operation's responses that are problems to ``shared``, under a name made of the kinds of problem."""
+    for status, response in operation["responses"].items():
+        problems = response.get("content", {}).get(MEDIA_TYPE)
+        if problems is not None and len(response["content"]) == 1:
+            name = ".".join(problems.get("examples", {"problem": None}))
+            assert shared.setdefault(name, response) == response, name
+            operation["responses"][status] = {"$ref": f"#/components/responses/{name}"}
+
+
 def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
     """The application's OpenAPI document; it is made once and kept.
 
@@ -252,11 +262,14 @@ def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, 
             schemas[model.__name__] = described
         made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
         made["components"]["examples"] = problem_examples()
+        shared: dict[str, Any] = {}
+        made["components"]["responses"] = shared
         made["components"]["securitySchemes"] = {"key": SECURITY_SCHEME}
         for unused in ("HTTPValidationError", "ValidationError"):
             schemas.pop(unused, None)
         for path, item in made["paths"].items():
             for operation in item.values():
                 _complete(path, operation)
+                _share_problems(operation, shared)
         app.openapi_schema = made
     return app.openapi_schema

@@ -58,10 +58,11 @@ def test_operation_ids_are_those_that_clients_were_made_from(operations: dict[st
     assert set(operations) == OPERATIONS
 
 
-def test_every_operation_is_described(operations: dict[str, dict[str, Any]]) -> None:
+def test_every_operation_is_described(described: dict[str, Any], operations: dict[str, dict[str, Any]]) -> None:
+    assert "application/problem+json" in described["components"]["responses"]["problem"]["content"]
     for name, operation in operations.items():
         assert operation["description"] and operation["tags"], name
-        assert "application/problem+json" in operation["responses"]["default"]["content"], name
+        assert operation["responses"]["default"] == {"$ref": "#/components/responses/problem"}, name
         for parameter in operation.get("parameters", []):
             assert parameter.get("description") or parameter["schema"].get("description"), (name, parameter["name"])
 
@@ -84,6 +85,23 @@ def test_problems_are_declared_by_status(operations: dict[str, dict[str, Any]]) 
     assert {"200", "201", "400", "404", "409", "413", "415", "422", "503", "507"} <= declared["enrol_place"]
     assert {"200", "400", "404", "409", "413", "415", "422", "503"} <= declared["query"]
     assert "412" in declared["edit_map"] and "409" in declared["create_map"]
+
+
+def test_each_answer_that_is_a_problem_is_written_once(
+    described: dict[str, Any], operations: dict[str, dict[str, Any]]
+) -> None:
+    shared = described["components"]["responses"]
+    seen = set()
+    for name, operation in operations.items():
+        for status, response in operation["responses"].items():
+            if "$ref" not in response:
+                assert set(response.get("content", {})) != {"application/problem+json"}, (name, status)
+                continue
+            component = response["$ref"].rpartition("/")[2]
+            seen.add(component)
+            for example in shared[component]["content"]["application/problem+json"].get("examples", {}):
+                assert described["components"]["examples"][example]["value"]["status"] == int(status), (name, example)
+    assert seen == set(shared)
 
 
 def test_every_reference_leads_somewhere(described: dict[str, Any]) -> None:
