@@ -169,7 +169,7 @@ def main(
         ways[name] = (back_by_faiss, cells), size + pack_local(known[1][:1], COMPRESSED).nbytes, products
 
     figures: dict[str, dict[str, float]] = {}
-    exact = [np.empty(0)] * 3
+    exact: list[NDArray[Any]] = []
     for name, (back, size, products) in ways.items():
         scores = asked[0] @ back[0].T
         first, both = chosen.scores_from_inner_products(scores), score_matrix(chosen, scores, asked[1], back[1])
