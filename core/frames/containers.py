@@ -3,6 +3,13 @@
 Everything is read from the bytes alone and before any decoding, so that a picture of a billion pixels costs as little
 to refuse as a small one to accept.  The walks read a file as its decoder does: PNG and WebP files to their end, JPEG
 files to their first scan, because only decoding shows whether the rest is there (``core.frames.jpeg``).
+
+Libraries do not replace them.  Of 10 800 damaged pictures, 2 830 are taken for what they are not, one of which lost its
+end; with Pillow's header in place of the walks there are as many, by OpenCV alone 5 378, by Pillow alone 5 668
+(``python -m benchmarks.pictures.damaged``).  But Pillow bounds no parts: 16 MiB of empty segments or chunks take it 5.4
+or 3.6 s where the walks take 0.02, empty scans of 40 megapixels 7.4 s, and a sound PNG 2.9 ms instead of 1.5, since it
+decodes the picture to find its orientation.  OpenCV bounds no pixels: 2.7 GB for a PNG of 900 megapixels
+(``python -m benchmarks.pictures.hostile``).
 """
 
 from __future__ import annotations
