@@ -4,15 +4,27 @@
 
 Queries are never kept and stay float32; references go through the storage's own packing and back.  ``first`` is
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another
-reference is the best, and ``deviation`` by how much a first-stage score differs at most.
+reference is the best of the first stage, and of both, ``deviation`` by how much a first-stage score differs at most,
+and ``error`` how long the differences of the descriptors are, by the length of the descriptors.  ``products`` is the
+median time of the products of a query with 100 descriptors as they are kept, on one thread.
+
+Beside them are FAISS's six bits a value, of a range that is fixed from the first row on, so that no row depends on a
+later one: ±1; each value's range in the first 100 rows; ±1 of each row's largest value; ±1 of the largest of each 128,
+which is what the storage does, and for which FAISS has products only with what it has unpacked.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from statistics import median
+from typing import Annotated, Any, Literal, get_args
 
+import faiss
 import numpy as np
+import torch
 import typer
 from numpy.typing import NDArray
 
@@ -24,10 +36,23 @@ from core.maps.records import Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.stages import score_matrix
-from core.storage.files.row_formats import pack_descriptors, pack_local, unpack_descriptors, unpack_local
+from core.storage.files.row_formats import (
+    BLOCK,
+    COMPRESSED,
+    inner_products,
+    pack_descriptors,
+    pack_local,
+    unpack_descriptors,
+    unpack_local,
+)
 
 Side = tuple[NDArray[np.float32], NDArray[np.int8]]
 """Descriptors float32 [n, D] and local descriptors int8 [n, C, L]."""
+Array = NDArray[np.float32]
+Products = Callable[[Array], Array]
+"""The products of queries, float32 [B, D], with rows that are kept: float32 [B, n]."""
+
+MOST_TIMED, REPEATS = 100, 60
 
 
 def encoded(encoder: Encoder, folder: Path) -> Side:
@@ -60,6 +85,67 @@ def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side
     return back, kept[0].nbytes + kept_local[0].nbytes
 
 
+def faiss_index(low: Array, high: Array) -> faiss.IndexScalarQuantizer:
+    """An index of six bits a value whose ranges, float32 [D], are what is given."""
+    index = faiss.IndexScalarQuantizer(len(low), faiss.ScalarQuantizer.QT_6bit, faiss.METRIC_INNER_PRODUCT)
+    faiss.copy_array_to_vector(np.concatenate([low, high - low]), index.sq.trained)
+    index.is_trained = True
+    return index
+
+
+def by_faiss(rows: Array, low: Array, high: Array, scales: Array) -> tuple[Array, int, Products]:
+    """What comes back of rows, float32 [n, D], bytes a row, and products with the first rows in their codes.
+
+    Args:
+        scales: float32 [n, D / d], by which d values each are divided before; low, high: float32 [d].
+    """
+    index, values = faiss_index(low, high), len(low)
+    parts = rows.reshape(-1, values) / scales.reshape(-1, 1)
+    codes = index.sa_encode(parts)
+    back = (index.sa_decode(codes) * scales.reshape(-1, 1)).reshape(rows.shape)
+    timed = codes[: MOST_TIMED * scales.shape[1]]
+    factors = scales[:MOST_TIMED].reshape(-1, 1)
+
+    def products(queries: Array) -> Array:
+        if scales.shape[1] > 1:
+            return queries @ (index.sa_decode(timed) * factors).reshape(-1, rows.shape[1]).T
+        index.reset()
+        index.add_sa_codes(timed)
+        found, where = index.search(queries, len(timed))
+        made = np.empty_like(found)
+        np.put_along_axis(made, where, found, axis=1)
+        return made * factors.T
+
+    scaled = bool((scales != 1).any())  # in half precision, as the storage keeps its own
+    return back, scales.shape[1] * (codes.shape[1] + 2 * scaled), products
+
+
+def variants_of_faiss(rows: Array) -> dict[str, tuple[Array, int, Products]]:
+    """FAISS's six bits of rows, by the range of values."""
+    n, dimension = rows.shape
+    ones, single, first = np.ones(dimension, np.float32), np.ones((n, 1), np.float32), rows[:100]
+    largest = np.abs(rows).max(axis=1, keepdims=True)
+    found = {
+        "FAISS, ±1": by_faiss(rows, -ones, ones, single),
+        "FAISS, first 100 rows": by_faiss(rows, first.min(axis=0), first.max(axis=0), single),
+        "FAISS, a scale a row": by_faiss(rows, -ones, ones, largest),
+    }
+    if dimension % BLOCK == 0:
+        blocks = np.maximum(np.abs(rows).reshape(n, -1, BLOCK).max(axis=2), np.float32(1e-9))
+        found["FAISS, a scale a block"] = by_faiss(rows, -ones[:BLOCK], ones[:BLOCK], blocks)
+    return found
+
+
+def milliseconds(products: Products, queries: Array) -> float:
+    """The median time of one query's products, of some queries one after the other."""
+    taken = []
+    for number in range(REPEATS):
+        began = time.perf_counter()
+        products(queries[number % len(queries)][np.newaxis])
+        taken.append(1000 * (time.perf_counter() - began))
+    return median(taken)
+
+
 def main(
     queries: Path,
     references: Path,
@@ -71,29 +157,53 @@ def main(
     chosen = EncoderCatalogue().get(encoder)
     asked, known = sides(chosen, queries, references, cache)
     truth = read_ground_truth(truth_file, len(asked[0]), len(known[0]))
-    figures: dict[str, dict[str, float]] = {}
-    exact_first = exact_best = None
+    faiss.omp_set_num_threads(1)
+    torch.set_num_threads(1)
+    ways: dict[str, tuple[Side, int, Products]] = {}
     for precision in ("float32", *get_args(Precision)):
         back, size = at_rest(known, precision)
-        products = asked[0] @ back[0].T
-        first = chosen.scores_from_inner_products(products)
-        both = score_matrix(chosen, products, asked[1], back[1])
-        if exact_first is None or exact_best is None:
-            exact_first, exact_best = first, both.argmax(axis=1)
-        figures[precision] = {
+        some = known[0][:MOST_TIMED] if precision == "float32" else pack_descriptors(known[0][:MOST_TIMED], precision)
+        ways[precision] = back, size, partial(_products, some, precision)
+    cells = at_rest(known, COMPRESSED)[0][1]
+    for name, (back_by_faiss, size, products) in variants_of_faiss(known[0]).items():
+        ways[name] = (back_by_faiss, cells), size + pack_local(known[1][:1], COMPRESSED).nbytes, products
+
+    figures: dict[str, dict[str, float]] = {}
+    exact: list[NDArray[Any]] = []
+    for name, (back, size, products) in ways.items():
+        scores = asked[0] @ back[0].T
+        first, both = chosen.scores_from_inner_products(scores), score_matrix(chosen, scores, asked[1], back[1])
+        if not figures:
+            exact = [first, first.argmax(axis=1), both.argmax(axis=1)]
+        figures[name] = {
             "bytes": size,
             "first": area(first, truth),
             "both": area(both, truth),
-            "changed": int((both.argmax(axis=1) != exact_best).sum()),
-            "deviation": float(np.abs(first - exact_first).max()),
+            "changed_first": int((first.argmax(axis=1) != exact[1]).sum()),
+            "changed_both": int((both.argmax(axis=1) != exact[2]).sum()),
+            "deviation": float(np.abs(first - exact[0]).max()),
+            "error": float(np.linalg.norm(back[0] - known[0]) / np.linalg.norm(known[0])),
+            "products_ms": milliseconds(products, asked[0]),
         }
     rows = [
-        (name, one["bytes"], f"{one['first']:.4f}", f"{one['both']:.4f}", one["changed"], f"{one['deviation']:.6f}")
+        (
+            name,
+            one["bytes"],
+            *(f"{one[column]:.4f}" for column in ("first", "both")),
+            f"{one['changed_first']}, {one['changed_both']}",
+            *(f"{one[column]:.4f}" for column in ("deviation", "error", "products_ms")),
+        )
         for name, one in figures.items()
     ]
-    columns = ["precision", "bytes a place", "first, AUC-PR", "both, AUC-PR", "changed", "deviation"]
+    columns = ["precision", "bytes", "first, AUC-PR", "both, AUC-PR", "changed", "deviation", "error", "products, ms"]
     more = {"encoder": chosen.identity, "precisions": figures}
     report("precision", f"{len(asked[0])} queries, {len(known[0])} references", columns, rows, more)
+
+
+def _products(kept: NDArray[Any], precision: str, queries: Array) -> Array:
+    if precision == "float32":
+        return np.asarray(queries @ kept.T)
+    return inner_products(queries, kept, COMPRESSED if precision == COMPRESSED else "half")
 
 
 def area(scores: NDArray[np.float32], truth: Truth) -> float:

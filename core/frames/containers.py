@@ -3,6 +3,13 @@
 Everything is read from the bytes alone and before any decoding, so that a picture of a billion pixels costs as little
 to refuse as a small one to accept.  The walks read a file as its decoder does: PNG and WebP files to their end, JPEG
 files to their first scan, because only decoding shows whether the rest is there (``core.frames.jpeg``).
+
+Libraries do not replace them.  Of 10 800 damaged pictures, 2 830 are taken for what they are not, one of which lost its
+end; with Pillow's header in place of the walks there are as many, by OpenCV alone 5 378, by Pillow alone 5 668
+(``python -m benchmarks.pictures.damaged``).  But Pillow bounds no parts: 16 MiB of empty segments or chunks take it 5.4
+or 3.6 s where the walks take 0.02, empty scans of 40 megapixels 7.4 s, and a sound PNG 2.9 ms instead of 1.5, since it
+decodes the picture to find its orientation.  OpenCV bounds no pixels: 2.7 GB for a PNG of 900 megapixels
+(``python -m benchmarks.pictures.hostile``).
 """
 
 from __future__ import annotations
@@ -236,8 +243,6 @@ def _read_png_header(data: bytes) -> Header:
     if data[8:16] != b"\0\0\0\x0dIHDR":
         raise NotAnImage("The PNG file is damaged: it does not begin with its header.")
     width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    if max(width, height) >= 2**31:
-        raise NotAnImage(f"The PNG header announces {width}x{height} pixels.")
     return Header("png", width, height)
 
 
@@ -265,13 +270,9 @@ def _walk_png(data: bytes) -> Iterator[_Chunk]:
 
 
 def _check_png(data: bytes) -> Structure:
-    exif, headers, filled, all_needed = None, 0, False, True
+    exif, all_needed = None, True
     needed: list[tuple[int, int]] = [(0, len(PNG_SIGNATURE))]
     for chunk in _walk_png(data):
-        headers += chunk.kind == b"IHDR"
-        filled = filled or (chunk.kind == b"IDAT" and chunk.end > chunk.start)
-        if headers > 1:
-            raise NotAnImage("The PNG file is damaged: it has two headers.")
         if chunk.kind == b"acTL":
             raise UnsupportedFormat("The PNG file is an animation; send one frame.")
         if chunk.kind == b"eXIf" and exif is None:
@@ -280,8 +281,6 @@ def _check_png(data: bytes) -> Structure:
             all_needed = False
         else:
             needed.append((chunk.start - 8, chunk.end + 4))
-    if not filled:
-        raise NotAnImage("The PNG file is damaged: it has no image data.")
     return Structure(_bare(exif), needed=() if all_needed else tuple(needed))
 
 
@@ -333,11 +332,8 @@ def _read_webp_header(data: bytes) -> Header:
 
 
 def _check_webp(data: bytes) -> bytes | None:
-    exif, filled = None, False
+    exif = None
     for chunk in _walk_webp(data):
-        filled = filled or chunk.kind in (b"VP8 ", b"VP8L")
         if chunk.kind == b"EXIF" and exif is None:
             exif = data[chunk.start : chunk.end]
-    if not filled:
-        raise NotAnImage("The WebP file is damaged: it has no image data.")
     return exif

@@ -2,6 +2,10 @@
 
 An EXIF block is a small TIFF file.  Cameras and editors write many that are broken; tags that cannot be read count as
 absent, and no block raises an error.
+
+Pillow's reader takes 0.7 s for the overlapping tags of a block of 1 MiB (``python -m benchmarks.pictures.hostile``),
+and this one 0.2 ms, for it reads 512 tags and 1 024 bytes of each at most.  For an ordinary block Pillow takes 0.1 ms
+instead of 0.02, and importing it takes 12 MB.
 """
 
 from __future__ import annotations

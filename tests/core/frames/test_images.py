@@ -270,10 +270,24 @@ def test_texts_and_profiles_of_a_png_do_not_reach_the_decoder(capfd: pytest.Capt
     assert "forged" not in capfd.readouterr().err
 
 
-def test_two_png_headers_are_refused() -> None:
+@pytest.mark.parametrize("place", [33, -12])
+@pytest.mark.parametrize("size", [(20, 12), (20_000, 20_000)])
+def test_two_png_headers_are_refused(place: int, size: tuple[int, int]) -> None:
     data = encoded("png")
-    with pytest.raises(NotAnImage, match="two headers"):
-        decode(data[:33] + png_header(20_000, 20_000) + data[33:])
+    with pytest.raises(NotAnImage):
+        decode(data[:place] + png_header(*size) + data[place:])
+
+
+@pytest.mark.parametrize("chunks", [b"", png_chunk(b"IDAT", b"")])
+def test_a_png_without_image_data_is_damaged(chunks: bytes) -> None:
+    with pytest.raises(NotAnImage):
+        decode(PNG_SIGNATURE + png_header(40, 24) + chunks + png_chunk(b"IEND", b""))
+
+
+def test_a_webp_without_image_data_is_damaged() -> None:
+    canvas = b"VP8X" + (10).to_bytes(4, "little") + bytes(4) + bytes([39, 0, 0, 23, 0, 0])
+    with pytest.raises(NotAnImage):
+        decode(b"RIFF" + (4 + len(canvas)).to_bytes(4, "little") + b"WEBP" + canvas)
 
 
 def test_a_webp_canvas_of_another_size_than_its_picture_is_refused() -> None:

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from safetensors.numpy import save_file
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
-from core.networks.xfeat import CELL, LENGTH, PACKAGED_XFEAT, XFeat, load_xfeat, tensor_shapes
+from core.networks.onnx_graph import read_graph
+from core.networks.xfeat import CELL, LENGTH, PACKAGED_XFEAT, XFeat, load_xfeat
 from service.commands.timing.samples import sample_frame
 
 BRIGHTEST = [(132, 179), (134, 22), (70, 19), (86, 54), (2, 176), (55, 60), (86, 106), (86, 58)]
@@ -36,10 +35,6 @@ def network() -> XFeat:
 @pytest.fixture(scope="module")
 def frame() -> Pixels:
     return sample_frame(seed=0, width=224, height=160)
-
-
-def zeros() -> dict[str, NDArray[np.float32]]:
-    return {name: np.zeros(shape, np.float32) for name, shape in tensor_shapes().items()}
 
 
 def test_the_maps_are_those_of_the_authors_code(network: XFeat, frame: Pixels) -> None:
@@ -87,24 +82,16 @@ def test_sides_that_are_no_multiples_are_refused(network: XFeat, sides: tuple[in
         network(np.zeros((*sides, 3), np.uint8))
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"block1.0.weight": None}, "lack block1.0.weight"),
-        ({"fusion.2.bias": np.zeros(63, np.float32)}, "has shape"),
-        ({"keypoints.3.bias": np.full(65, np.nan, np.float32)}, "not finite"),
-    ],
-)
-def test_weights_that_cannot_be_are_refused(change: dict[str, NDArray[np.float32] | None], said: str) -> None:
-    weights = {name: tensor for name, tensor in (zeros() | change).items() if tensor is not None}
-    with pytest.raises(InvalidModel, match=said):
-        XFeat(weights)
-
-
-def test_files_that_are_no_such_weights_are_refused(tmp_path: Path) -> None:
-    other, damaged = tmp_path / "other.safetensors", tmp_path / "damaged.safetensors"
-    save_file(zeros(), other)
-    damaged.write_bytes(PACKAGED_XFEAT.read_bytes()[:-1000])
-    for path, said in ((other, "placerec-xfeat/1"), (damaged, "readable"), (tmp_path / "missing", "readable")):
+def test_files_that_are_no_such_network_are_refused(tmp_path: Path) -> None:
+    other, cut, short = tmp_path / "other.onnx", tmp_path / "cut.onnx", tmp_path / "short.onnx"
+    whole = PACKAGED_XFEAT.read_bytes()
+    model = read_graph(whole)
+    model.graph.initializer[-1].dims[0] += 1
+    short.write_bytes(model.SerializeToString())
+    del model.metadata_props[:]
+    other.write_bytes(model.SerializeToString())
+    cut.write_bytes(whole[:-1000])
+    refused = {other: "not a placerec-xfeat/2 file", cut: "ONNX format", short: "of their shape"}
+    for path, said in (refused | {tmp_path / "missing.onnx": "cannot be read"}).items():
         with pytest.raises(InvalidModel, match=said):
             load_xfeat(path)
