@@ -111,10 +111,11 @@ def command_line() -> str:
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Every command below a group that does something, with its full name."""
+    """Every command below a group that does something and is not hidden, with its full name."""
     names = getattr(command, "commands", None)
     if names is None:
-        yield name, command
+        if not command.hidden:
+            yield name, command
         return
     for child in names:
         yield from commands(command.get_command(typer.Context(command), child), f"{name} {child}")

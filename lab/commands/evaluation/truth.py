@@ -29,7 +29,7 @@ class TruthOptions:
         bool,
         _option(
             "--poses",
-            help="By the poses in places.csv of both directories (as for enroll), in file names "
+            help="By the poses in places.csv of both directories (as for enrol), in file names "
             "(@easting@northing@…) or in EXIF data.",
         ),
     ] = False

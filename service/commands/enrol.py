@@ -1,4 +1,4 @@
-"""``placerec enroll``: enrol the frames of a recording as places of a map."""
+"""``placerec enrol``: enrol the frames of a recording as places of a map."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Report:
             self.posed += outcome.posed
 
 
-def enroll(
+def enrol(
     recording: Annotated[
         Path,
         typer.Argument(
@@ -137,7 +137,7 @@ def enroll(
             chosen = chosen if keep_standing else without_standing(opened, chosen, mask)
             return [FrameToSend(taken, name, camera) for taken in chosen]
 
-        report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
+        report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, name, frames, time.monotonic() - began)
     if align:
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
@@ -177,7 +177,7 @@ def _show_aligned(job: dict[str, Any]) -> None:
     )
 
 
-async def _enroll(
+async def _enrol(
     target: CommandTarget,
     map_id: str,
     choose: Callable[[str | None, Mask | None], list[FrameToSend]],
