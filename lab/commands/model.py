@@ -33,7 +33,7 @@ def import_model(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="Of which published network FILE.onnx is: input, output and aggregation.", show_default=False
+            help="The published network that FILE.onnx is: it sets input, output and aggregation.", show_default=False
         ),
     ] = None,
     description: Annotated[

@@ -75,7 +75,7 @@ def enrol(
     ] = None,
     keep: Annotated[
         Literal["none", "thumbnail", "image"] | None,
-        typer.Option(help="What a map that is created keeps of each frame."),
+        typer.Option(help="Pictures that a map that is created stores of each frame."),
     ] = None,
     sequence: Annotated[
         str | None, typer.Option(help="Name of the traverse; default: the name of RECORDING.", show_default=False)
@@ -113,7 +113,7 @@ def enrol(
     (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
     images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
-    shows, as where the robot stood, are left out. What is neither JPEG nor PNG nor WebP is sent as PNG.
+    shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
     """
     options = RecordingOptions(
