@@ -57,12 +57,12 @@ PROTOCOLS = """
 # Protocols
 
 This page is for researchers. It lists the data sets and protocols that `placerec evaluate --dataset NAME --data DIR`
-knows: which traverse is the reference and which the query, what is true, what a query is not matched against, and how
-many images there should be. [Evaluate place recognition](../how-to/evaluate.md) shows how to use them.
+knows: the reference and the query traverse, the truth, the references that a query is not matched against, and the
+number of images. [Evaluate place recognition](../how-to/evaluate.md) shows how to use them.
 
 `DIR` holds the folders of the two traverses, or is any folder of one of the published trees below: the folders above
-those in braces may be left out. A file `ground_truth.csv` with rows `query,reference` beside the traverses says what is
-true in place of the rule. Counts that differ from the published ones are said in a remark.
+those in braces may be left out. A file `ground_truth.csv` with rows `query,reference` beside the traverses gives the
+truth in place of the rule. A remark names counts that differ from the published ones.
 """
 
 PUBLISHED_FIGURES = """
