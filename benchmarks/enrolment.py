@@ -2,7 +2,7 @@
 
     python -m benchmarks.enrolment
 
-The command ``placerec enroll DIR --url`` is run as a user runs it, in a process of its own, and its whole time counts
+The command ``placerec enrol DIR --url`` is run as a user runs it, in a process of its own, and its whole time counts
 but for that of its start, which is measured with a folder of one frame.  Each round takes a new map.  With ``--direct``
 the command opens a data directory itself instead.
 """
@@ -31,9 +31,9 @@ from service.commands.malloc import configure_malloc
 LIMIT = 0.7
 
 
-def enroll(folder: Path, map_id: str, where: list[str], environment: dict[str, str]) -> tuple[float, float]:
+def enrol(folder: Path, map_id: str, where: list[str], environment: dict[str, str]) -> tuple[float, float]:
     """Seconds that the command took, and the most memory that its process has had, in MB (10^6 bytes)."""
-    words = [sys.executable, "-m", "service.commands", "enroll", str(folder), "--map", map_id, "--create", *where]
+    words = [sys.executable, "-m", "service.commands", "enrol", str(folder), "--map", map_id, "--create", *where]
     began = time.perf_counter()
     process = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     peak = 0.0
@@ -43,7 +43,7 @@ def enroll(folder: Path, map_id: str, where: list[str], environment: dict[str, s
     spent = time.perf_counter() - began
     if process.returncode:
         assert process.stderr is not None
-        raise RuntimeError(f"placerec enroll ended with {process.returncode}: {process.stderr.read().decode()[-2000:]}")
+        raise RuntimeError(f"placerec enrol ended with {process.returncode}: {process.stderr.read().decode()[-2000:]}")
     return spent, peak
 
 
@@ -77,9 +77,9 @@ def main(
                 time.sleep(SETTLE)
                 rate = encode_in_batches(chosen, data, 1.0 if turn == 0 else seconds)
                 time.sleep(SETTLE)
-                start, _ = enroll(folder / "one", f"one-{turn}", where, environment)
-                spent, peak = enroll(folder / "all", f"all-{turn}", where, environment)
-                known, _ = enroll(folder / "all", f"all-{turn}", where, environment)
+                start, _ = enrol(folder / "one", f"one-{turn}", where, environment)
+                spent, peak = enrol(folder / "all", f"all-{turn}", where, environment)
+                known, _ = enrol(folder / "all", f"all-{turn}", where, environment)
                 if turn:
                     batched.append(rate)
                     starts.append(start)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.maps.recordings
 
-The recordings take turns, in each round each once.  ``placerec enroll`` is run as a user runs it, its start included.
+The recordings take turns, in each round each once.  ``placerec enrol`` is run as a user runs it, its start included.
 Memory is the most that a process has had which opens a recording and loads every frame.
 """
 
@@ -24,7 +24,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.enrolment import enroll
+from benchmarks.enrolment import enrol
 from benchmarks.frames import camera_frames
 from benchmarks.process import ROOT, median, service
 from benchmarks.report import report
@@ -125,8 +125,8 @@ def main(
             for number in range(rounds):
                 for name, path in paths.items():
                     opened, loaded, _ = read(path)
-                    spent, _ = enroll(path, f"map-{number}-{list(paths).index(name)}", where, environment)
-                    found = {"open": opened, "load": loaded, "enroll": 1e3 * spent / frames}
+                    spent, _ = enrol(path, f"map-{number}-{list(paths).index(name)}", where, environment)
+                    found = {"open": opened, "load": loaded, "enrol": 1e3 * spent / frames}
                     for what, value in found.items():
                         measured[name].setdefault(what, []).append(value)
                     time.sleep(0.5)
@@ -135,7 +135,7 @@ def main(
             measured[name]["peak"] = [read(paths[name])[2]]
             measured[name]["long peak"] = [read(write(longer, repeated))[2]]
     figures = {name: {what: median(values) for what, values in found.items()} for name, found in measured.items()}
-    columns = ("open", "load", "enroll", "peak", "long peak")
+    columns = ("open", "load", "enrol", "peak", "long peak")
     report(
         "recordings",
         f"Recordings of {frames} frames ({content}); milliseconds a frame, peaks in MB, the last of {long} frames",

@@ -33,7 +33,7 @@ def import_model(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="Of which published network FILE.onnx is: input, output and aggregation.", show_default=False
+            help="The published network that FILE.onnx is: it sets input, output and aggregation.", show_default=False
         ),
     ] = None,
     description: Annotated[
@@ -46,7 +46,7 @@ def import_model(
             help="With a preset or a description: pictures that teach and calibrate the encoder; may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of what is learned from the pictures.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the training from the pictures.")] = 0,
     mean: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="A Caffe network's mean file, .npy or .binaryproto.", show_default=False),

@@ -7,7 +7,7 @@ import typer
 from service.commands.bench import bench
 from service.commands.calibrate import calibrate
 from service.commands.console import Commands
-from service.commands.enroll import enroll
+from service.commands.enrol import enrol
 from service.commands.jobs import jobs
 from service.commands.keys import keys
 from service.commands.laboratory import add_laboratory
@@ -25,8 +25,9 @@ application = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (serve, enroll, query, calibrate, bench, settings):
+for command in (serve, enrol, query, calibrate, bench, settings):
     application.command()(command)
+application.command("enroll", hidden=True)(enrol)  # as it is spelt in the United States
 application.add_typer(maps, name="maps")
 application.add_typer(backup, name="backup")
 application.add_typer(jobs, name="jobs")

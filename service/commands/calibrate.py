@@ -150,7 +150,7 @@ def _calibrate_encoder(name: str, pictures: list[Path], models_dir: Path | None,
         highlight=False,
     )
     if found.curve is None:
-        remark("The pictures are all alike, or told apart without a mistake: no probabilities could be fitted.")
+        remark("The pictures are all alike, or distinguished without a mistake: no probabilities could be fitted.")
     if not dry_run:
         remark("A service that has loaded the encoder already keeps the old calibration until it is started again.")
 

@@ -23,10 +23,10 @@ SPAN = re.compile(r"([0-9]{1,6})([mhdw])")
 
 @keys.command("create")
 def create(
-    name: Annotated[str, typer.Argument(help="Whose key it is; the name appears in logs.", show_default=False)],
+    name: Annotated[str, typer.Argument(help="The holder of the key; the name appears in logs.", show_default=False)],
     role: Annotated[
         Literal["query", "enrol", "admin"],
-        typer.Option(help="What it may do; enrol includes query, and admin includes everything.", show_default=False),
+        typer.Option(help="Permissions: enrol includes query, and admin includes everything.", show_default=False),
     ],
     maps: Annotated[
         list[str] | None, typer.Option("--map", "-m", help="Limit the key to this map; may be repeated.")

@@ -222,7 +222,7 @@ function KeyPage({ problem }) {
   return html`
     <main class="key-page">
       <h1><${Mark} /> placerec</h1>
-      <p>The service asks for a key. It is kept in this tab and sent to this service only.</p>
+      <p>The service asks for a key. It is stored in this tab and sent to this service only.</p>
       ${problem.slug !== "key-needed" && html`<${Trouble} error=${problem} />`}
       <${KeyForm} />
     </main>

@@ -57,12 +57,12 @@ PROTOCOLS = """
 # Protocols
 
 This page is for researchers. It lists the data sets and protocols that `placerec evaluate --dataset NAME --data DIR`
-knows: which traverse is the reference and which the query, what is true, what a query is not matched against, and how
-many images there should be. [Evaluate place recognition](../how-to/evaluate.md) shows how to use them.
+knows: the reference and the query traverse, the truth, the references that a query is not matched against, and the
+number of images. [Evaluate place recognition](../how-to/evaluate.md) shows how to use them.
 
 `DIR` holds the folders of the two traverses, or is any folder of one of the published trees below: the folders above
-those in braces may be left out. A file `ground_truth.csv` with rows `query,reference` beside the traverses says what is
-true in place of the rule. Counts that differ from the published ones are said in a remark.
+those in braces may be left out. A file `ground_truth.csv` with rows `query,reference` beside the traverses gives the
+truth in place of the rule. A remark names counts that differ from the published ones.
 """
 
 PUBLISHED_FIGURES = """
@@ -111,10 +111,11 @@ def command_line() -> str:
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Every command below a group that does something, with its full name."""
+    """Every command below a group that does something and is not hidden, with its full name."""
     names = getattr(command, "commands", None)
     if names is None:
-        yield name, command
+        if not command.hidden:
+            yield name, command
         return
     for child in names:
         yield from commands(command.get_command(typer.Context(command), child), f"{name} {child}")

@@ -102,7 +102,7 @@ def test_commands(watch: Watch, tmp_path: Path, server: Server, where: str) -> N
     for number in range(2):
         (tmp_path / "pictures" / f"{number}.jpg").write_bytes(encoded(scene(number)))
     address = f"http://127.0.0.1:{server.port}"
-    words = ("enroll", tmp_path / "pictures", "--map", "enrolled-in-silence", "--create")
+    words = ("enrol", tmp_path / "pictures", "--map", "enrolled-in-silence", "--create")
     run(watch, tmp_path, *words, where, address if where == "--url" else tmp_path / "data")
     assert watch.told() == ({f"127.0.0.1:{server.port}"} if where == "--url" else set())
     assert written(watch, tmp_path, tmp_path / "data") == set()

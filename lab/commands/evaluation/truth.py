@@ -29,16 +29,16 @@ class TruthOptions:
         bool,
         _option(
             "--poses",
-            help="By the poses in places.csv of both directories (as for enroll), in file names "
+            help="By the poses in places.csv of both directories (as for enrol), in file names "
             "(@easting@northing@…) or in EXIF data.",
         ),
     ] = False
     metres: Annotated[
-        float | None, _option(metavar="N", min=0, help="With --poses: true if at most so many metres apart.")
+        float | None, _option(metavar="N", min=0, help="With --poses: true if at most N metres apart.")
     ] = None
     degrees: Annotated[
         float | None,
-        _option(metavar="N", min=0, max=180, help="With --poses: and if headings differ by at most so many degrees."),
+        _option(metavar="N", min=0, max=180, help="With --poses: and if headings differ by at most N degrees."),
     ] = None
 
     def check(self) -> None:

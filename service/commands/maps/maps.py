@@ -39,11 +39,13 @@ for name, command in (
     maps.command(name)(command)
 
 Description = Annotated[str | None, typer.Option(help="Description of the map.")]
-Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What the map keeps of each frame.")]
-Radius = Annotated[float | None, typer.Option(min=0, help="Places within so many metres count as the same place.")]
+Keep = Annotated[
+    Literal["none", "thumbnail", "image"] | None, typer.Option(help="Pictures that the map stores of each frame.")
+]
+Radius = Annotated[float | None, typer.Option(min=0, help="Places within N metres count as the same place.")]
 Frames = Annotated[
     int | None,
-    typer.Option(min=0, help="Without poses: places within so many frames of a sequence count as the same place."),
+    typer.Option(min=0, help="Without poses: places within N frames of a sequence count as the same place."),
 ]
 Verification = Annotated[
     bool | None,

@@ -52,15 +52,15 @@ LargestGap = Annotated[
 ]
 EveryMetres = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: take a frame after so many metres.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: take a frame after N metres.", rich_help_panel=PANEL, metavar="N"),
 ]
 EveryDegrees = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after a turn by so many degrees.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
 ]
 EverySeconds = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after so many seconds.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: or after N seconds.", rich_help_panel=PANEL, metavar="N"),
 ]
 EveryChange = Annotated[
     float | None,

@@ -143,7 +143,7 @@ function Why({ answer }) {
       ["Encoder", encoderName(encoder), encoder],
     ]} />
     ${explanation && explanation.words.length > 0 && html`
-      <h3>What each word adds</h3>
+      <h3>Contribution of each word</h3>
       <${Words} words=${explanation.words} />
     `}
   `;

@@ -105,7 +105,7 @@ function Lately({ map, id }) {
   return html`
     <section class="panel">
       <div class="spread">
-        <h2>What matched it lately</h2>
+        <h2>Recent matches</h2>
         ${cameras.data?.items.length > 0 && html`
           <${Field} label="Camera" inline>
             <select value=${camera} onChange=${(event) => setCamera(event.target.value)}>
@@ -121,7 +121,7 @@ function Lately({ map, id }) {
             The best match of ${integer(best)} answers since the counting began, recognized in ${integer(recognized)}${last && html`; last <${Moment} at=${last} />`}.
           </p>
           ${items.length === 0
-            ? html`<p class="faint">Nothing in the answers that are kept.</p>`
+            ? html`<p class="faint">None in the recent answers.</p>`
             : html`<${Answers} map=${map} items=${items} />`}
         `}
       <//>

@@ -20,7 +20,7 @@ export default function Audit({ query }) {
   const lines = useResource((signal) => read(filter, cursor, signal), [filter, cursor]);
   const kind = (name) => (["after", "before"].includes(name) ? "datetime-local" : "text");
   return html`
-    <${Head} title="Audit" note=${lines.data?.source === "memory" ? "The last lines of this process; with PLACEREC_AUDIT_FILE all of them are kept." : "Who changed what, and who was refused."}>
+    <${Head} title="Audit" note=${lines.data?.source === "memory" ? "The last lines of this process; with PLACEREC_AUDIT_FILE all of them are stored." : "Changes and refusals, with their callers."}>
       <button type="button" onClick=${lines.reload}>Refresh</button>
     <//>
     <div class="filters" role="search" aria-label="Filters">
@@ -62,7 +62,7 @@ function Table({ items, open }) {
   return html`
     <div class="table" tabindex="0" role="region" aria-label="Audit trail">
       <table>
-        <thead><tr><th>When</th><th>Who</th><th>What</th><th>On</th><th class="number">Status</th><th>From</th><th><span class="hidden">More</span></th></tr></thead>
+        <thead><tr><th>When</th><th>Caller</th><th>Change</th><th>On</th><th class="number">Status</th><th>From</th><th><span class="hidden">More</span></th></tr></thead>
         <tbody>
           ${items.map((line) => html`
             <tr>

@@ -173,7 +173,7 @@ const ROWS = [
 
 function Effect({ now, then }) {
   return html`
-    <table aria-label="What would change">
+    <table aria-label="Effect of the change">
       <thead><tr><th class="wrapped">On the measured frames</th><th class="number">Now</th><th class="number">Then</th><th class="number">Change</th></tr></thead>
       <tbody>
         ${ROWS.map(([name, value, written]) => {
@@ -289,8 +289,8 @@ function Order({ map, own, tag, started, close }) {
       ${aimed && html`<div class="fields">
         <${Field} label="Target">
           <select value=${fields.rule} onChange=${(event) => change({ rule: event.target.value, value: event.target.value === "precision" ? 0.95 : 0.01 })}>
-            <option value="precision">so many of those believed are right</option>
-            <option value="false_accept_rate">so many unknown places are believed</option>
+            <option value="precision">precision of recognized answers</option>
+            <option value="false_accept_rate">unknown places that are recognized</option>
             <option value="mean_of_negatives">mean of unknown places</option>
           </select>
         <//>

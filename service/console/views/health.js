@@ -192,7 +192,7 @@ function Prune({ map }) {
       <${Field} label=${html`Recall that may be lost: <strong>${decimal(loss, 1)} %</strong>`}>
         <input type="range" min="0" max="10" step="0.5" value=${loss} onInput=${(event) => setLoss(event.target.valueAsNumber)} />
       <//>
-      <div class="row"><button type="button" onClick=${() => trial.start({ dry_run: true, max_recall_loss: loss / 100 })}>What would it cost?</button></div>
+      <div class="row"><button type="button" onClick=${() => trial.start({ dry_run: true, max_recall_loss: loss / 100 })}>Preview the loss</button></div>
       ${trial.error && html`<${Trouble} error=${trial.error} />`}
       ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Pruning"} />`}
       ${report && html`
@@ -234,7 +234,7 @@ function Merge({ map }) {
           <${Field} label="From"><select value=${from} onChange=${(event) => setFrom(event.target.value)}><option value="">choose …</option>${others.map((one) => html`<option value=${one.id}>${one.id} (${integer(one.places)})</option>`)}</select><//>
           <${Field} label="Where names conflict"><select value=${conflict} onChange=${(event) => setConflict(event.target.value)}><option value="refuse">refuse</option><option value="rename">rename what comes</option><option value="skip">skip it</option></select><//>
         </div>
-        <div class="row"><button type="button" disabled=${!from} onClick=${() => trial.start({ from, dry_run: true, on_conflict: conflict })}>What would come?</button></div>
+        <div class="row"><button type="button" disabled=${!from} onClick=${() => trial.start({ from, dry_run: true, on_conflict: conflict })}>Preview the merge</button></div>
       `}
       ${trial.error && html`<${Trouble} error=${trial.error} />`}
       ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Merging"} />`}

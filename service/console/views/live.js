@@ -39,7 +39,7 @@ export default function Live({ map }) {
     </div>
     ${stream.error && html`<${Trouble} error=${stream.error} again=${stream.again} />`}
     ${shown.length === 0
-      ? html`<${Nothing} title="Nothing was asked yet">Answers appear here as robots, cameras and this console ask.<//>`
+      ? html`<${Nothing} title="No queries yet">Answers appear here as robots, cameras and this console ask.<//>`
       : html`
         <ol class="stream" aria-label="Answers">
           ${shown.map((one) => (one.missed === undefined ? html`<${Line} key=${one.number} map=${map} event=${one} open=${setOpen} />` : html`<${Gap} key=${one.number} missed=${one.missed} />`))}

@@ -25,11 +25,11 @@ export default function Review({ map }) {
   return html`
     <${Head} title="Review" note=${`Frames that ${map} was not sure of.`}>
       <button type="button" onClick=${write}>Export the labels</button>
-      ${may("admin") && about.data && html`<button type="button" onClick=${keep}>What is kept</button>`}
+      ${may("admin") && about.data && html`<button type="button" onClick=${keep}>Stored frames</button>`}
     <//>
     <${Shown} resource=${about}>
       ${() => html`
-        ${settings === null && html`<p class="notice">This map keeps no frames for review now. ${may("admin") ? "Say under What is kept which answers it should keep." : "Somebody with an admin key can turn that on."}</p>`}
+        ${settings === null && html`<p class="notice">This map stores no frames for review now. ${may("admin") ? "Choose under Stored frames the answers whose frames it stores." : "Somebody with an admin key can turn that on."}</p>`}
         <div class="segments" role="group" aria-label="Which frames">
           <button type="button" aria-pressed=${!labelled} onClick=${() => setLabelled(false)}>To be looked at</button>
           <button type="button" aria-pressed=${labelled} onClick=${() => setLabelled(true)}>Labelled</button>
@@ -68,7 +68,7 @@ function Frames({ map, labelled, keeps }) {
       ${({ frames, bytes: size, next_cursor: next }) => html`
         <p class="faint">${counted(frames, "frame")}, ${bytes(size)}.</p>
         ${items.length === 0
-          ? html`<${Nothing} title=${labelled ? "No labels yet" : "Nothing to be looked at"}>${!labelled && keeps && "Frames appear here as they are answered with the verdicts that are kept."}<//>`
+          ? html`<${Nothing} title=${labelled ? "No labels yet" : "Nothing to be looked at"}>${!labelled && keeps && "Frames appear here as they are answered with the chosen verdicts."}<//>`
           : html`
             <div class="review">
               <ul class="queue" aria-label="Frames">
@@ -221,11 +221,11 @@ function Keeping({ map, read, close, changed }) {
   const keep = async () => {
     const review = verdicts.length ? { verdicts, most_frames: frames, most_bytes: size * MIB } : null;
     await patch(mapPath(map), { review }, read.tag);
-    say(review ? "Such frames are kept from now on." : "No further frames are kept.");
+    say(review ? "Such frames are stored from now on." : "No further frames are stored.");
     changed();
   };
   return html`
-    <${FormDialog} title="What is kept for review" action="Save" close=${close} send=${keep}>
+    <${FormDialog} title="Frames stored for review" action="Save" close=${close} send=${keep}>
       <p class="faint">Frames as they were sent, with their answers. The oldest go first. Tell those who are in the pictures.</p>
       <fieldset class="stack">
         <legend class="label">Frames that were answered</legend>

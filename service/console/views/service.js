@@ -39,7 +39,7 @@ function State({ data }) {
         ${disk && html`<${Level} name="Disk" value=${disk.total - disk.free} of=${disk.total} text=${bytes} />`}
       </section>
       <section class="panel">
-        <h2>What it holds</h2>
+        <h2>Contents</h2>
         <${Facts} rows=${[
           memory && ["Memory of the process", bytes(memory.resident)],
           disk && ["Free on the disk", bytes(disk.free)],

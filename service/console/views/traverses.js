@@ -14,7 +14,7 @@ import { html, useState } from "../shared/view.js";
 export default function Traverses({ map, query }) {
   const traverses = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
   return html`
-    <${Head} title="Traverses" note=${`What ${map} was made of, and how two of them fit.`} />
+    <${Head} title="Traverses" note=${`The traverses of ${map}, and how two of them fit.`} />
     <${Shown} resource=${traverses}>
       ${({ items }) => items.length === 0
         ? html`<${Nothing} title="No traverses">Places with a traverse appear here once they are enrolled.<//>`
@@ -81,7 +81,7 @@ function Compare({ map, items, query }) {
         <${Field} label="against">${choice("reference", reference)}<//>
         ${compared.data && html`<${Pill} tone=${compared.data.aligned ? "good" : ""}>${compared.data.aligned ? "aligned" : "not aligned"}<//>`}
         ${may("enrol") && html`
-          <button type="button" onClick=${() => align(true)}>What would alignment find?</button>
+          <button type="button" onClick=${() => align(true)}>Preview alignment</button>
           <button type="button" onClick=${() => align(false)}>Align</button>
         `}
       </div>

@@ -148,7 +148,7 @@ function Webcam({ ask, close }) {
   }, [repeated]);
   if (error) return html`<${Trouble} error=${error} close=${close} />`;
   return html`
-    <video ref=${video} onLoadedData=${() => setReady(true)} autoplay muted playsinline aria-label="What the webcam sees"></video>
+    <video ref=${video} onLoadedData=${() => setReady(true)} autoplay muted playsinline aria-label="Picture of the webcam"></video>
     <div class="row">
       <button type="button" class="primary" disabled=${!ready} onClick=${take}>Ask with this frame</button>
       <label class="row"><input type="checkbox" checked=${repeated} onChange=${() => setRepeated(!repeated)} /> every second</label>
@@ -233,7 +233,7 @@ function python(map, options, name) {
 
 function Asked({ items, shown, show, clear }) {
   return html`
-    <section class="panel" aria-label="Frames that were asked">
+    <section class="panel" aria-label="Queries so far">
       <div class="spread"><h2>${integer(items.length)} frames</h2><button type="button" class="small" onClick=${clear}>Clear</button></div>
       <div class="table limited" tabindex="0" role="region" aria-label="Frames">
         <table>

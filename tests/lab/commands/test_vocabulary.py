@@ -81,7 +81,7 @@ def test_options_reach_the_definition_and_a_map_uses_it(
     folder.mkdir()
     for seed in range(3):
         (folder / f"{seed}.jpg").write_bytes(encoded(scene(seed)))
-    placerec("enroll", folder, "--map", "lab")
+    placerec("enrol", folder, "--map", "lab")
     answer = json.loads(placerec("query", folder / "1.jpg", "-m", "lab", "--json").stdout)
     assert answer["matches"][0]["place"]["id"] == "1"
     assert answer["score"] == pytest.approx(1.0, abs=1e-4)

@@ -10,7 +10,7 @@ import pytest
 from tests.service.commands.conftest import Placerec
 from tests.service.server import ROOT
 
-COMMANDS = ["serve", "enroll", "query", "evaluate", "calibrate", "vocabulary", "model", "maps", "bench", "settings"]
+COMMANDS = ["serve", "enrol", "query", "evaluate", "calibrate", "vocabulary", "model", "maps", "bench", "settings"]
 
 
 def test_help_names_every_command(placerec: Placerec) -> None:
@@ -21,6 +21,12 @@ def test_help_names_every_command(placerec: Placerec) -> None:
 @pytest.mark.parametrize("command", [*COMMANDS, "maps places", "maps sequences", "vocabulary train", "model import"])
 def test_each_command_has_help(placerec: Placerec, command: str) -> None:
     assert "--help" in placerec(*command.split(), "--help").stdout
+
+
+def test_enrol_may_be_spelt_with_two_ls(placerec: Placerec) -> None:
+    assert "enroll" not in placerec("--help").stdout
+    written, typed = (placerec(name, "--help").stdout.partition("Enrol the frames")[2] for name in ("enrol", "enroll"))
+    assert "places of a map" in written and typed == written
 
 
 def test_help_keys_and_settings_load_nothing_heavy() -> None:

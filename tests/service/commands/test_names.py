@@ -126,5 +126,5 @@ def test_other_words_are_unknown(placerec: Placerec) -> None:
 
 def test_a_traverse_is_refused_before_a_frame_is_read(placerec: Placerec, monday: Path) -> None:
     for name in ("..", ".", "a/b", "\u202e", "x" * 129):
-        told = placerec("enroll", monday, "--map", "lab", "--create", "--sequence", name, status=1).stderr
+        told = placerec("enrol", monday, "--map", "lab", "--create", "--sequence", name, status=1).stderr
         assert "cannot name a sequence" in told and "--sequence" in told

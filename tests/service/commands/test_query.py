@@ -16,7 +16,7 @@ from tests.service.server import Server
 def test_a_second_look_is_recognized_where_the_threshold_lets_it(
     placerec: Placerec, monday: Path, tmp_path: Path
 ) -> None:
-    placerec("enroll", monday, "--map", "lab", "--create")
+    placerec("enrol", monday, "--map", "lab", "--create")
     (tmp_path / "again.png").write_bytes(encoded(seen_again(scene(2)), ".png"))
 
     done = placerec("query", tmp_path / "again.png", monday / "10.jpg", "-m", "lab", "-k", 3, "--json")
@@ -56,11 +56,11 @@ def test_the_mask_of_a_camera_is_applied(placerec: Placerec, server: Server, map
     frames.mkdir()
     (frames / "1.jpg").write_bytes(encoded(scene(1)))
     there = ("-m", map_id, "--url", server.client.base_url)
-    placerec("enroll", frames, *there, "--camera", "back", status=1)
+    placerec("enrol", frames, *there, "--camera", "back", status=1)
     assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
-    placerec("enroll", frames, *there, "--camera", "front")
+    placerec("enrol", frames, *there, "--camera", "front")
     assert server.client.get(f"/v1/maps/{map_id}/places/1").json()["camera"] == "front"
-    assert "1 unchanged" in placerec("enroll", frames, *there, "--camera", "front").stdout
+    assert "1 unchanged" in placerec("enrol", frames, *there, "--camera", "front").stdout
     masked, bare = (
         json.loads(placerec("query", frames / "1.jpg", *there, "--json", *words).stdout)
         for words in (("--camera", "front"), ())

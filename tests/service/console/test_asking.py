@@ -140,7 +140,7 @@ def test_live_answers_are_paused_and_filtered(admin: Operator, keyed: Server) ->
     page.get_by_role("button", name="Go on").click()
     lines.first.wait_for()
     page.get_by_label("Who, camera, place").fill("nobody")
-    page.get_by_text("Nothing was asked yet").wait_for()
+    page.get_by_text("No queries yet").wait_for()
     page.get_by_label("Who, camera, place").fill("ADMIN")
     lines.first.wait_for()
     page.get_by_role("button", name="recognized", exact=True).click()

@@ -160,7 +160,7 @@ def test_a_place_is_shown_with_its_picture_neighbours_and_what_matched_it(admin:
     expect(along.get_by_role("listitem")).to_contain_text([f"monday-{number:02d}" for number in range(7)])
     near = page.locator("section").filter(has=page.get_by_role("heading", name="Nearest by pose"))
     expect(near.get_by_role("listitem").first).to_contain_text("tuesday-03")
-    page.get_by_role("heading", name="What matched it lately").wait_for()
+    page.get_by_role("heading", name="Recent matches").wait_for()
     page.get_by_role("region", name="Answers").get_by_role("row").nth(1).wait_for()
 
 

@@ -40,14 +40,14 @@ def doubtful(keyed: Server, request: pytest.FixtureRequest) -> str:
 def test_an_admin_says_which_frames_are_kept(admin: Operator, keyed: Server) -> None:
     keyed.create_map("keeping")
     page = admin.go("maps/keeping/review")
-    page.get_by_text("This map keeps no frames for review now.").wait_for()
-    page.get_by_role("button", name="What is kept").click()
+    page.get_by_text("This map stores no frames for review now.").wait_for()
+    page.get_by_role("button", name="Stored frames").click()
     dialog = page.get_by_role("dialog")
     dialog.get_by_label("ambiguous").check()
     dialog.get_by_label("unknown").check()
     dialog.get_by_label("At most, frames").fill("50")
     dialog.get_by_role("button", name="Save").click()
-    page.get_by_text("This map keeps no frames for review now.").wait_for(state="detached")
+    page.get_by_text("This map stores no frames for review now.").wait_for(state="detached")
     kept = keyed.client.get("/v1/maps/keeping").json()["review"]
     assert sorted(kept["verdicts"]) == ["ambiguous", "unknown"] and kept["most_frames"] == 50
 
@@ -176,7 +176,7 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     page = admin.go("maps/day/health")
     prune = page.get_by_role("region", name="Prune")
     prune.get_by_role("slider").fill("10")
-    prune.get_by_role("button", name="What would it cost?").click()
+    prune.get_by_role("button", name="Preview the loss").click()
     prune.get_by_role("button", name=re.compile(r"Delete \d+ places")).click()
     dialog.get_by_role("textbox").fill("day")
     dialog.get_by_role("button", name="Delete the places").click()

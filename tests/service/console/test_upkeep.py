@@ -69,12 +69,12 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     before = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
     page = admin.go(f"maps/{yard}/calibration")
     page.set_viewport_size({"width": 390, "height": 844})
-    page.get_by_role("table", name="What would change").wait_for()
+    page.get_by_role("table", name="Effect of the change").wait_for()
     assert page.evaluate(OUT_OF_PANEL) == []
     slider = page.get_by_role("slider", name=re.compile("Threshold"))
     slider.focus()
     page.keyboard.press("End")
-    table = page.get_by_role("table", name="What would change")
+    table = page.get_by_role("table", name="Effect of the change")
     table.get_by_role("row", name=re.compile("^recognized")).get_by_text("−").wait_for()
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"] == before, "nothing is changed by looking"
     page.get_by_role("button", name="Apply").click()
@@ -127,7 +127,7 @@ def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yar
     matrix.focus()
     page.keyboard.press("ArrowDown")
     pair.get_by_role("link", name="tuesday-03").wait_for()
-    page.get_by_role("button", name="What would alignment find?").click()
+    page.get_by_role("button", name="Preview alignment").click()
     page.get_by_text("no, a dry run").wait_for()
     page.get_by_role("button", name="Align", exact=True).click()
     page.get_by_text("aligned", exact=True).wait_for()
@@ -159,7 +159,7 @@ def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> 
     page.get_by_text("The map has not been queried yet.").wait_for()
     prune = page.get_by_role("region", name="Prune")
     prune.get_by_role("slider").fill("10")
-    prune.get_by_role("button", name="What would it cost?").click()
+    prune.get_by_role("button", name="Preview the loss").click()
     prune.get_by_text("Recall after").wait_for()
     assert len(keyed.places("pruned")) == enrolled, "a dry run removes nothing"
     prune.get_by_role("button", name=re.compile(r"Delete \d+ places")).click()
@@ -178,7 +178,7 @@ def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -
     page = admin.go("maps/target/health")
     merge = page.get_by_role("region", name="Merge")
     merge.get_by_label("From").select_option("source")
-    merge.get_by_role("button", name="What would come?").click()
+    merge.get_by_role("button", name="Preview the merge").click()
     merge.get_by_role("button", name="Copy 2 places").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("target")
     page.get_by_role("dialog").get_by_role("button", name="Copy the places").click()

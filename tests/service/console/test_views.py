@@ -50,7 +50,7 @@ def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) ->
     operator = visit(role)
     changes = "Create|Delete|Edit|Import|Export|Calibrate|Apply"
     refused = (
-        rf"^\s*({changes}|Align|What would alignment)"
+        rf"^\s*({changes}|Align|Preview alignment)"
         if role == "query"
         else r"^\s*(Create|Import|Export\s*$|Calibrate|Apply)"
     )

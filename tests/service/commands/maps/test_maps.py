@@ -57,7 +57,7 @@ def test_an_edit_must_change_something(placerec: Placerec) -> None:
 @pytest.mark.thorough
 def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str], tmp_path: Path) -> None:
     name = f"places-{len(where)}"
-    placerec("enroll", monday, "--map", name, "--create", *where)
+    placerec("enrol", monday, "--map", name, "--create", *where)
 
     placerec("maps", "places", "edit", name, "9", "--x", 1, "--y", 2, "--metadata", '{"door": "open"}', *where)
     edit = ("maps", "places", "edit", name, "9", "--json", *where)
@@ -97,7 +97,7 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
 
 @pytest.mark.thorough
 def test_damage_is_found(placerec: Placerec, monday: Path, tmp_path: Path) -> None:
-    placerec("enroll", monday, "--map", "lab", "--create")
+    placerec("enrol", monday, "--map", "lab", "--create")
     largest = max((path for path in (tmp_path / "data").rglob("*") if path.is_file()), key=lambda p: p.stat().st_size)
     content = bytearray(largest.read_bytes())
     content[len(content) // 2] ^= 0xFF

@@ -39,7 +39,7 @@ def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, 
     lab, hall, anew = (f"{name}-{len(where)}" for name in ("looked-after", "taken-in", "made-anew"))
     for name, folder in ((lab, monday), (hall, tuesday)):
         placerec("maps", "create", name, "--encoder", COARSE, "--keep", "image", *where)
-        placerec("enroll", folder, "--map", name, *where)
+        placerec("enrol", folder, "--map", name, *where)
 
     told = placerec("maps", "merge", lab, hall, "--json", *where)
     assert json.loads(told.stdout)["result"]["coming"] == 2
@@ -87,9 +87,9 @@ def test_aligning_traverses(placerec: Placerec, where: list[str], tmp_path: Path
         for index in range(12):
             frame = scene(index) if not day else seen_again(scene(index), index)
             (folder / f"{day}-{index}.jpg").write_bytes(encoded(frame))
-    first = placerec("enroll", tmp_path / "day0", "--map", name, "--align", *where).stdout
+    first = placerec("enrol", tmp_path / "day0", "--map", name, "--align", *where).stdout
     assert "0 of 12 frames show places of other traverses" in first
-    second = placerec("enroll", tmp_path / "day1", "--map", name, "--align", *where).stdout
+    second = placerec("enrol", tmp_path / "day1", "--map", name, "--align", *where).stdout
     assert "frames show places of other traverses (day0: 1" in second
     asked = ("maps", "align", name, "--sequence", "day1", "--json", *where)
     told = json.loads(placerec(*asked, "--with", "day0", "--no-poses", "--dry-run").stdout)

@@ -1,4 +1,4 @@
-"""Bags, videos and folders of other formats, enrolled by ``placerec enroll``."""
+"""Bags, videos and folders of other formats, enrolled by ``placerec enrol``."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def stored(data: Path, name: str) -> tuple[list[dict[str, Any]], Any]:
 )
 def test_a_bag_gives_the_map_that_its_frames_in_a_folder_give(writer: str, placerec: Placerec, tmp_path: Path) -> None:
     bag = WRITERS[writer](tmp_path, walk(5))
-    done = placerec("enroll", bag, "--map", "of-bag", "--create", "--pose-topic", ODOMETRY, "--sequence", "walk")
+    done = placerec("enrol", bag, "--map", "of-bag", "--create", "--pose-topic", ODOMETRY, "--sequence", "walk")
     assert "5 of 5 frames are places of of-bag, sequence walk: 5 created; 5 with a pose; 5 sent" in done.stdout
 
     folder = tmp_path / "folder"
@@ -74,14 +74,14 @@ def test_a_bag_gives_the_map_that_its_frames_in_a_folder_give(writer: str, place
         name = f"camera-image_raw-compressed-{1_700_000_000 + index}.000000000"
         rows.append(f"{index}.jpg,{name},{index},0,0.5,0,2023-11-14T22:13:{20 + index}Z")
     (folder / "places.csv").write_text("\n".join(rows) + "\n")
-    placerec("enroll", folder, "--map", "of-folder", "--create", "--sequence", "walk")
+    placerec("enrol", folder, "--map", "of-folder", "--create", "--sequence", "walk")
 
     (of_bag, found), (of_folder, expected) = (stored(tmp_path / "data", name) for name in ("of-bag", "of-folder"))
     assert of_bag == of_folder and len(of_bag) == 5
     assert of_bag[2]["pose"]["x"] == 2 and of_bag[2]["timestamp"] == "2023-11-14T22:13:22Z"
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
-    again = placerec("enroll", bag, "--map", "of-bag", "--pose-topic", ODOMETRY, "--sequence", "walk")
+    again = placerec("enrol", bag, "--map", "of-bag", "--pose-topic", ODOMETRY, "--sequence", "walk")
     assert "5 unchanged" in again.stdout and "0 sent" in again.stdout
 
 
@@ -94,7 +94,7 @@ def test_killed_in_the_middle_and_run_again_nothing_is_sent_twice_or_missing(
     placerec: Placerec, tmp_path: Path, server: Server, map_id: str
 ) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", small_walk(120))
-    words = ["enroll", bag, "--map", map_id, "--url", server.client.base_url]
+    words = ["enrol", bag, "--map", map_id, "--url", server.client.base_url]
     command = [sys.executable, "-m", "service.commands", *map(str, words)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (count := server.client.get(f"/v1/maps/{map_id}").json()["places"]):
@@ -120,34 +120,34 @@ def test_a_truncated_bag_enrols_what_it_holds_and_the_whole_one_the_rest(placere
     bag = write_ros1(tmp_path / "walk.bag", small_walk(60))
     whole = bag.read_bytes()
     bag.write_bytes(whole[: len(whole) // 2])
-    first = placerec("enroll", bag, "--map", "lab", "--create")
+    first = placerec("enrol", bag, "--map", "lab", "--create")
     assert "walk.bag is cut short" in first.stderr and "what could be read of it is taken" in first.stderr
     count = len(json.loads(placerec("maps", "places", "list", "lab", "--json").stdout))
     assert 10 < count < 40
 
     bag.write_bytes(whole)
-    second = placerec("enroll", bag, "--map", "lab")
+    second = placerec("enrol", bag, "--map", "lab")
     assert f"{60 - count} created, {count} unchanged" in second.stdout and f"{60 - count} sent" in second.stdout
 
 
 @pytest.mark.thorough
 def test_a_video_is_enrolled_by_its_keyframes(placerec: Placerec, tmp_path: Path) -> None:
     write_video(tmp_path / "walk.mp4")
-    timed = placerec("enroll", tmp_path / "walk.mp4", "--map", "timed", "--create", "--every-seconds", 1)
+    timed = placerec("enrol", tmp_path / "walk.mp4", "--map", "timed", "--create", "--every-seconds", 1)
     assert "3 of 12 frames are keyframes" in timed.stderr and "3 of 3 frames are places" in timed.stdout
-    seen = placerec("enroll", tmp_path / "walk.mp4", "--map", "seen", "--create", "--every-change", 0.3)
+    seen = placerec("enrol", tmp_path / "walk.mp4", "--map", "seen", "--create", "--every-change", 0.3)
     assert "4 of 12 frames are keyframes" in seen.stderr  # each scene once
     ids = [place["id"] for place in json.loads(placerec("maps", "places", "list", "seen", "--json").stdout)]
     assert ids == ["walk-000000", "walk-000003", "walk-000006", "walk-000009"]
-    again = placerec("enroll", tmp_path / "walk.mp4", "--map", "seen", "--every-change", 0.3)
+    again = placerec("enrol", tmp_path / "walk.mp4", "--map", "seen", "--every-change", 0.3)
     assert "4 unchanged" in again.stdout and "0 sent" in again.stdout
 
 
 def test_of_a_video_the_frames_of_a_stop_are_left_out_unless_wanted(placerec: Placerec, tmp_path: Path) -> None:
     write_video(tmp_path / "walk.mp4")
-    moved = placerec("enroll", tmp_path / "walk.mp4", "--map", "moved", "--create")
+    moved = placerec("enrol", tmp_path / "walk.mp4", "--map", "moved", "--create")
     assert "8 of 12 frames show the same" in moved.stderr and "4 of 4 frames are places" in moved.stdout
-    whole = placerec("enroll", tmp_path / "walk.mp4", "--map", "whole", "--create", "--keep-standing")
+    whole = placerec("enrol", tmp_path / "walk.mp4", "--map", "whole", "--create", "--keep-standing")
     assert "12 of 12 frames are places" in whole.stdout
 
 
@@ -164,7 +164,7 @@ def test_what_the_mask_of_a_camera_covers_is_no_stop(
         return encoded(pixels, ".png")
 
     bag = [compressed(START + number * SECOND, seen(number), form="png") for number in range(4)]
-    words = ("enroll", write_mcap(tmp_path / "walk.mcap", bag), "--map", f"masked{where}")
+    words = ("enrol", write_mcap(tmp_path / "walk.mcap", bag), "--map", f"masked{where}")
     server.create_map(f"masked{where}")
     server.client.put(f"/v1/maps/masked{where}/cameras/front", json={"mask": BODY}).raise_for_status()
     at = ("--url", f"http://127.0.0.1:{server.port}")
@@ -174,7 +174,7 @@ def test_what_the_mask_of_a_camera_covers_is_no_stop(
         at = ("--data-dir", str(tmp_path / "data"))
         placerec("maps", "import", file, *at)
     assert "4 of 4 frames are places" in placerec(*words, "--camera", "front", *at).stdout
-    whole = placerec("enroll", *words[1:], "--sequence", "without", "--id-prefix", "without-", *at)
+    whole = placerec("enrol", *words[1:], "--sequence", "without", "--id-prefix", "without-", *at)
     assert "3 of 4 frames show the same" in whole.stderr, "without the mask they show the body"
 
 
@@ -185,10 +185,10 @@ BODY = {"polygons": [[[0, 0.2], [1, 0.2], [1, 1], [0, 1]]]}
 @pytest.mark.thorough
 def test_keyframes_of_a_bag_follow_its_poses(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(6))
-    words = ("enroll", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)
+    words = ("enrol", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)
     done = placerec(*words, "--every-metres", 2)
     assert "3 of 6 frames are keyframes" in done.stderr
-    none = placerec("enroll", bag, "--map", "lab", "--every-metres", 2, status=1)
+    none = placerec("enrol", bag, "--map", "lab", "--every-metres", 2, status=1)
     assert "No frame of walk can be judged by the --every options" in none.stderr
 
 
@@ -198,7 +198,7 @@ def test_a_folder_of_other_formats_equals_one_of_png(placerec: Placerec, tmp_pat
         (tmp_path / name).mkdir()
         for index in range(3):
             (tmp_path / name / f"{index}.{name}").write_bytes(encoded(scene(index, 96, 72), f".{name}"))
-        placerec("enroll", tmp_path / name, "--map", name, "--create", "--sequence", "walk")
+        placerec("enrol", tmp_path / name, "--map", name, "--create", "--sequence", "walk")
     (of_bmp, found), (of_png, expected), (of_ppm, _) = (
         stored(tmp_path / "data", name) for name in ("bmp", "png", "ppm")
     )
@@ -212,16 +212,16 @@ def test_poses_come_from_satellites_and_files(placerec: Placerec, tmp_path: Path
     seen = small_walk(3)
     told = [fix(START + index * SECOND, 48 + index, 2) for index in range(3)]
     bag = write_mcap(tmp_path / "walk.mcap", [*seen, *told])
-    placerec("enroll", bag, "--map", "earth", "--create", "--pose-topic", "/fix")
+    placerec("enrol", bag, "--map", "earth", "--create", "--pose-topic", "/fix")
     places = json.loads(placerec("maps", "places", "list", "earth", "--json").stdout)
     assert [place["pose"] for place in places] == [{"latitude": 48.0 + index, "longitude": 2.0} for index in range(3)]
 
     file = tmp_path / "path.tum"
     file.write_text("1700000000 0 0 0 0 0 0 1\n1700000001 1 0 0 0 0 0 1\n")
-    done = placerec("enroll", bag, "--map", "plane", "--create", "--trajectory", file)
+    done = placerec("enrol", bag, "--map", "plane", "--create", "--trajectory", file)
     assert "2 with a pose" in done.stdout and "1 of 3 frames get no pose" in done.stderr
     file.write_text("1700000000 0 0\n")
-    bad = placerec("enroll", bag, "--map", "plane", "--trajectory", file, status=1)
+    bad = placerec("enrol", bag, "--map", "plane", "--trajectory", file, status=1)
     assert "path.tum, line 1: 3 values are neither" in bad.stderr
 
 
@@ -240,14 +240,14 @@ def test_what_does_not_fit_is_refused_before_anything_is_sent(
 ) -> None:
     said = [compressed(START, jpeg(0)), moved(START, 0, 0), moved(START + SECOND, 1, 0)]
     bag = write_mcap(tmp_path / "walk.mcap", said)
-    refused = placerec("enroll", bag, "--map", "lab", "--create", *words, "--url", "http://127.0.0.1:1", status=1)
+    refused = placerec("enrol", bag, "--map", "lab", "--create", *words, "--url", "http://127.0.0.1:1", status=1)
     assert message in refused.stderr and "Traceback" not in refused.stderr
 
 
 def test_options_that_do_not_go_together_are_refused(placerec: Placerec, monday: Path) -> None:
-    both = placerec("enroll", monday, "--map", "lab", "--pose-topic", "/odom", "--trajectory", "a.tum", status=2)
+    both = placerec("enrol", monday, "--map", "lab", "--pose-topic", "/odom", "--trajectory", "a.tum", status=2)
     assert "--pose-topic or --trajectory, not both" in both.stderr
-    alone = placerec("enroll", monday, "--map", "lab", "--trajectory-times", "times.txt", status=2)
+    alone = placerec("enrol", monday, "--map", "lab", "--trajectory-times", "times.txt", status=2)
     assert "goes with --trajectory" in alone.stderr
 
 
@@ -258,7 +258,7 @@ def test_a_damaged_picture_in_a_bag_fails_alone_and_is_named(placerec: Placerec,
         compressed(START + 9 * SECOND, b"no picture"),
         compressed(START + 10 * SECOND, jpeg(9)[:500]),
     ]
-    done = placerec("enroll", write_mcap(tmp_path / "walk.mcap", said), "--map", "lab", "--create", status=1)
+    done = placerec("enrol", write_mcap(tmp_path / "walk.mcap", said), "--map", "lab", "--create", status=1)
     assert "2 of 4 frames are places" in done.stdout
     assert f"Error: {CAMERA} at 1700000009.000000000: " in done.stderr
     assert f"Error: {CAMERA} at 1700000010.000000000: " in done.stderr
@@ -269,7 +269,7 @@ def test_two_cameras_of_a_bag_do_not_overwrite_each_other(placerec: Placerec, tm
     rear = [compressed(START + index * SECOND, jpeg(10 + index, 96, 72), "/rear") for index in range(2)]
     bag = write_mcap(tmp_path / "walk.mcap", [*small_walk(2), *rear])
     for topic in (CAMERA, "/rear"):
-        placerec("enroll", bag, "--map", "lab", "--create", "--topic", topic)
+        placerec("enrol", bag, "--map", "lab", "--create", "--topic", topic)
     assert len(json.loads(placerec("maps", "places", "list", "lab", "--json").stdout)) == 4
 
 
@@ -297,7 +297,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path) -> None:
 @pytest.mark.thorough
 def test_frames_of_bags_videos_and_folders_are_queried(placerec: Placerec, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "walk.mcap", walk(4))
-    placerec("enroll", bag, "--map", "lab", "--create")
+    placerec("enrol", bag, "--map", "lab", "--create")
     (tmp_path / "again.bmp").write_bytes(encoded(seen_again(scene(2)), ".bmp"))
     words = ("query", tmp_path / "again.bmp", bag, "--map", "lab", "--every-seconds", 2, "--json")
     done = placerec(*words)
@@ -315,7 +315,7 @@ def test_frames_of_bags_videos_and_folders_are_queried(placerec: Placerec, tmp_p
 
 @pytest.mark.thorough
 def test_a_map_is_calibrated_by_labelled_frames_of_a_bag(placerec: Placerec, tmp_path: Path) -> None:
-    placerec("enroll", write_mcap(tmp_path / "walk.mcap", small_walk(11)), "--map", "lab", "--create")
+    placerec("enrol", write_mcap(tmp_path / "walk.mcap", small_walk(11)), "--map", "lab", "--create")
     again = [
         compressed(START + (100 + index) * SECOND, encoded(seen_again(scene(index, 96, 72), index)), "/rear")
         for index in range(22)  # half of them the map lacks

@@ -1,4 +1,4 @@
-"""``placerec enroll``: enrol the frames of a recording as places of a map."""
+"""``placerec enrol``: enrol the frames of a recording as places of a map."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Report:
             self.posed += outcome.posed
 
 
-def enroll(
+def enrol(
     recording: Annotated[
         Path,
         typer.Argument(
@@ -75,7 +75,7 @@ def enroll(
     ] = None,
     keep: Annotated[
         Literal["none", "thumbnail", "image"] | None,
-        typer.Option(help="What a map that is created keeps of each frame."),
+        typer.Option(help="Pictures that a map that is created stores of each frame."),
     ] = None,
     sequence: Annotated[
         str | None, typer.Option(help="Name of the traverse; default: the name of RECORDING.", show_default=False)
@@ -113,7 +113,7 @@ def enroll(
     (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
     images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
-    shows, as where the robot stood, are left out. What is neither JPEG nor PNG nor WebP is sent as PNG.
+    shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
     """
     options = RecordingOptions(
@@ -137,7 +137,7 @@ def enroll(
             chosen = chosen if keep_standing else without_standing(opened, chosen, mask)
             return [FrameToSend(taken, name, camera) for taken in chosen]
 
-        report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
+        report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, name, frames, time.monotonic() - began)
     if align:
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
@@ -177,7 +177,7 @@ def _show_aligned(job: dict[str, Any]) -> None:
     )
 
 
-async def _enroll(
+async def _enrol(
     target: CommandTarget,
     map_id: str,
     choose: Callable[[str | None, Mask | None], list[FrameToSend]],

@@ -1,4 +1,4 @@
-"""``placerec enroll`` in both modes, and what it refuses."""
+"""``placerec enrol`` in both modes, and what it refuses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEADER = "file,id,x,y,z,heading,latitude,longitude,timestamp\n"
 
 @pytest.mark.thorough
 def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> None:
-    done = placerec("enroll", monday, "--map", "lab", "--create")
+    done = placerec("enrol", monday, "--map", "lab", "--create")
     assert "4 of 4 frames are places of lab, sequence monday: 4 created; 0 with a pose" in done.stdout
 
     places = json.loads(placerec("maps", "places", "list", "lab", "--json").stdout)
@@ -35,11 +35,11 @@ def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> Non
     assert {place["sequence"] for place in places} == {"monday"}
     assert all(place["pose"] is None for place in places)
 
-    again = placerec("enroll", monday, "--map", "lab")
+    again = placerec("enrol", monday, "--map", "lab")
     assert "4 unchanged" in again.stdout
 
     (monday / "2.jpg").write_bytes(jpeg(7))
-    replaced = placerec("enroll", monday, "--map", "lab")
+    replaced = placerec("enrol", monday, "--map", "lab")
     assert "1 replaced, 3 unchanged" in replaced.stdout
 
 
@@ -52,13 +52,13 @@ def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, se
         encoding="utf-8",
     )
     # A heading of more than a turn is refused with its line, before anything is sent.
-    refused = placerec("enroll", monday, "--map", map_id, "--url", server.client.base_url, status=1)
+    refused = placerec("enrol", monday, "--map", map_id, "--url", server.client.base_url, status=1)
     assert "places.csv, line 2: heading" in refused.stderr
     assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
 
     text = (monday / "places.csv").read_text().replace("370", "-90")
     (monday / "places.csv").write_text(text)
-    done = placerec("enroll", monday, "--map", map_id, "--url", server.client.base_url, "--sequence", "walk")
+    done = placerec("enrol", monday, "--map", map_id, "--url", server.client.base_url, "--sequence", "walk")
 
     assert "3 of 3 frames" in done.stdout
     assert "2 with a pose" in done.stdout
@@ -81,7 +81,7 @@ def test_poses_come_from_exif(placerec: Placerec, tmp_path: Path) -> None:
     Image.fromarray(scene(0)).save(file, "JPEG", exif=exif.tobytes())
     (folder / "a.jpg").write_bytes(file.getvalue())
 
-    done = placerec("enroll", folder, "--map", "paris", "--create")
+    done = placerec("enrol", folder, "--map", "paris", "--create")
 
     assert "1 with a pose" in done.stdout
     shown = json.loads(placerec("maps", "places", "show", "paris", "a", "--json").stdout)
@@ -91,7 +91,7 @@ def test_poses_come_from_exif(placerec: Placerec, tmp_path: Path) -> None:
 def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
     (monday / "3.jpg").write_bytes(b"not an image")
     (monday / "4.png").write_bytes(encoded(scene(5), ".png")[:500])
-    done = placerec("enroll", monday, "--map", "lab", "--create", status=1)
+    done = placerec("enrol", monday, "--map", "lab", "--create", status=1)
     assert "4 of 6 frames are places of lab" in done.stdout
     assert "Error: 3.jpg: " in done.stderr
     assert "Error: 4.png: " in done.stderr
@@ -102,36 +102,36 @@ def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) 
 def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
     odd = monday / "ä ö.jpg"
     odd.write_bytes(jpeg(5))
-    done = placerec("enroll", monday, "--map", "lab", "--create", status=1)
+    done = placerec("enrol", monday, "--map", "lab", "--create", status=1)
     assert "4 of 5 frames are places of lab" in done.stdout and "4 sent in" in done.stdout
     assert "Error: ä ö.jpg: no id can be made from its name; give it one in places.csv." in done.stderr
     assert "1.jpg" not in done.stderr
     assert "ä ö.jpg" in placerec("query", odd, "--map", "lab").stdout
     (monday / "places.csv").write_text("file,id\nä ö.jpg,umlauts\n", encoding="utf-8")
-    assert "1 of 1 frames are places of lab" in placerec("enroll", monday, "--map", "lab").stdout
+    assert "1 of 1 frames are places of lab" in placerec("enrol", monday, "--map", "lab").stdout
 
 
 @pytest.mark.thorough
 def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
-    refused = placerec("enroll", monday, "--map", "lab", status=1)
+    refused = placerec("enrol", monday, "--map", "lab", status=1)
     assert "There is no map 'lab'. Give --create to create it." in refused.stderr
-    placerec("enroll", monday, "--map", "lab", "--create", "--encoder", "region-vlad", "--keep", "none")
+    placerec("enrol", monday, "--map", "lab", "--create", "--encoder", "region-vlad", "--keep", "none")
     made = json.loads(placerec("maps", "show", "lab", "--json").stdout)
     assert made["encoder"].startswith("region-vlad@")
     assert made["keep"] == "none"
-    wrong = placerec("enroll", monday, "--map", "lab", "--encoder", "m-region-vlad", status=1)
+    wrong = placerec("enrol", monday, "--map", "lab", "--encoder", "m-region-vlad", status=1)
     assert "bound to region-vlad@" in wrong.stderr
     assert "0 of 4 frames are enrolled" in wrong.stderr
 
 
 @pytest.mark.thorough
 def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Placerec, monday: Path) -> None:
-    placerec("enroll", monday, "--map", "lab", "--create")
+    placerec("enrol", monday, "--map", "lab", "--create")
     tuesday = monday.rename(monday.with_name("tuesday"))
-    refused = placerec("enroll", tuesday, "--map", "lab", status=1)
+    refused = placerec("enrol", tuesday, "--map", "lab", status=1)
     assert "4 ids of this traverse belong" in refused.stderr
     assert "--id-prefix tuesday-" in refused.stderr
-    placerec("enroll", tuesday, "--map", "lab", "--id-prefix", "tuesday-")
+    placerec("enrol", tuesday, "--map", "lab", "--id-prefix", "tuesday-")
     sequences = json.loads(placerec("maps", "sequences", "list", "lab", "--json").stdout)
     assert [(one["name"], one["places"]) for one in sequences] == [("monday", 4), ("tuesday", 4)]
 
@@ -142,13 +142,13 @@ def test_file_names_become_ids(placerec: Placerec, tmp_path: Path) -> None:
     folder.mkdir()
     for index, name in enumerate(("_hall (2)", "Küche", "x.y~z")):
         (folder / f"{name}.png").write_bytes(encoded(scene(index, 64, 48), ".png"))
-    placerec("enroll", folder, "--map", "lab", "--create")
+    placerec("enrol", folder, "--map", "lab", "--create")
     places = json.loads(placerec("maps", "places", "list", "lab", "--json").stdout)
     assert [place["id"] for place in places] == ["K-che", "hall-2-", "x.y~z"]  # in the order of the files
     assert {place["sequence"] for place in places} == {"odd names"}
 
     (folder / "K che.png").write_bytes(encoded(scene(4, 64, 48), ".png"))
-    clash = placerec("enroll", folder, "--map", "lab", status=1)
+    clash = placerec("enrol", folder, "--map", "lab", status=1)
     assert "would both have the id 'K-che'" in clash.stderr
 
 
@@ -176,12 +176,12 @@ def test_a_wrong_list_is_refused_before_anything_is_sent(
     placerec: Placerec, monday: Path, content: str, message: str
 ) -> None:
     (monday / "places.csv").write_text(content)
-    refused = placerec("enroll", monday, "--map", "lab", "--create", "--url", "http://127.0.0.1:1", status=1)
+    refused = placerec("enrol", monday, "--map", "lab", "--create", "--url", "http://127.0.0.1:1", status=1)
     assert message in refused.stderr
 
 
 def test_a_directory_without_images_is_refused(placerec: Placerec, tmp_path: Path) -> None:
-    refused = placerec("enroll", tmp_path / "nowhere", "--map", "lab", "--url", "http://127.0.0.1:1", status=1)
+    refused = placerec("enrol", tmp_path / "nowhere", "--map", "lab", "--url", "http://127.0.0.1:1", status=1)
     assert "cannot be read as a directory" in refused.stderr
 
 
@@ -220,7 +220,7 @@ def test_a_full_disk_ends_the_run(placerec: Placerec, tmp_path: Path) -> None:
     folder = many(tmp_path / "many", 5 * FIRST_BATCH)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), FullAfterOne) as full:
         threading.Thread(target=full.serve_forever, daemon=True).start()
-        stopped = placerec("enroll", folder, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
+        stopped = placerec("enrol", folder, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
         full.shutdown()
     assert f"The disk is full. {FIRST_BATCH} of 80 frames are enrolled; run the command again" in stopped.stderr
     assert FullAfterOne.taken <= 3  # what comes after the batch that was under way meanwhile was not sent
@@ -240,7 +240,7 @@ def test_many_frames_keep_their_order_and_are_not_sent_twice(
 ) -> None:
     folder, url = many(tmp_path / "many", 60), server.client.base_url
     (folder / "17.jpg").write_bytes(b"not an image")
-    first = placerec("enroll", folder, "--map", map_id, "--url", url, status=1)
+    first = placerec("enrol", folder, "--map", map_id, "--url", url, status=1)
     assert "59 of 60 frames are places" in first.stdout and "59 sent" in first.stdout
     assert "Error: 17.jpg: " in first.stderr
     items = server.client.get(f"/v1/maps/{map_id}/places", params={"limit": 100}).json()["items"]
@@ -248,12 +248,12 @@ def test_many_frames_keep_their_order_and_are_not_sent_twice(
 
     (folder / "17.jpg").write_bytes(jpeg(170, 96, 72))
     (folder / "30.jpg").write_bytes(jpeg(300, 96, 72))
-    second = placerec("enroll", folder, "--map", map_id, "--url", url)
+    second = placerec("enrol", folder, "--map", map_id, "--url", url)
     assert "60 of 60 frames are places" in second.stdout
     assert "1 created, 1 replaced, 58 unchanged" in second.stdout and "2 sent" in second.stdout
 
     (folder / "places.csv").write_text(HEADER + "5.jpg,,1,2,,,,,\n")
-    moved = placerec("enroll", folder, "--map", map_id, "--url", url)
+    moved = placerec("enrol", folder, "--map", map_id, "--url", url)
     assert "1 updated" in moved.stdout and "0 sent" in moved.stdout
     assert server.client.get(f"/v1/maps/{map_id}/places/5").json()["pose"]["x"] == 1.0
 
@@ -263,7 +263,7 @@ def test_a_service_that_takes_little_at_a_time(
     placerec: Placerec, tmp_path: Path, tight_server: Server, tight_map: str
 ) -> None:
     folder = many(tmp_path / "many", 14)
-    done = placerec("enroll", folder, "--map", tight_map, "--url", tight_server.client.base_url)
+    done = placerec("enrol", folder, "--map", tight_map, "--url", tight_server.client.base_url)
     assert "14 of 14 frames are places" in done.stdout
     items = tight_server.client.get(f"/v1/maps/{tight_map}/places").json()["items"]
     assert [place["id"] for place in items] == [str(index) for index in range(14)]
@@ -280,7 +280,7 @@ def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) ->
         for index in range(count):
             # 300 KB each: all of the larger folder would be 360 MB.
             (folder / f"{index}.jpg").write_bytes(jpeg(index % 40, 96, 72) + index.to_bytes(4) + bytes(300_000))
-        words = ["enroll", str(folder), "--map", name, "--create", "--url", str(server.client.base_url)]
+        words = ["enrol", str(folder), "--map", name, "--create", "--url", str(server.client.base_url)]
         process = subprocess.Popen([sys.executable, "-m", "service.commands", *words], cwd=ROOT)
         peak = 0
         while process.poll() is None:
@@ -298,7 +298,7 @@ def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) ->
 def test_the_data_of_a_running_service_is_left_alone(
     placerec: Placerec, monday: Path, server: Server, client: httpx.Client
 ) -> None:
-    refused = placerec("enroll", monday, "--map", "left-alone", "--create", "--data-dir", server.data_dir, status=1)
+    refused = placerec("enrol", monday, "--map", "left-alone", "--create", "--data-dir", server.data_dir, status=1)
     assert refused.stderr.startswith("Error: ")
     assert "Traceback" not in refused.stderr
     assert "--url" in refused.stderr

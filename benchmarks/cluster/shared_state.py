@@ -1,6 +1,6 @@
 """What it costs that services share their state in PostgreSQL, beside the files of a data directory.
 
-    python -m benchmarks.shared_state [--rounds 200]
+    python -m benchmarks.cluster.shared_state [--rounds 200]
 
 starts a PostgreSQL of its own (that of the system) and prints medians over the rounds, in milliseconds.
 """
