@@ -112,7 +112,7 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Step:
-    """What is known about the motion between two frames; nothing for a run's first frame.
+    """The known motion between two frames; unknown for a run's first frame.
 
     odometry: None if the robot reports none.
     reach: the metres that the robot can have moved, by its speed limit and the time between; None if not known.

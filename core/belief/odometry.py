@@ -1,6 +1,6 @@
 """Where odometry says that the robot is, and the motion between two such poses.
 
-A pose is told anew with every frame, so that nothing is lost or counted twice if a frame or an answer to it is lost:
+A pose is sent anew with every frame, so that nothing is lost or counted twice if a frame or an answer to it is lost:
 the motion is always the one since the last frame that was taken in.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from core.belief.motion import Odometry
 
 FASTEST = 100.0
-"""Metres per second.  Odometry that tells a faster motion has begun anew, or was set."""
+"""Metres per second.  Odometry that reports a faster motion has begun anew, or was set."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def vectors(index: faiss.IndexFlatCodes) -> Vectors:
 
 
 def selector(chosen: Flags) -> faiss.IDSelector:
-    """What lets a search find only the chosen rows; bool [capacity]."""
+    """The selector that limits a search to the chosen rows; bool [capacity]."""
     return faiss.IDSelectorBitmap(np.packbits(chosen, bitorder="little"))
 
 

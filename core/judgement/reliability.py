@@ -36,7 +36,7 @@ class Bin(BaseModel):
 
 
 class Reliability(BaseModel):
-    """What stated probabilities are worth, over n answers whose truth is known."""
+    """The reliability of stated probabilities over n answers whose truth is known."""
 
     answers: int
     right: int

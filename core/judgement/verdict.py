@@ -50,17 +50,18 @@ Likeness = Callable[[Positions], NDArray[np.float32]]
 """Returns what the best match scores, as if it were the query, at positions in a ranking; int64 [k] to float32 [k]."""
 
 ALIKE = 2.5
-"""A place shows the same as the best match if its score against it has a decision value of so many thresholds.  On
-corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no share of the verdicts by more than 0.05."""
+"""A place shows the same as the best match if the decision value of its score against it is this multiple of the
+threshold.  On corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no share of the verdicts by more
+than 0.05."""
 
 MOST_RIVALS = 8
-"""So many rivals, each with its neighbours, are looked at; they are the best ones."""
+"""The largest number of rivals, the best ones, that are examined, each with its neighbours."""
 
 MOSTLY_IMAGINED = 0.5
 """A map of which more of the background than this is imagined has few places."""
 
 DOUBT = (0.1, 0.5)
-"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, asked of the whole other
+"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, queried in the whole other
 traverse, two stages leave 0.27 and 0.23 there."""
 
 
@@ -69,7 +70,7 @@ class Calibration(BaseModel):
 
     ``threshold`` is on the decision value, ``margin`` on the difference of
     two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
-    frames, in units of the score.  ``curve`` tells how probable a decision value is right; a calibration on
+    frames, in units of the score.  ``curve`` gives the probability that a decision value is right; a calibration on
     frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map does
     not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
@@ -210,7 +211,7 @@ def stands_out(decision: float, calibration: Calibration, imagined: float = 0.0,
 def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
     """Whether ``verify=auto`` verifies candidates after this judgement, because it leaves doubt.
 
-    It is asked after two stages, and again after their best match alone was verified, whose evidence may settle it.  In
+    It is called after two stages, and again after only their best match was verified: its evidence may settle it.  In
     a map of a few places two stages always leave doubt.
 
     Args:

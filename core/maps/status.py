@@ -1,4 +1,4 @@
-"""What a map reports of itself: how it is searched, and what it takes."""
+"""The status of a map: how it is searched, and its size on disk."""
 
 from __future__ import annotations
 
@@ -63,15 +63,15 @@ class KeypointsStatus(BaseModel):
 
 
 class StorageStatus(BaseModel):
-    """What a map takes on disk."""
+    """The size of a map on disk."""
 
     model_config = ConfigDict(frozen=True)
 
-    precision: str = Field(description="How descriptors are kept.")
+    precision: str = Field(description="How descriptors are stored.")
     bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
     descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
     index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
     database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata, pictures, keypoints.")
     keypoints: KeypointsStatus | None = Field(
-        description="Of how many places keypoints are kept; null until the map is first used after a start."
+        description="The number of places with stored keypoints; null until the map is first used after a start."
     )

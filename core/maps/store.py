@@ -1,7 +1,7 @@
-"""What is asked of a store of maps, of one of its maps, and of that map at one moment.
+"""The interfaces of a store of maps, of one of its maps, and of that map at one moment.
 
 These are interfaces; :mod:`core.storage` implements them in a data directory.  Recognition knows nothing else of where
-maps are kept, and ``docs/explanation/stores.md`` says why the interfaces are as they are.
+maps are stored, and ``docs/explanation/stores.md`` says why the interfaces are as they are.
 
 Whatever stores it, a descriptor stands in a *row* of its map: a number that is given to one frame of one place and is
 never used again.  A search returns rows.
@@ -25,9 +25,9 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
     MapSettings,
+    PicturedPlace,
     Precision,
     SameFrame,
     SequenceSummary,
@@ -42,7 +42,7 @@ from core.places import Neighborhood, Place, PlaceFields, Whereabouts
 Rows = NDArray[np.int64]
 
 HANDED_OVER, HAS_PICTURE = 1, 2
-"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is kept."""
+"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is stored."""
 
 Ranking = tuple[Rows, NDArray[np.float32]]
 """Rows, best first, and their inner products."""
@@ -169,7 +169,7 @@ class Plan(Protocol):
         place has one.
 
         Args:
-            step: about every so many places are listed.
+            step: about one place in every ``step`` is listed.
         """
 
 
@@ -198,7 +198,7 @@ class Map(Protocol):
 
     @property
     def review(self) -> Review:
-        """The frames that are kept to be reviewed."""
+        """The frames that are stored to be reviewed."""
 
     @property
     def plan(self) -> Plan:
@@ -235,7 +235,7 @@ class Map(Protocol):
         """The places of rows that a search returned; None where a place was deleted or got another frame since."""
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
-        """The keypoints of those places; None also where none are kept."""
+        """The keypoints of those places; None also where none are stored."""
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
@@ -281,7 +281,7 @@ class Map(Protocol):
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
         """Those of the names that no sequence has."""
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
 
         Args:
@@ -290,7 +290,7 @@ class Map(Protocol):
         """
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
 
         Raises:
             StorageFailure: the picture is damaged.
@@ -306,7 +306,7 @@ class Map(Protocol):
             MemoryError: its pixels do not fit into memory.
         """
 
-    # How it is kept
+    # How it is stored
 
     def index_status(self) -> IndexStatus:
         """How the map is searched; this does not wait."""
@@ -315,7 +315,7 @@ class Map(Protocol):
         """Build what makes searches fast again from the descriptors; searches use the present one meanwhile.
 
         Args:
-            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+            progress: called with the number of rows that are done and of all; if it raises, nothing changes.
         """
 
     def storage_status(self) -> StorageStatus:
@@ -358,7 +358,7 @@ class Map(Protocol):
             UnknownPlace, InvalidField.
         """
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that :meth:`without_keypoints` listed, in one write.
 
         A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all

@@ -1,6 +1,6 @@
 """Making a map of an export file in PostgreSQL and Milvus.
 
-The map is kept unlisted, under a name that no map can have, until all of it is there; what a crash leaves of it is
+The map is stored unlisted, under a name that no map can have, until all of it is there; what a crash leaves of it is
 removed a while later.
 """
 
@@ -61,9 +61,9 @@ class Importing(Unpacking):
 
     def put_places(self, lines: Sequence[PlaceLine], frames: NDArray[np.void], contents: Iterator[Content]) -> None:
         with self._map.writing() as write:
-            for line, kept, content in zip(lines, frames, contents, strict=True):
-                descriptor, local = self._form.divided(kept.tobytes())
-                picture = write.kept(None if content.picture is None else content.picture[0])
+            for line, frame, content in zip(lines, frames, contents, strict=True):
+                descriptor, local = self._form.divided(frame.tobytes())
+                picture = write.stored_picture(None if content.picture is None else content.picture[0])
                 try:
                     write.put_new(self._entry(write, line), Frame(descriptor, local, content.keypoints, picture))
                 except refusals.UniqueViolation:

@@ -28,8 +28,8 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
+    PicturedPlace,
     SameFrame,
     SequenceSummary,
     patched_fields,
@@ -47,7 +47,7 @@ from core.milvus.parts.exporter import MilvusExporter
 from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
-from core.milvus.pictures.kept import read_pictures
+from core.milvus.pictures.stored import read_pictures
 from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
@@ -101,7 +101,7 @@ class MilvusMap:
 
     @property
     def held(self) -> bool:
-        """False: other processes are asked for everything."""
+        """False: everything comes from other processes."""
         return False
 
     @property
@@ -150,8 +150,8 @@ class MilvusMap:
         last = self._last
         if last is not None and last.state == state:
             return last
-        leavings = tuple(ledger.leavings(connection, self.number))
-        return MilvusSnapshot(self._database, self.collection, state, leavings)
+        orphans = tuple(ledger.orphans(connection, self.number))
+        return MilvusSnapshot(self._database, self.collection, state, orphans)
 
     def scope(self, selection: Selection | None = None) -> MilvusScope:
         """The places that a query may find at this moment; None: all."""
@@ -166,11 +166,11 @@ class MilvusMap:
         return [found.get(int(row)) for row in rows]
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
-        """The keypoints of those places; None also where none are kept, and where they are damaged, which is logged."""
+        """The keypoints of those places; None also without any, and where they are damaged, which is logged."""
         with self._reading() as connection:
             entries = ledger.entries_by(connection, self.number, "row", [int(row) for row in rows])
-            kept = ledger.of_frames(connection, self.number, "keypoints", [entry.row for entry in entries])
-        return [None if (record := kept.get(int(row))) is None else _keypoints(int(row), record) for row in rows]
+            records = ledger.of_frames(connection, self.number, "keypoints", [entry.row for entry in entries])
+        return [None if (record := records.get(int(row))) is None else _keypoints(int(row), record) for row in rows]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
@@ -244,7 +244,7 @@ class MilvusMap:
         with self._reading() as connection:
             return set(names) - set(ledger.sequence_codes(connection, self.number, names))
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         """Places that keep their image or a thumbnail, and no keypoints, behind the number ``after``."""
         with self._reading() as connection:
             return ledger.without_keypoints(connection, self.number, after, limit)
@@ -258,19 +258,19 @@ class MilvusMap:
             StorageFailure: the picture is missing or damaged.
             MemoryError: its pixels do not fit into memory.
         """
-        entry, kept = self._picture_of(place_id)
+        entry, picture = self._picture_of(place_id)
         if entry is None:
             raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
-        if kept is None:
+        if picture is None:
             raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
         if entry.place.picture == "thumbnail":
-            return kept
+            return picture
         try:
-            return encode_thumbnail(decode(kept, ANY_SIZE))
+            return encode_thumbnail(decode(picture, ANY_SIZE))
         except InvalidImage as error:
-            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
+            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
 
-    # How it is kept
+    # How it is stored
 
     def index_status(self) -> IndexStatus:
         """How the map is searched: by Milvus, which compares every place if its collection has no other index."""
@@ -290,7 +290,7 @@ class MilvusMap:
         """Give Milvus all descriptors again, some at a time; searches use those that it has meanwhile.
 
         Args:
-            progress: is told how many places of how many are done; what it raises ends the work, and what was done
+            progress: called with the number of places done and of all; its exceptions end the work, and the part done
                 until then stays.
         """
         done, after, total = 0, -1, self.count_places()
@@ -324,7 +324,7 @@ class MilvusMap:
             return self._room[1]
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
 
         Raises:
             StorageFailure: the picture is missing or damaged.
@@ -339,9 +339,9 @@ class MilvusMap:
                 entry = ledger.find(connection, self.number, place_id)
                 if entry is None:
                     return None, None
-                kept = ledger.pictures_of(connection, self.number, [entry.row])
-            found = read_pictures(self.objects, kept)
-            if entry.row in found or entry.row not in kept:
+                pictures = ledger.pictures_of(connection, self.number, [entry.row])
+            found = read_pictures(self.objects, pictures)
+            if entry.row in found or entry.row not in pictures:
                 return entry, found.get(entry.row)
             if entry.row == before:
                 raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
@@ -400,7 +400,7 @@ class MilvusMap:
         """Delete what was left over a while ago; what cannot be deleted now is deleted after another write."""
         try:
             with self._database.transaction("delete what is left over") as connection:
-                if keys := ledger.old_leavings(connection, self.number):
+                if keys := ledger.old_orphans(connection, self.number):
                     self.collection.delete(keys)
                     ledger.clear(connection, self.number, keys)
         except StorageFailure as error:
@@ -463,7 +463,7 @@ class MilvusMap:
             entry = write.expect(place_id)
             return write.set_fields(entry, patched_fields(entry.place, changes))[0]
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that have none (:meth:`core.maps.store.Map.add_keypoints`)."""
         if not found:
             return 0

@@ -32,7 +32,7 @@ SHORTLIST = 100
 MOST_KNOWN = 10_000
 """Places that a snapshot remembers, so that what was read of a place stays as it was."""
 
-_SPARE = 1.25  # that more entities are asked for, because some are no place's any more or beyond an edge
+_SPARE = 1.25  # the factor of entities requested, for some are no place's any more or beyond an edge
 _MORE = 4  # by this factor, if these were too few
 
 Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
@@ -47,13 +47,13 @@ class MilvusSnapshot:
     frame for ever, but its place may have got another pose.
 
     state: of the map at that moment.
-    leavings: the keys of entities that were no place's any more.
+    orphans: the keys of entities that were no place's any more.
     """
 
     database: Database
     collection: Collection
     state: MapState
-    leavings: tuple[int, ...] = ()
+    orphans: tuple[int, ...] = ()
     _known: dict[int, PlaceEntry] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -68,7 +68,7 @@ class MilvusSnapshot:
         """The places of rows that a search found, as it found them, and else as they are now.
 
         Raises:
-            UnknownPlace: the place of a row was deleted, or got another frame, before it was asked for.
+            UnknownPlace: the place of a row was deleted, or got another frame, before it was requested.
         """
         found = {row: entry for row in rows.tolist() if (entry := self._known.get(row)) is not None}
         if missing := [row for row in rows.tolist() if row not in found]:
@@ -144,7 +144,7 @@ class MilvusSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of a place with some probability.
+    """The known facts about a place that hold with some probability.
 
     constraints: on pose, time and sequence.
     tokens: of values that its metadata has.
@@ -192,10 +192,10 @@ class MilvusScope:
         listed = set(ranking[0].tolist())
 
         def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
-            kept = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
+            matching = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
             if neighborhood is None:
-                return kept
-            return kept & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
+                return matching
+            return matching & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
 
         expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
         where = there.whereabouts()
@@ -211,8 +211,8 @@ class MilvusScope:
     def living_rows(self) -> Rows:
         """The rows of the places of the scope, int64 [n], ascending."""
         entries = self.snapshot.all_entries
-        kept = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
-        return np.array(sorted(kept), np.int64)
+        matching = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
+        return np.array(sorted(matching), np.int64)
 
     def weights_at(self, rows: Rows) -> Values | None:
         """The log prior of rows, float64 [n]; None if there is no prior."""
@@ -237,7 +237,7 @@ class MilvusScope:
         if not len(queries) or not len(snapshot):
             return [nothing] * len(queries)
         wanted = len(snapshot) if len(snapshot) < COMPACT_FROM else SHORTLIST
-        unused = (f"not (key in {list(snapshot.leavings)})",) if snapshot.leavings else ()
+        unused = (f"not (key in {list(snapshot.orphans)})",) if snapshot.orphans else ()
         bounds = f"row < {snapshot.rows}"
         expression = all_of((f"map == {snapshot.state.number}", bounds, *unused, *expressions))
         limit = min(MOST_FOUND, int(_SPARE * wanted) + 10)
@@ -259,9 +259,9 @@ class MilvusScope:
         keys = np.unique(np.concatenate([found for found, _ in hits])).tolist()
         with snapshot.database.reading() as connection:
             entries = ledger.entries_by(connection, snapshot.state.number, "key", keys)
-        kept = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
-        snapshot.note(kept)
-        rows = {entry.key: entry.row for entry in kept}
+        matching = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
+        snapshot.note(matching)
+        rows = {entry.key: entry.row for entry in matching}
         rankings = []
         for found, products in hits:
             there = np.array([key in rows for key in found.tolist()], np.bool_)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects
 
 MOST_MAPS = 1000
-"""Maps of which an object is kept, so that whoever asks for a map twice gets the same one."""
+"""The largest number of maps with a cached object; a second call for a map returns the same one."""
 
 IMPORTED = ".import-"
 """How the names begin under which imports keep their maps; no map id begins like this."""
@@ -92,7 +92,7 @@ class MilvusStore:
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
             unlisted: only :meth:`unlisted` finds the map until it is published.
-            precision: how its descriptors are kept in PostgreSQL, and so what Milvus compares.
+            precision: how its descriptors are stored in PostgreSQL, and so what Milvus compares.
 
         Raises:
             InvalidIdentifier: the id is malformed.
@@ -289,7 +289,7 @@ class MilvusStore:
             with suppress(UnknownMap):  # it was published, or removed
                 log.warning("The unfinished map %s is removed: nobody has written to it for a while", name)
                 self._remove(name, number)
-        # What is in a collection that no map is in may be another database's.
+        # A collection without a map of this database may be another database's.
         ours = [self._collection_of(*encoder) for encoder in encoders]
         return sweep(self._database, [collection for collection in ours if collection.id in used])
 
@@ -356,8 +356,8 @@ class MilvusStore:
             self._maps.pop(found.number, None)
         # The number of a deleted map is never used again, so what stays in Milvus is never found.
         try:
-            for start in range(0, len(keys), ledger.LEAVINGS_AT_ONCE):
-                collection.delete(keys[start : start + ledger.LEAVINGS_AT_ONCE])
+            for start in range(0, len(keys), ledger.ORPHANS_AT_ONCE):
+                collection.delete(keys[start : start + ledger.ORPHANS_AT_ONCE])
         except StorageFailure as error:
             log.warning("Map %s is deleted; its descriptors stay in Milvus: %s", map_id, error)
 

@@ -14,7 +14,7 @@ from core.errors import UnknownMap
 from core.milvus import ledger
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.database import Database
-from core.milvus.pictures.kept import before_key, key_of
+from core.milvus.pictures.stored import before_key, key_of
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects
@@ -51,8 +51,8 @@ def sweep(database: Database, collections: list[Collection]) -> int:
                     continue
                 with database.reading() as connection:
                     orphans = sorted(set(found) - ledger.known_keys(connection, found))
-                for start in range(0, len(orphans), ledger.LEAVINGS_AT_ONCE):
-                    collection.delete(orphans[start : start + ledger.LEAVINGS_AT_ONCE])
+                for start in range(0, len(orphans), ledger.ORPHANS_AT_ONCE):
+                    collection.delete(orphans[start : start + ledger.ORPHANS_AT_ONCE])
                 count += len(orphans)
     if count:
         log.warning("%d descriptors of writes that came to no end are deleted from Milvus", count)

@@ -398,7 +398,7 @@ class Atlas:
             removed = self._rename_removed(found, self._folder / map_id, self._maps)
             self._damaged.pop(map_id, None)
             self._refused.pop(map_id, None)
-        # What cannot be deleted now is deleted at the next start.
+        # Files that cannot be deleted now are deleted at the next start.
         shutil.rmtree(removed, ignore_errors=True)
 
     def check_writable(self) -> None:

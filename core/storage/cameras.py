@@ -38,7 +38,7 @@ class Cameras(AnyCameras):
     def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
         self._reading, self._writing = reading, writing
         self._known: dict[str, CameraRecord] | None = None
-        self._changes = 0  # counts changes, so that a reading that began before a change is not kept
+        self._changes = 0  # counts changes, so that a reading that began before a change is not cached
         self._lock = threading.Lock()  # of both; never held while reading or writing, which take other locks
 
     def all(self) -> list[CameraRecord]:

@@ -44,7 +44,7 @@ class Counterparts:
     def copy(self, other: Counterparts, names: Mapping[str, str]) -> None:
         """Bring places that were copied from another map to the stations that they have there, in one COMMIT.
 
-        A station is told by the nearest frame of its track that both maps have.  If they have none, as where the
+        A station is derived from the nearest frame of its track that both maps have.  If they have none, as where the
         sequence is gone, the places on the track come to a new one, which no sequence has.
 
         Args:

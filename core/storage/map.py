@@ -30,8 +30,8 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
+    PicturedPlace,
     SameFrame,
     SequenceSummary,
     VerifyReport,
@@ -78,11 +78,11 @@ class RecentPlaces:
     """
 
     def __init__(self) -> None:
-        self._kept: tuple[object, dict[int, Place]] = (object(), {})
+        self._cached: tuple[object, dict[int, Place]] = (object(), {})
 
     def places(self, state: object, rows: Iterable[int]) -> dict[int, Place]:
         """The places of ``rows`` that were read in this state of the map (``Database.state``)."""
-        of, places = self._kept
+        of, places = self._cached
         if of is not state:
             return {}
         found = ((row, places.get(row)) for row in rows)
@@ -91,11 +91,11 @@ class RecentPlaces:
     def keep(self, state: object, places: Mapping[int, Place]) -> None:
         """Remember places that were read after the map was found in this state."""
         small = {row: place for row, place in places.items() if len(str(place.metadata)) <= LONGEST_METADATA}
-        of, kept = self._kept
-        if of is not state or len(kept) + len(small) > MOST_RECENT:
-            self._kept = (state, dict(list(small.items())[:MOST_RECENT]))
+        of, cached = self._cached
+        if of is not state or len(cached) + len(small) > MOST_RECENT:
+            self._cached = (state, dict(list(small.items())[:MOST_RECENT]))
         else:
-            kept.update(small)
+            cached.update(small)
 
 
 class Map:
@@ -238,7 +238,7 @@ class Map:
             yield
 
     def _indexed(self, opened: OpenMap) -> IndexedMap:
-        """What the indexer needs of the map."""
+        """The part of the map that the indexer uses."""
 
         def publish(change: Callable[[Snapshot], Snapshot]) -> Snapshot:
             with self._lock:
@@ -265,7 +265,7 @@ class Map:
         A map that is searched exactly has none, so nothing is done.
 
         Args:
-            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+            progress: called with the number of rows that are done and of all; if it raises, nothing changes.
 
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
@@ -334,7 +334,7 @@ class Map:
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
         """Change settings (the fields of MapSettings) or ``calibration`` (None: use that of the encoder).
 
-        ``keep`` applies to frames enrolled later; pictures that are kept already stay.  The revision grows by one if
+        ``keep`` applies to frames enrolled later; pictures that are stored already stay.  The revision grows by one if
         anything changes.
 
         Raises:
@@ -402,7 +402,7 @@ class Map:
             stored = ledger.expect(write.connection, place_id)
             return write.set_fields(stored, patched_fields(stored.place, changes))[0]
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that :meth:`without_keypoints` listed, with one COMMIT.
 
         A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
@@ -539,15 +539,15 @@ class Map:
         """The keypoints of the places of rows that a search returned, read from disk.
 
         Returns:
-            In the order of ``rows``; None where a place was deleted or got another frame since, where none are kept,
-            and where those that are kept are damaged, which is logged.
+            In the order of ``rows``; None where a place was deleted or got another frame since, where none are stored,
+            and where the stored ones are damaged, which is logged.
         """
         wanted = [int(row) for row in rows]
         with self._reading() as connection:
             found = keypoints.at_rows(connection, wanted)
         return [found.get(row) for row in wanted]
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
 
         Args:
@@ -558,7 +558,7 @@ class Map:
             return keypoints.frames_without(connection, after, limit)
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
 
         Raises:
             StorageFailure: the picture is damaged.
@@ -578,15 +578,15 @@ class Map:
         """
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
-            kept = ledger.picture(connection, stored.number, place_id)
-        if kept is None:
+            picture = ledger.picture(connection, stored.number, place_id)
+        if picture is None:
             raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
         if stored.place.picture == "thumbnail":
-            return kept
+            return picture
         try:
-            return encode_thumbnail(decode(kept, ANY_SIZE))
+            return encode_thumbnail(decode(picture, ANY_SIZE))
         except InvalidImage as error:
-            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
+            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
 
     def verify(self, progress: Progress = no_progress) -> VerifyReport:
         """Read all files of the map again and check them; writes and searches go on meanwhile.

@@ -206,7 +206,7 @@ def read_snapshot(
         getattr(whereabouts, name)[columns.rows] = column
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
-    # What a map was searched by before is not known, but by the number of its places it may be as it was.
+    # The index that a map had before is not known, but the number of its places allows it to be as it was.
     table = _load_codes(files, entries)
     present: Tier = "compact" if len(table) else "exact"
     tier = tier_for(record.index, len(columns.rows), present)

@@ -52,7 +52,7 @@ class Plan:
         array with null where a place has no value, or null if no place has one.
 
         Args:
-            step: about every so many places are listed.
+            step: about one place in every ``step`` is listed.
         """
         with self._reading() as connection:
             connection.execute("BEGIN")  # both queries see the same moment

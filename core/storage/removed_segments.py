@@ -67,7 +67,7 @@ class RemovedSegments:
             query = "SELECT count(*) FROM places WHERE row >= ? AND row < ?"
             (places,) = connection.execute(query, (number * size, (number + 1) * size)).fetchone()
             if places:
-                log.error("%s is kept: it has %s places that are not searched.", segment_name(number), places)
+                log.error("%s is not removed: it has %s places that are not searched.", segment_name(number), places)
                 continue
             connection.execute("UPDATE segments SET removed = 1 WHERE number = ?", (number,))
             self._waiting[number] = weakref.ref(segment.reading)

@@ -1,4 +1,4 @@
-"""Frames that a map was told to keep because its answers were doubtful, and what people say that they show.
+"""Frames that a map stores because its answers were doubtful, and people's labels of them.
 
 They are in a small SQLite file of their own in the map's folder, ``review.sqlite``, and go with the map.  A frame is
 stored whole or not at all.  The file is bounded by the map's setting: the oldest frame without a label goes first, then
@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 
 class ReviewFrames:
-    """The kept frames of one map.  Any thread may use it; the file is made with the first frame.
+    """The frames of one map that are stored for review.  Any thread may use it; the file is made with the first frame.
 
     Every method may raise StorageFull and StorageFailure.
 
@@ -84,7 +84,7 @@ class ReviewFrames:
         """Keep a frame, and drop the oldest ones beyond the limits; it is synced when this returns.
 
         Returns:
-            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
+            Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.
         """
         if len(data) > setting.most_bytes:
             return False
@@ -111,7 +111,7 @@ class ReviewFrames:
             connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
-        """The latest frames, newest first, and how many are kept in all, as of one moment.
+        """The latest frames, newest first, and how many are stored in all, as of one moment.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -134,7 +134,7 @@ class ReviewFrames:
         """One frame.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
         with self._using() as connection:
             return _frame(_expect(connection, number))
@@ -143,7 +143,7 @@ class ReviewFrames:
         """The file of a frame.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
             StorageFailure: it is damaged.
         """
         with self._using() as connection:
@@ -156,7 +156,7 @@ class ReviewFrames:
 
     @contextmanager
     def held(self, number: int) -> Iterator[None]:
-        """Have a frame, if it is kept, not dropped for newer ones until the block ends; one at a time may hold it.
+        """Protect a frame, if it is stored, from being dropped for newer ones until the block ends; one at a time.
 
         It does not wait for the disk.
         """
@@ -170,7 +170,7 @@ class ReviewFrames:
         """Say what a frame shows, in place of what was said before.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
         with self._using() as connection, transaction(connection):
             frame = _frame(_expect(connection, number))
@@ -182,7 +182,7 @@ class ReviewFrames:
         """Throw a frame away.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
         with self._using() as connection, transaction(connection):
             _expect(connection, number)
@@ -241,7 +241,7 @@ def _drop_unsound(connection: sqlite3.Connection) -> None:
 
 
 def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: Container[int]) -> None:
-    """Drop frames, those without a label first and the oldest of these first, until the limits are kept.
+    """Drop frames, those without a label first and the oldest of these first, until the limits hold.
 
     Those that are held stay.
     """
@@ -254,7 +254,7 @@ def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: C
 
 
 def _size(connection: sqlite3.Connection) -> tuple[int, int]:
-    """How many frames are kept, and their bytes."""
+    """How many frames are stored, and their bytes."""
     count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
     return int(count), int(size)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, primary_code
 from core.geometry.keypoints import Keypoints
-from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
+from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, microseconds
@@ -101,7 +101,7 @@ class Write:
         self._now = datetime.now(UTC)
 
     def expect(self, frames: int) -> None:
-        """Allocate room for so many more frames at once, so that none has to be copied later."""
+        """Allocate room for more frames at once, so that none has to be copied later."""
         if (needed := self._appended + frames) > len(self._records):
             records = np.zeros(needed, self._layout.record)
             records[: self._appended] = self._records[: self._appended]
@@ -156,14 +156,14 @@ class Write:
             views.note(stored.ordinal, look)
 
     def _looks(self, rows: list[int]) -> list[Look]:
-        """What the frames in some rows show, those of this write included."""
+        """The content of the frames in some rows, those of this write included."""
         poses = {row: stored.place.pose for row, stored in ledger.stored_at(self.connection, rows).items()}
         before = self._snapshot.rows
         old = np.array([row for row in rows if row < before], np.int64)
         new = self._records[[row - before for row in rows if row >= before]]
-        kept = zip(self._snapshot.descriptors_at(old), self._snapshot.locals_at(old), strict=True)
+        stored = zip(self._snapshot.descriptors_at(old), self._snapshot.locals_at(old), strict=True)
         pending = zip(self._layout.descriptors_of(new), self._layout.locals_of(new), strict=True)
-        shown = dict(zip(old.tolist(), kept, strict=True))
+        shown = dict(zip(old.tolist(), stored, strict=True))
         shown |= dict(zip([row for row in rows if row >= before], pending, strict=True))
         return [Look(shown[row][0], shown[row][1], poses[row]) for row in rows]
 
@@ -201,7 +201,7 @@ class Write:
         if self.record.verification:
             keypoints.put(self.connection, stored.number, stored.digest, found.record())
 
-    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+    def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
         stored = ledger.find(self.connection, frame.id)
         if stored is None or stored.digest != frame.digest or keypoints.are_kept(self.connection, stored.number):

@@ -82,7 +82,7 @@ def _along(
 
     Args:
         sequence, ordinal: of the places, or their tracks and stations.
-        steps: a place is compared with so many places behind it.
+        steps: the number of places behind it with which a place is compared.
     """
     pairs = []
     order = np.lexsort((ordinal, sequence))

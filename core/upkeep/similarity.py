@@ -93,7 +93,7 @@ class GreyScale:
 def stretches_of(scores: NDArray[np.float32]) -> list[SharedStretch]:
     """The stretches that two traverses share by their scores, best first, with rows as ``first``.
 
-    If the second traverse has so many more frames that a path could not keep up with it, its frames are matched with
+    If the second traverse has too many frames for a path to keep up with it, its frames are matched with
     those of the first.
 
     Args:

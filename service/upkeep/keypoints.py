@@ -16,7 +16,7 @@ from core.frames.images import ANY_SIZE, decode
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import KeptFrame, Map
+from core.maps import Map, PicturedPlace
 from core.networks.xfeat import packaged_xfeat
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, yield_to_requests
@@ -44,7 +44,7 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     told: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
     total = map_.count_places()
     while places := map_.without_keypoints(told["after"], PLACES_PER_COMMIT):
-        made: list[tuple[KeptFrame, Keypoints]] = []
+        made: list[tuple[PicturedPlace, Keypoints]] = []
         for place in places:
             yield_to_requests(engine, context)
             try:
@@ -69,7 +69,7 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     }
 
 
-def _keypoints(map_: Map, place: KeptFrame) -> Keypoints:
+def _keypoints(map_: Map, place: PicturedPlace) -> Keypoints:
     """The keypoints in the picture that a map keeps of a place.
 
     Raises:

@@ -48,7 +48,7 @@ class Stopped(Exception):
 
 @dataclass(frozen=True)
 class IndexedMap:
-    """What the indexer uses of its map.
+    """The interface of a map for its indexer.
 
     setting: returns the tier that the owner chose.
     snapshot: returns the newest snapshot.

@@ -272,7 +272,7 @@ class Snapshot:
         in_memory: Callable[[Segment, int], NDArray[Any]],
         on_disk: Callable[[RowReader, NDArray[np.int64], NDArray[np.uint32]], NDArray[Any]],
     ) -> None:
-        """Fill ``found`` with what is kept of rows, by what gives a held row of a segment and what reads others."""
+        """Fill ``found`` with the stored data of rows: a row of a segment, or rows on disk."""
         self._check_rows(rows)
         held = self._held[rows]
         for position in np.flatnonzero(held).tolist():

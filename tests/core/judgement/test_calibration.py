@@ -109,7 +109,7 @@ def test_too_few_frames_are_refused(frames: int) -> None:
 def test_a_map_whose_answers_tell_nothing_is_refused() -> None:
     trials = drawn(300)
     noise = np.random.default_rng(1).random(len(trials))
-    with pytest.raises(CalibrationImpossible, match="hardly be told"):
+    with pytest.raises(CalibrationImpossible, match="hardly be distinguished"):
         fit_map_calibration(
             Trials(noise, trials.margin, trials.known, trials.right, trials.frame), BASE, PRECISE, "map"
         )

@@ -17,8 +17,8 @@ from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.maps import MapSettings, ReviewSetting
 from core.milvus import Bucket, ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.kept import StoredObject
 from core.milvus.pictures.objects import Objects
+from core.milvus.pictures.stored import StoredObject
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
 from tests.core.maps.review import check_pages_are_of_one_moment
@@ -110,7 +110,7 @@ def test_old_pictures_stay_where_they_are(store: MilvusStore, lab: MilvusMap, se
     lab.enrol([frame("new"), frame("replaced", "something else")])
     assert lab.picture("replaced") == image_of("something else") and where(lab, "new").size == len(image_of("new"))
     assert before.picture("old") == image_of("old")
-    with pytest.raises(StorageFailure, match="told of none"):
+    with pytest.raises(StorageFailure, match="configured without one"):
         before.picture("new")
     assert store.verify("lab").ok
     without.close()

@@ -77,7 +77,7 @@ def test_what_comes_back_is_what_was_there(
 def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
     with full._writing() as write:
         write.connection.execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE place = 1")
-    with pytest.raises(StorageFailure, match="The keypoints kept of place 'p0' do not match their checksum"):
+    with pytest.raises(StorageFailure, match="The stored keypoints of place 'p0' do not match their checksum"):
         full.exporter.write(tmp_path / "kept.tar")
     assert not (tmp_path / "kept.tar").exists()
 
