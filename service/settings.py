@@ -281,21 +281,21 @@ class Settings(BaseSettings):
         description="Seconds within which the whole file of a map has to arrive.",
     )
     max_exports: int = Field(
-        default=4, ge=1, le=1000, description="Most exports of maps that are kept for their downloads; then 503."
+        default=4, ge=1, le=1000, description="Most exports of maps that are stored for their downloads; then 503."
     )
     export_seconds: float = Field(
         default=3600.0,
         gt=0,
         le=7 * 24 * 3600,
         allow_inf_nan=False,
-        description="Seconds after its last use for which an export is kept, so that its download can continue.",
+        description="Seconds after its last use for which an export is stored, so that its download can continue.",
     )
     thumbnail_side: int = Field(default=320, ge=16, le=2048, description="Longer side of a thumbnail, in pixels.")
     job_workers: int = Field(
         default=1, ge=1, le=16, description="Jobs that run at the same time, at most one of each map."
     )
     job_queue: int = Field(default=32, ge=1, le=10_000, description="Most jobs that wait; then 503.")
-    job_history: int = Field(default=200, ge=1, le=100_000, description="Jobs that have ended and are still kept.")
+    job_history: int = Field(default=200, ge=1, le=100_000, description="Jobs that have ended and are still stored.")
     job_watchers: int = Field(
         default=64, ge=1, le=10_000, description="Most clients that follow jobs at the same time."
     )

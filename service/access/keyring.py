@@ -59,7 +59,7 @@ class HeldKeys:
 
 @dataclass
 class _Known:
-    """What is known of the keys; it is replaced as a whole.
+    """The keys as they were read; replaced as a whole.
 
     Args:
         demanded: whether a request needs a key.

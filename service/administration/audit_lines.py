@@ -161,7 +161,7 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 
 def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[AuditLine]:
-    """The lines that are kept in memory from the latest to the oldest.
+    """The lines that are held in memory from the latest to the oldest.
 
     Args:
         before: only lines before this one; None: all.

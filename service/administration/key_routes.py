@@ -182,7 +182,7 @@ def _take_effect(gate: Gate) -> None:
 
 
 def _noted(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """What the audit trail says of a change of a key, under names that do not hide who asked for it."""
+    """The fields of a changed key in the audit trail, under names that do not hide the caller's."""
     names = {"key": "changed_key", "name": "changed_key_name"}
     shown = {names.get(name, name): value for name, value in changes.items()}
     if shown.get("expires_at") is not None:

@@ -46,7 +46,7 @@ class QueueState(BaseModel):
     """The queue in front of the encoder."""
 
     waiting: int = Field(description="Requests that wait for the encoder or are in it.")
-    limit: int = Field(description="With so many, the next one is answered with 503.")
+    limit: int = Field(description="At this number the next one is answered with 503.")
 
 
 class ThreadsState(BaseModel):
@@ -91,7 +91,7 @@ class JobsState(BaseModel):
 class MemoryState(BaseModel):
     """Memory in bytes."""
 
-    resident: int | None = Field(description="Of the process; null where the system does not tell.")
+    resident: int | None = Field(description="Of the process; null where the system does not report it.")
     uploads: int = Field(description="Held by bodies of requests.")
     upload_limit: int
 

@@ -48,7 +48,7 @@ class JobView(BaseModel):
     state: JobState = Field(description="Queued, then running, then succeeded, failed or cancelled.")
     progress: Progress
     arguments: dict[str, Any] = Field(description="The arguments with which the job was submitted.")
-    cancelling: bool = Field(description="The job was asked to stop, and stops at the next point where it can.")
+    cancelling: bool = Field(description="The job was cancelled, and stops at the next point where it can.")
     resumable: bool = Field(description="The job goes on after a restart of the service; otherwise it then fails.")
     attempt: int = Field(description="How often the job was started.")
     result: dict[str, Any] | None = Field(description="The result, once the job has succeeded.")

@@ -1,4 +1,4 @@
-"""What a front does with its frames: it sends them to the replicas, several in one call where several wait.
+"""The encoders of a front: it sends frames to the replicas, several in one call where several wait.
 
 A call costs milliseconds of processor time however few frames it has.  So a replica that has nothing to do gets its
 share of what waits at once, and one that is at work gets a full batch ahead, or nothing: batches grow with the load,
@@ -281,7 +281,7 @@ class RayEncoders:
                 self._finish(frame, made)
 
     async def _call(self, frames: list[QueuedFrame], sent: list[SentFrame]) -> list[ReturnedFrame | Exception]:
-        """What a replica makes of frames; the call is cancelled as soon as nobody waits for any of them.
+        """Frames as a replica encodes them; the call is cancelled as soon as nobody waits for any of them.
 
         Raises:
             TimeoutError: it takes too long.
@@ -343,7 +343,7 @@ class RayEncoders:
 
 
 class _RayThread:
-    """The thread in which all that blocks is asked of Ray, one thing after the other.
+    """The thread for all blocking calls of Ray, one after the other.
 
     It is one as long as Ray answers, since the processes of a local Ray end with the thread that has started them.
     """
@@ -357,7 +357,7 @@ class _RayThread:
             work()
 
     def end(self) -> None:
-        """End the thread once it has done what it is asked."""
+        """End the thread once it has done its work."""
         self._work.put(None)
 
     async def ask(self, work: Callable[[], Made], seconds: float) -> Made:

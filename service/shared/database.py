@@ -23,7 +23,7 @@ MAKING_TABLES = 7_061_636_573
 
 
 def configure(connection: Connection[Any]) -> None:
-    """What is committed is durable, whatever the server's default is, and nothing takes for ever."""
+    """Settings by which a commit is durable, whatever the server's default is, and no statement takes for ever."""
     connection.execute("SET synchronous_commit TO on")
     connection.execute(f"SET statement_timeout TO '{STATEMENT_SECONDS}s'")
 

@@ -30,7 +30,7 @@ CHANNEL = "placerec"
 RECONNECT_SECONDS = 1.0
 
 Heard = Callable[[str | None], None]
-"""Is told what was said; None: the connection was lost for a while, so anything may have been said."""
+"""Called with a message; None: the connection was lost for a while, so any message may have been missed."""
 
 log = logging.getLogger("placerec.shared")
 
@@ -65,7 +65,7 @@ class ServiceReplica:
         self._tasks.append(task)
 
     def hear(self, topic: str, heard: Heard) -> None:
-        """Be told in a thread what services say about a topic; call it before :meth:`start`."""
+        """Call a function, in a thread, with the messages of services on a topic; before :meth:`start`."""
         self._heard[topic] = heard
 
     def start(self) -> None:
@@ -109,8 +109,8 @@ class ServiceReplica:
         return "ok" if self.living else next(iter(self._trouble.values()), "PostgreSQL cannot be reached.")
 
     def say(self, topic: str, text: str = "") -> None:
-        """Tell all services, this one included; what is said is not kept for those that do not hear it."""
-        self.database.execute("tell others", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
+        """Send a message to all services, this one included; it is not stored for those that are not connected."""
+        self.database.execute("notify other services", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
 
     # The threads
 

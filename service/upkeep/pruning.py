@@ -206,7 +206,7 @@ def _search(
     if not found:
         raise NothingToMeasure(
             "No frame of the map has another frame of the same place by which it could be recognized: there is nothing "
-            "to prune, or poses and sequences do not tell which places are the same."
+            "to prune, or poses and sequences do not show which places are the same."
         )
     positions, scores, gains, right = (np.stack(column) for column in zip(*found, strict=True))
     return RemovalTrial(positions, scores, gains, right, stage)

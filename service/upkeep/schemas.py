@@ -56,7 +56,7 @@ class Pruning(BaseModel):
         "frame is a query for which the map is searched without that frame. This overestimates recall, since the "
         "neighbouring frames were taken with it.",
     )
-    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="How many queries are asked at most.")
+    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="The largest number of queries.")
 
 
 class Aligning(BaseModel):
@@ -300,7 +300,7 @@ class ComparedTraverse(BaseModel):
 
 
 class SimilarityScale(BaseModel):
-    """What the 8-bit values of the matrix mean: a score is `low` + value / 255 · (`high` - `low`)."""
+    """The meaning of the 8-bit values of the matrix: a score is `low` + value / 255 · (`high` - `low`)."""
 
     low: float
     high: float

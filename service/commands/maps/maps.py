@@ -40,10 +40,10 @@ for name, command in (
 
 Description = Annotated[str | None, typer.Option(help="Description of the map.")]
 Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What the map keeps of each frame.")]
-Radius = Annotated[float | None, typer.Option(min=0, help="Places within so many metres count as the same place.")]
+Radius = Annotated[float | None, typer.Option(min=0, help="Places within this distance (metres) are the same place.")]
 Frames = Annotated[
     int | None,
-    typer.Option(min=0, help="Without poses: places within so many frames of a sequence count as the same place."),
+    typer.Option(min=0, help="Without poses: places this many frames apart in a sequence are the same place."),
 ]
 Verification = Annotated[
     bool | None,

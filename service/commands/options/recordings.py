@@ -52,15 +52,15 @@ LargestGap = Annotated[
 ]
 EveryMetres = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: take a frame after so many metres.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: a frame after this distance (metres).", rich_help_panel=PANEL, metavar="N"),
 ]
 EveryDegrees = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after a turn by so many degrees.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: or after this turn (degrees).", rich_help_panel=PANEL, metavar="N"),
 ]
 EverySeconds = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after so many seconds.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, help="Keyframes: or after this time (seconds).", rich_help_panel=PANEL, metavar="N"),
 ]
 EveryChange = Annotated[
     float | None,
@@ -123,7 +123,7 @@ class RecordingOptions:
         """The frames that are taken: the keyframes that the options ask for, or all.
 
         Args:
-            encoder: name or identity of that whose descriptors tell how much a frame has changed; None for the default.
+            encoder: name or identity of that whose descriptors show how much a frame has changed; None for the default.
             mask: what to ignore in the frames.
 
         Raises:
@@ -189,7 +189,7 @@ def without_standing(
 
 
 def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
-    """What describes frames by an encoder that is installed here; frames that cannot be used have no descriptor."""
+    """A function that describes frames by an encoder installed here; unusable frames have no descriptor."""
     import numpy as np
     from numpy.typing import NDArray
 

@@ -92,7 +92,7 @@ def encode_batch(encoder: Encoder, frames: Sequence[bytes]) -> list[Encoding]:
 def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
     """A run that answers an encoded query as the service does: both stages, verdict, look-up of the matches.
 
-    The map has so many sample places and lies in a temporary folder until the block ends.
+    The map has ``places`` sample places and lies in a temporary folder until the block ends.
     """
     query = Query(encoder.encode(sample_frame(0)), Question(MATCHES))
     with tempfile.TemporaryDirectory() as folder:

@@ -17,7 +17,7 @@ from service.errors.faults import TooManyListeners
 from service.events import events as module
 from service.events import feed as feeds
 from service.events.events import LINGER_SECONDS, Events
-from service.events.feed import Feed, Kept, Listener
+from service.events.feed import Feed, FeedEvent, Listener
 from service.events.schemas import MapEvent, QueryEvent
 from tests.service.scenes import jpeg
 
@@ -29,7 +29,7 @@ def add(feed: Feed, count: int = 1, size: int = 10) -> None:
     for _ in range(count):
         text = json.dumps({"number": feed.number + 1, "filler": "x" * size})
         with feed.lock:
-            feed.add(Kept(0, "map", None, frozenset({"lab"}), text, text, None))
+            feed.add(FeedEvent(0, "map", None, frozenset({"lab"}), text, text, None))
 
 
 def numbers(listener: Listener, most: int = 100) -> tuple[int | None, list[int]]:
@@ -68,16 +68,16 @@ async def test_an_id_that_is_not_known_is_answered_with_an_unknown_count(strange
 
 
 async def test_the_oldest_events_go_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feeds, "MOST_KEPT", 10)
+    monkeypatch.setattr(feeds, "MOST_EVENTS", 10)
     monkeypatch.setattr(feeds, "MOST_BYTES", 2000)
     feed = Feed(threading.Lock())
     listener = Listener(feed, None, False)
     add(feed, 25)
     assert numbers(listener) == (15, list(range(16, 26)))
     add(feed, 4, size=400)
-    assert feed.size <= 2000 and feed.size == sum(event.size for event in feed.kept)
+    assert feed.size <= 2000 and feed.size == sum(event.size for event in feed.latest)
     add(feed, 1, size=5000)
-    assert len(feed.kept) == 1, "an event that is larger than the limit is told all the same"
+    assert len(feed.latest) == 1, "an event that is larger than the limit is told all the same"
     assert numbers(listener) == (4, [30])
 
 
@@ -91,7 +91,7 @@ def test_whatever_the_pace_nothing_is_told_twice_or_lost_without_a_count(steps: 
         listener = Listener(feed, None, False)
         expected = 4  # the number of the next event
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(feeds, "MOST_KEPT", 17)
+            patched.setattr(feeds, "MOST_EVENTS", 17)
             for what, amount in [*steps, ("read", 1000)]:
                 if what == "add":
                     add(feed, amount)

@@ -106,12 +106,12 @@ def test_a_plan_that_is_too_long_names_a_step(
     made = plans.Plans()
     with pytest.raises(PlanTooLarge, match="step=3 "):
         made.make(lab, 1)
-    assert made.make(lab, 3) is made.kept(lab, 3)
+    assert made.make(lab, 3) is made.cached(lab, 3)
     monkeypatch.setattr(plans, "MOST_BYTES", len(made.make(lab, 3).compressed) + 1)
     made.make(lab, 4)
-    assert made.kept(lab, 3) is None and made.kept(lab, 4) is not None and made._bytes <= plans.MOST_BYTES
+    assert made.cached(lab, 3) is None and made.cached(lab, 4) is not None and made._bytes <= plans.MOST_BYTES
     lab.forget("p0")
-    assert made.kept(lab, 4) is None
+    assert made.cached(lab, 4) is None
     atlas.close()
     for wrong in ("0", "-1", "x"):
         assert_problem(server.client.get(f"/v1/maps/{map_id}/plan", params={"step": wrong}), 422, "invalid-request")
@@ -133,5 +133,5 @@ def test_only_the_plans_that_were_asked_for_last_are_kept(tmp_path: Path) -> Non
     made, steps = plans.Plans(), range(1, plans.MOST_KEPT + 3)
     for step in steps:
         made.make(lab, step)
-    assert [step for step in steps if made.kept(lab, step) is not None] == list(steps[2:])
+    assert [step for step in steps if made.cached(lab, step) is not None] == list(steps[2:])
     atlas.close()
