@@ -76,7 +76,7 @@ def train(
     """Train a vocabulary on a set of images and install the encoder that it makes.
 
     A network with a description says itself how it is aggregated; only the images, the seed and the limit count for it.
-    Four images in five train, the fifth is kept out to set threshold and margin of the verdict.
+    Four images in five train, the fifth is held out to set threshold and margin of the verdict.
     """
     # Imported here because they take a second.
     from pydantic import ValidationError

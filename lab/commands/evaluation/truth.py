@@ -34,11 +34,11 @@ class TruthOptions:
         ),
     ] = False
     metres: Annotated[
-        float | None, _option(metavar="N", min=0, help="With --poses: true if at most so many metres apart.")
+        float | None, _option(metavar="N", min=0, help="With --poses: true if at most this distance (metres) apart.")
     ] = None
     degrees: Annotated[
         float | None,
-        _option(metavar="N", min=0, max=180, help="With --poses: and if headings differ by at most so many degrees."),
+        _option(metavar="N", min=0, max=180, help="With --poses: and if headings differ by at most this angle."),
     ] = None
 
     def check(self) -> None:

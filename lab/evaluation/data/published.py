@@ -53,6 +53,6 @@ PUBLISHED = _published()
 
 
 def published_figures(protocol: str) -> list[Published]:
-    """What others have published of a protocol, the best first; nothing for folders without a name."""
+    """The published results of a protocol, the best first; nothing for folders without a name."""
     found = [one for one in PUBLISHED if one.protocol == protocol]
     return sorted(found, key=lambda one: -one.recall_at[0])

@@ -1,6 +1,6 @@
 """Charts by Matplotlib: each an SVG for the page, in the page's own colours, and a PNG file beside it.
 
-Figures are made by Matplotlib's objects, without ``pyplot``: nothing is kept between charts, and the same comparison
+Figures are made by Matplotlib's objects, without ``pyplot``: no state remains between charts, and the same comparison
 gives the same bytes.
 """
 

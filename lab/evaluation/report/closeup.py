@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Closeup:
-    """What the page shows of a run.
+    """The part of a run that the page shows.
 
     constants: of the system, as text.
     layers: addresses that hold the drawings of the matrix: heat, true references, best matches.

@@ -51,7 +51,7 @@ def wrong_first(outcomes: Sequence[Outcome], wrong: int, right: int) -> list[int
 
 
 def case(comparison: Comparison, run: Run, query: int) -> Case:
-    """What to show of a query.
+    """The view of a query in the gallery.
 
     Of a wrong match the best true reference, the one that was nearly chosen; of a right one the
     middle of the true ones, to see how far aside the match lies.

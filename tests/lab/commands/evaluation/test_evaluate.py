@@ -200,7 +200,7 @@ def test_a_cache_that_cannot_be_written_is_told(
 ) -> None:
     (tmp_path / "file").write_text("")
     words = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--encoder", "hog")
-    assert "Nothing was kept" in placerec("evaluate", *words, "--cache", tmp_path / "file").stderr
+    assert "Nothing was cached" in placerec("evaluate", *words, "--cache", tmp_path / "file").stderr
 
 
 def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
