@@ -1,4 +1,4 @@
-"""What an object store costs: places enrolled, pictures read, and the 30 frames of a query, with it and without.
+"""The cost of an object store: places enrolled, pictures read, and the 30 frames of a query, with it and without.
 
     python -m benchmarks.cluster.objects [--places 320] [--bytes 8000]
 

@@ -144,7 +144,7 @@ def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Mo
 
 
 def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float, same: bool, random: Random) -> bytes:
-    """What the camera sends; a view that is between two frames of the walk, or stays, is drawn anew each time."""
+    """The camera's picture; a view that is between two frames of the walk, or stays, is drawn anew each time."""
     nearest, out = round(at), abs(aside) > 1e-9
     if out:
         data = walk.strangers[round(aside / walk.spacing) % len(walk.strangers)]
@@ -164,7 +164,7 @@ def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float,
 
 
 def _measured(wheels: Pose, old: Pose, new: Pose, random: Random) -> Pose:
-    """What the odometry says after a motion: the motion with its errors, on top of what it said before."""
+    """The odometry after a motion: the motion with its errors, on top of what it said before."""
     way = (new.x - old.x) + 1j * (new.y - old.y)
     length = abs(way)
     slipped = way * np.exp(1j * (wheels.heading - old.heading)) * (1 + SLIP * random.normal())

@@ -78,7 +78,7 @@ class Walk:
         return along, np.cumsum(0.1 * np.exp(1j * BEND * np.sin(along / BEND_METRES)))
 
     def pose(self, metres: float, aside: float = 0.0) -> Pose:
-        """The pose at so many metres along the curve, ``aside`` metres to its left."""
+        """The pose at ``metres`` along the curve, ``aside`` metres to its left."""
         along, points = self._curve
         heading = BEND * float(np.sin(metres / BEND_METRES))
         x, y = (float(np.interp(metres, along, part)) for part in (points.real, points.imag))

@@ -1,8 +1,8 @@
-"""What keeping descriptors in fewer bits costs: AUC-PR of both stages, by how a map keeps what it searches.
+"""The cost of storing descriptors in fewer bits: AUC-PR of both stages, by the stored form that a map searches.
 
     python -m benchmarks.maps.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz]
 
-Queries are never kept and stay float32; references go through the storage's own packing and back.  ``first`` is
+Queries are never stored and stay float32; references go through the storage's own packing and back.  ``first`` is
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another
 reference is the best, and ``deviation`` by how much a first-stage score differs at most.
 """
@@ -41,14 +41,14 @@ def sides(encoder: Encoder, queries: Path, references: Path, cache: Path | None)
     if cache is not None and cache.is_file():
         with np.load(cache) as kept:
             return (kept["qd"], kept["ql"]), (kept["rd"], kept["rl"])
-    asked, known = encoded(encoder, queries), encoded(encoder, references)
+    queried, known = encoded(encoder, queries), encoded(encoder, references)
     if cache is not None:
-        np.savez(cache, qd=asked[0], ql=asked[1], rd=known[0], rl=known[1])
-    return asked, known
+        np.savez(cache, qd=queried[0], ql=queried[1], rd=known[0], rl=known[1])
+    return queried, known
 
 
 def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side, int]:
-    """What comes back of a side that was kept, or the side itself for float32, and bytes a place."""
+    """A side as it is read back from its stored form, or itself for float32, and bytes a place."""
     descriptors, local = side
     if precision == "float32":
         return side, descriptors[0].nbytes + local[0].nbytes
@@ -65,19 +65,19 @@ def main(
     references: Path,
     truth_file: Annotated[Path, typer.Argument(metavar="TRUTH.csv")],
     encoder: str = DEFAULT_ENCODER,
-    cache: Annotated[Path | None, typer.Option(help="Where encoded frames are kept, .npz.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Where encoded frames are stored, .npz.")] = None,
 ) -> None:
     """Measure, print a table and write JSON."""
     chosen = EncoderCatalogue().get(encoder)
-    asked, known = sides(chosen, queries, references, cache)
-    truth = read_ground_truth(truth_file, len(asked[0]), len(known[0]))
+    queried, known = sides(chosen, queries, references, cache)
+    truth = read_ground_truth(truth_file, len(queried[0]), len(known[0]))
     figures: dict[str, dict[str, float]] = {}
     exact_first = exact_best = None
     for precision in ("float32", *get_args(Precision)):
         back, size = at_rest(known, precision)
-        products = asked[0] @ back[0].T
+        products = queried[0] @ back[0].T
         first = chosen.scores_from_inner_products(products)
-        both = score_matrix(chosen, products, asked[1], back[1])
+        both = score_matrix(chosen, products, queried[1], back[1])
         if exact_first is None or exact_best is None:
             exact_first, exact_best = first, both.argmax(axis=1)
         figures[precision] = {
@@ -93,7 +93,7 @@ def main(
     ]
     columns = ["precision", "bytes a place", "first, AUC-PR", "both, AUC-PR", "changed", "deviation"]
     more = {"encoder": chosen.identity, "precisions": figures}
-    report("precision", f"{len(asked[0])} queries, {len(known[0])} references", columns, rows, more)
+    report("precision", f"{len(queried[0])} queries, {len(known[0])} references", columns, rows, more)
 
 
 def area(scores: NDArray[np.float32], truth: Truth) -> float:
