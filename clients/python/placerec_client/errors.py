@@ -1,4 +1,4 @@
-"""What can go wrong with a call: every error of this package is a :class:`PlacerecError`."""
+"""The errors of calls: every error of this package is a :class:`PlacerecError`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is sent: paths, query strings, JSON, forms."""
+"""The parts of requests: paths, query strings, JSON, forms."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def form(parts: Sequence[Part]) -> tuple[bytes, str]:
 
 
 def part_head(part: Part, boundary: str) -> bytes:
-    """What comes before the data of one part."""
+    """The bytes before the data of one part."""
     name = (
         text_of("the name of a frame", part.name)
         .replace("\\", "\\\\")
@@ -188,7 +188,7 @@ def part_head(part: Part, boundary: str) -> bytes:
 
 
 def part_end(boundary: str) -> bytes:
-    """What comes after the last part and its line end."""
+    """The bytes after the last part and its line end."""
     return f"--{boundary}--\r\n".encode()
 
 

@@ -1,4 +1,4 @@
-"""What the node knows of its own health: troubles, counters, times. It is what ``/diagnostics`` shows.
+"""The health of the node, as ``/diagnostics`` shows it: troubles, counters, times.
 
 A trouble that lasts is logged when it begins and when it is over. One of single frames is logged once in each wording.
 """

@@ -116,7 +116,7 @@ class Task(Generic[Result]):
         self._task.cancel()
         await asyncio.wait({self._task})
         if not self._task.cancelled():
-            self._task.exception()  # seen, so that nobody is told that it was not
+            self._task.exception()  # retrieved, so that asyncio does not report it
 
 
 Lock = asyncio.Lock
@@ -126,7 +126,7 @@ async def acquire(lock: Lock, seconds: float | None) -> None:
     """Take a lock, which those who ask for it get in their order.
 
     Raises:
-        TimeoutError: it has not become free within so many seconds; None waits for any time.
+        TimeoutError: it has not become free within ``seconds``; None waits for any time.
     """
     async with asyncio.timeout(seconds):
         await lock.acquire()

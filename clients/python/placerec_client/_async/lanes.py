@@ -24,7 +24,7 @@ class AsyncLanes(httpx.AsyncBaseTransport):
 
     Args:
         url: of the service.
-        idle: seconds for which a connection is kept without a request.
+        idle: seconds for which a connection stays open without a request.
     """
 
     def __init__(self, url: httpx.URL, idle: float) -> None:

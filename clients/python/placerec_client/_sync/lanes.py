@@ -25,7 +25,7 @@ class Lanes(httpx.BaseTransport):
 
     Args:
         url: of the service.
-        idle: seconds for which a connection is kept without a request.
+        idle: seconds for which a connection stays open without a request.
     """
 
     def __init__(self, url: httpx.URL, idle: float) -> None:

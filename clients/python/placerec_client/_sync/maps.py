@@ -292,7 +292,7 @@ class Map:
         """Send many frames in one request, and return the job that enrols them.
 
         Args:
-            places: all are read twice; none of them is kept in memory.
+            places: all are read twice; none of them is held in memory.
             align: whether the job then finds which frames show places that the map had already.
             encoder: name or identity that the map must have.
 
