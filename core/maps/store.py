@@ -293,7 +293,7 @@ class Map(Protocol):
         """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
 
         Raises:
-            StorageFailure: the picture is damaged.
+            StorageFailure: the picture is missing or damaged.
         """
 
     def thumbnail(self, place_id: str) -> bytes:
@@ -302,7 +302,7 @@ class Map(Protocol):
         Raises:
             UnknownPlace: there is no such place.
             NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
-            StorageFailure: the picture is damaged.
+            StorageFailure: the picture is missing or damaged.
             MemoryError: its pixels do not fit into memory.
         """
 

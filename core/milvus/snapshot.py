@@ -61,7 +61,6 @@ class MilvusSnapshot:
 
     @property
     def rows(self) -> int:
-        """All rows are below this number."""
         return self.state.rows
 
     def entries_at(self, rows: Rows) -> list[PlaceEntry]:
@@ -89,7 +88,6 @@ class MilvusSnapshot:
             self._known.setdefault(entry.row, entry)
 
     def whereabouts_at(self, rows: Rows) -> Whereabouts:
-        """Where and when the frames of some rows were taken."""
         return whereabouts_of(self.entries_at(rows))
 
     def descriptors_at(self, rows: Rows) -> NDArray[np.float32]:
@@ -119,7 +117,6 @@ class MilvusSnapshot:
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:
-        """Whether each row belongs to a place: bool [rows]."""
         alive = np.zeros(self.rows, np.bool_)
         alive[[entry.row for entry in self.all_entries]] = True
         return alive
@@ -136,7 +133,6 @@ class MilvusSnapshot:
         return Whereabouts(**columns)
 
     def among(self, allowed: NDArray[np.bool_]) -> MilvusScope:
-        """The places of some rows, bool [rows], as a scope without a prior."""
         inside, outside = np.flatnonzero(allowed & self.alive), np.flatnonzero(~allowed & self.alive)
         few = any_row(inside.tolist()) if len(inside) <= len(outside) else f"not ({any_row(outside.tolist())})"
         return MilvusScope(self, (few,), lambda entries: allowed[[entry.row for entry in entries]])
@@ -209,7 +205,6 @@ class MilvusScope:
         return self._ranked(descriptor[np.newaxis], expressions, keep)[0]
 
     def living_rows(self) -> Rows:
-        """The rows of the places of the scope, int64 [n], ascending."""
         entries = self.snapshot.all_entries
         matching = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
         return np.array(sorted(matching), np.int64)

@@ -46,7 +46,10 @@ log = logging.getLogger(__name__)
 
 
 class MilvusStore:
-    """Maps by id.  Any thread may call any method, and any number of processes may use the same maps."""
+    """Maps by id (:class:`core.maps.store.Store`).
+
+    Any thread may call any method, and any number of processes may use the same maps.
+    """
 
     def __init__(
         self,
@@ -180,7 +183,6 @@ class MilvusStore:
         return found
 
     def unlisted(self) -> dict[str, MilvusMap]:
-        """The maps that are being built by jobs, by id."""
         self._expect_open()
         with self._database.reading() as connection:
             found = ledger.unlisted(connection)
@@ -196,12 +198,6 @@ class MilvusStore:
         return []
 
     def publish(self, map_id: str) -> MilvusMap:
-        """List a map that was being built and is now complete; durable when this returns.
-
-        Raises:
-            UnknownMap: no map of this id is being built.
-            StorageFull, StorageFailure.
-        """
         with self._database.transaction(f"publish map {map_id!r}") as connection:
             number = ledger.unlisted(connection).get(map_id)
             if number is None:
@@ -210,11 +206,6 @@ class MilvusStore:
         return self._map(map_id, number)
 
     def abandon(self, map_id: str) -> None:
-        """Delete a map that was being built; nothing happens if there is none.
-
-        Raises:
-            StorageFull, StorageFailure: the map is still there.
-        """
         self._expect_open()
         with self._database.reading() as connection:
             number = ledger.unlisted(connection).get(map_id)
@@ -257,11 +248,6 @@ class MilvusStore:
             )
 
     def check_pictures(self) -> None:
-        """Raise unless pictures could be stored now, if they are stored elsewhere than the rest.
-
-        Raises:
-            StoreUnavailable, StorageFull.
-        """
         self._expect_open()
         if self._objects is not None:
             self._objects.check()
@@ -326,11 +312,6 @@ class MilvusStore:
             return self._collections[encoder]
 
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
-        """A page of the maps' records by id, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         wanted = one_more(limit)
         listing: Listing = ["maps"]
         after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
@@ -340,11 +321,6 @@ class MilvusStore:
         return page_of(listing, found, limit, lambda record: record.id)
 
     def delete(self, map_id: str) -> None:
-        """Delete a map; the deletion is durable when this returns.
-
-        Raises:
-            UnknownMap, StorageFull, StorageFailure.
-        """
         self._remove(map_id, None)
 
     def _remove(self, map_id: str, number: int | None) -> None:

@@ -26,8 +26,9 @@ Access = Callable[[], AbstractContextManager[Connected]]
 
 
 class Cameras(AnyCameras):
-    """All cameras of one map, which are few and needed by every frame, so they stay in memory.  Any thread may use it.
+    """All cameras of one map (:class:`core.maps.cameras.Cameras`).
 
+    They are few and needed by every frame, so they stay in memory.  Any thread may use it.
     Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
@@ -46,7 +47,6 @@ class Cameras(AnyCameras):
         return sorted(self._records().values(), key=lambda camera: camera.name)
 
     def known(self, name: str) -> CameraRecord | None:
-        """One camera; None if the map has none of this name."""
         return self._records().get(name)
 
     def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:

@@ -99,7 +99,7 @@ class RecentPlaces:
 
 
 class Map:
-    """The places of one environment.  Any thread may call any method.
+    """The places of one environment (:class:`core.maps.store.Map`).  Any thread may call any method.
 
     One thread writes at a time.  A write returns when it is synced, and every later snapshot contains it; reads and
     searches never wait for a write.
@@ -135,7 +135,6 @@ class Map:
 
     @property
     def record(self) -> MapRecord:
-        """The map's record as of its last edit."""
         return self._record
 
     @property
@@ -278,7 +277,6 @@ class Map:
         return self.index_status()
 
     def storage_status(self) -> StorageStatus:
-        """How much room the map takes on disk."""
         with self._guarded("read"):
             return storage_of(self._folder, self._record.precision, self.count_places(), self._keypoints_status())
 
@@ -384,20 +382,10 @@ class Map:
         return found
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
-        """Replace all fields of a place; its frame stays.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self._writing() as write:
             return write.set_fields(ledger.expect(write.connection, place_id), fields)
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
-        """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self._writing() as write:
             stored = ledger.expect(write.connection, place_id)
             return write.set_fields(stored, patched_fields(stored.place, changes))[0]
@@ -417,11 +405,6 @@ class Map:
             return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
 
     def forget(self, place_id: str) -> None:
-        """Delete a place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self._writing() as write:
             write.forget(ledger.expect(write.connection, place_id))
 
@@ -438,11 +421,6 @@ class Map:
         return found
 
     def forget_sequence(self, name: str) -> int:
-        """Delete all places of a sequence; returns how many.
-
-        Raises:
-            UnknownSequence: there is none.
-        """
         with self._writing() as write:
             count = write.forget_sequence(name)
             if not count:
@@ -458,7 +436,6 @@ class Map:
         return snapshot
 
     def scope(self, selection: Selection | None = None) -> SearchScope:
-        """The places that a query may find at this moment; None: all."""
         snapshot = self.snapshot()
         return Chooser(snapshot, self.attributes, self.rows_of).scope(selection) if selection else SearchScope(snapshot)
 
@@ -468,17 +445,11 @@ class Map:
         return self._places if snapshot is None else len(snapshot)
 
     def digest(self, place_id: str) -> bytes | None:
-        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
         return None if stored is None else stored.digest
 
     def place(self, place_id: str) -> Place:
-        """One place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self._reading() as connection:
             return ledger.expect(connection, place_id).place
 
@@ -497,25 +468,14 @@ class Map:
             return page_of_places(connection, self._folder.name, cursor, limit, wanted)
 
     def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
-        """The ids of the places that fulfil some conditions, in the order of their enrolment.
-
-        Raises:
-            TooManyToDelete: there are more than ``most``.
-        """
         with self._reading() as connection:
             return _not_more(ledger.ids_of(connection, wanted, most + 1), most)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
-        """A page of sequences by name, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         with self._reading() as connection:
             return page_of_sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
         found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
@@ -526,7 +486,6 @@ class Map:
         return [found.get(row) for row in wanted]
 
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
-        """Those of the names that no sequence has."""
         return set(names) - set(self.attributes.sequence_codes(names))
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
@@ -548,34 +507,15 @@ class Map:
         return [found.get(row) for row in wanted]
 
     def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
-        """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
-
-        Args:
-            after: the number of the last place of the page before; 0 for the first page.
-            limit: how many places are listed at most; fewer if there are no further ones.
-        """
         with self._reading() as connection:
             return keypoints.frames_without(connection, after, limit)
 
     def picture(self, place_id: str) -> bytes | None:
-        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
-
-        Raises:
-            StorageFailure: the picture is damaged.
-        """
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
             return None if stored is None else ledger.picture(connection, stored.number, place_id)
 
     def thumbnail(self, place_id: str) -> bytes:
-        """A small JPEG of a place.
-
-        Raises:
-            UnknownPlace: there is no such place.
-            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
-            StorageFailure: the picture is damaged.
-            MemoryError: its pixels do not fit into memory.
-        """
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
             picture = ledger.picture(connection, stored.number, place_id)

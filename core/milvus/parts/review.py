@@ -50,11 +50,6 @@ class MilvusReview:
             yield connection
 
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
-        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
-
-        Returns:
-            Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.
-        """
         if len(data) > setting.most_bytes:
             return False
         digest = hashlib.sha256(data).digest()
@@ -80,7 +75,6 @@ class MilvusReview:
         return True
 
     def shrink(self, setting: ReviewSetting) -> None:
-        """Drop the oldest frames beyond new limits."""
         with self._writing() as connection:
             self._drop_oldest(connection, setting)
 
@@ -94,12 +88,6 @@ class MilvusReview:
         connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
-        """The latest frames, newest first, and how many are stored in all, as of one moment.
-
-        Args:
-            before: only frames with a smaller number; None: all.
-            labelled: only frames with a label, or without one; None: all.
-        """
         also = "" if labelled is None else f" AND label IS {'NOT ' * labelled}NULL"
         query = (
             f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number < %s{also} ORDER BY number DESC LIMIT %s"
@@ -109,7 +97,6 @@ class MilvusReview:
             return ReviewPage([_frame(values) for values in found], *self._size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
         query = f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND label IS NOT NULL ORDER BY number"
         with self._reading() as connection:
             return [_frame(values) for values in connection.execute(query, (self._map,))]
@@ -121,21 +108,10 @@ class MilvusReview:
         return int(count), int(size)
 
     def find(self, number: int) -> ReviewFrame:
-        """One frame.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
         with self._reading() as connection:
             return self._expect(connection, number)
 
     def picture(self, number: int) -> bytes:
-        """The file of a frame.
-
-        Raises:
-            UnknownFrame: it is not stored.
-            StorageFailure: it is damaged.
-        """
         with self._reading() as connection:
             frame = self._expect(connection, number)
             query = (
@@ -159,11 +135,6 @@ class MilvusReview:
             self._held.discard(number)
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Say what a frame shows, in place of what was said before.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
         with self._writing() as connection:
             frame = self._expect(connection, number)
             query = "UPDATE review_frames SET label = %s WHERE map = %s AND number = %s"
@@ -172,11 +143,6 @@ class MilvusReview:
         return replace(frame, label=label)
 
     def discard(self, number: int) -> None:
-        """Throw a frame away.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
         with self._writing() as connection:
             query = "DELETE FROM review_frames WHERE map = %s AND number = %s"
             if not connection.execute(query, (self._map, number)).rowcount:

@@ -65,7 +65,7 @@ def together(run: Callable[[Part], None], parts: Sequence[Part]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """All places of a map at one moment.  Immutable; any thread may search it.
+    """All places of a map at one moment (:class:`core.maps.store.Snapshot`).  Immutable; any thread may search it.
 
     dimension, rows_per_segment, local_shape: of the map; ``local_shape`` is (C, L).
     row_reader: reads the descriptors of segments that hold none in memory.
@@ -116,7 +116,6 @@ class Snapshot:
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:
-        """Whether each row belongs to a place: bool [rows]."""
         parts = [segment.alive for segment in self.segments]
         return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
 
@@ -409,7 +408,6 @@ class SearchScope:
         return None if self.weights is None else self.weights[rows]
 
     def living_rows(self) -> NDArray[np.int64]:
-        """The rows of the places of the scope, int64 [n], ascending."""
         alive = self.snapshot.alive
         return np.flatnonzero(alive if self.allowed is None else alive & self.allowed)
 
