@@ -4,7 +4,7 @@ Standard library and bytes made beforehand, like :mod:`service.commands.load`, b
 place that was enrolled before a frame was sent, and whose deletion was not begun before the answer came, must be the
 best match of its own scene; one whose deletion was acknowledged before the frame was sent must not occur at all.
 
-Robots keep to a timetable.  What an answer took counts from the moment when its frame was due, so that a robot that had
+Robots keep to a timetable.  The time of an answer counts from when its frame was due, so that a robot that had
 to wait for the answer before does not hide the wait.
 """
 

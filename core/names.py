@@ -51,9 +51,9 @@ class Names:
 
     A field that is no name is refused with the same sentence as an argument; the JSON Schema has the pattern.
 
-    what: what it names, with its article.
+    what: the named thing, with its article.
     pattern: of every name, without anchors.
-    rule: what the pattern says, in words that go on after "a name".
+    rule: the pattern in words that go on after "a name".
     most: characters of the longest one; None: the pattern says it.
     but: a text of the pattern that is no name all the same; the schema does not say so.
     """

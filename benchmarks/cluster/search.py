@@ -3,7 +3,7 @@
     python -m benchmarks.cluster.search [--places 100000] [--milvus ADDRESS --postgres ADDRESS]
 
 Places and queries are those of ``benchmarks.maps.search``.  The store asks Milvus and then PostgreSQL for the places
-of the hits; *alone* is the first of these two.  What index Milvus has depends on its version (core.milvus.indexes);
+of the hits; *alone* is the first of these two.  The index of Milvus depends on its version (core.milvus.indexes);
 that of scripts/cluster is flat.  Recall@1 is how often the first of a ranking is the one that exact float32 products
 put first.  *Core ms* is processor time of a server for one search, which other load does not change.
 """

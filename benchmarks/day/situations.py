@@ -38,7 +38,7 @@ class Stretch:
     pace: frames of the walk a second; negative backwards, facing ahead.
     start: where the robot is put at first, as a share of the walk, if it is not where it was: it is carried there.
     aside: metres a second to the left, out of what the map shows and back.
-    look: what the camera makes of the view.
+    look: the view as the camera renders it.
     orientation: that the files state.
     own: the pictures are those that the map was made of.
     fate: of every second frame, of all if ``whole``.
@@ -82,7 +82,7 @@ class Moment:
     second: when, from the beginning.
     at: where, in frames of the robot's walk.
     aside: metres beside the walk; the map shows nothing of it there.
-    pose: the true one, in the map's frame; ``wheels``: what the odometry says, in its own.
+    pose: the true one, in the map's frame; ``wheels``: that of the odometry, in its own.
     right: the references whose place the frame shows; none if it shows nothing of the map.
     again: it is the first after a disturbance.
     """

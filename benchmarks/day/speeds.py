@@ -40,7 +40,7 @@ from lab.training.map_sizes import corridor_and_lip6
 from lab.training.validation import TraverseTask, describe
 
 DRAWN = 10
-"""So many frames at ten times the rate for one."""
+"""Number of frames at ten times the rate for one."""
 
 STRETCHES, LENGTH = 3, 10
 """Stretches of a walk that are seen at ten times the rate, and how many of its frames each has."""

@@ -328,7 +328,7 @@ def main(
     verify: Annotated[list[str] | None, typer.Option(help="Of: never, auto, always.")] = None,
     looks: Annotated[list[str] | None, typer.Option(help="Looks at a spot: 1 to 200, or walk.")] = None,
 ) -> None:
-    """One table: what is recognized and right, by environment, poses, mode and looks at a spot; of all, or of some."""
+    """One table: the share recognized rightly, by environment, poses, mode and looks at a spot; of all, or of some."""
     kinds = chosen(KINDS, looks)
     share_cores(cores())
     camera = Camera(EncoderCatalogue().get(encoder))

@@ -1,4 +1,4 @@
-"""The walks at hand: what the map is made of, what a robot sees later, and which places each of its frames shows."""
+"""The walks at hand: the frames of the map, the later frames of a robot, and the places that each of these shows."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ WITHIN, NOTICED, HALVED = 3, 0.9, 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """One frame: what it says alone, and what it says to a session.
+    """One frame: its own verdict, and its evidence for a session.
 
     best: the reference that it matches best alone; -1: none.
     right: bool [R], the references that show its place.

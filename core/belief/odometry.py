@@ -35,7 +35,7 @@ class OdometryPose:
     def since(self, before: OdometryPose) -> Odometry:
         """The motion from an earlier pose of the same origin to this one, in the robot's coordinates at that pose.
 
-        What this pose's covariance has beyond the earlier one, as it is carried along by the motion, is that of the
+        The excess of this pose's covariance over the earlier one, as it is carried along by the motion, is that of the
         motion; it is never negative.  It is 0 if either is not known.
         """
         east, north = self.x - before.x, self.y - before.y

@@ -180,7 +180,7 @@ class Run:
         Args:
             seen: the evidence of the frame.
             step: the motion since the frame before; ignored for the first frame.
-            view: what the frame shows; None: it is not known, and taken to be new.
+            view: the view of the frame; None: not known, and taken to be new.
             pose: where odometry says that the robot is, from which the motion to the next frame is computed.
         """
         change = None if view is None or self._view is None else view.change(self._view)

@@ -72,7 +72,7 @@ LASTING = 0.9
 """Probability that a robot that is elsewhere than believed has the speed that is believed."""
 
 TRACKED = 1024
-"""So many places have shares of their own, in maps where not all have."""
+"""Number of places with shares of their own, in maps where not all have them."""
 
 
 @dataclass(frozen=True, eq=False)

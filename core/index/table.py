@@ -205,7 +205,7 @@ class CodeTable:
         """A block that can take the place of some smaller ones; None while these have few rows.
 
         Args:
-            progress: is called with the rows done and all rows; what it raises ends the work.
+            progress: called with the number of rows done and of all; its exceptions end the work.
         """
         if not self.is_loose:
             return None

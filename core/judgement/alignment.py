@@ -4,7 +4,7 @@ A single frame may resemble many places; a path of frames that resemble one plac
 hardly ever.  The scores of all frames of a traverse against all of another are first made comparable: the median of
 each row and of each column is subtracted, and the rest divided by its spread (the median of its absolute values, as a
 standard deviation), so that neither a frame that resembles everything nor a place that everything resembles counts.
-What exceeds ``ORDINARY`` is the gain of a pair of frames, and what falls short of it its loss.
+The excess over ``ORDINARY`` is the gain of a pair of frames, and the deficit its loss.
 
 A path pairs consecutive frames of the first traverse with frames of the second, of which it advances by none to three
 at a time; every step but that by one costs ``UNEVEN`` for each frame of difference.  The path with the largest sum is
@@ -59,10 +59,10 @@ MOST_PATHS = 64
 """The largest number of paths looked for among the frames that are matched together."""
 
 TOGETHER = 1024
-"""So many frames of the first traverse are matched at a time, at most; a path ends with them."""
+"""The largest number of frames of the first traverse that are matched at a time; a path ends with them."""
 
 TILE = 512
-"""So many frames of the second traverse are scored at a time."""
+"""Number of frames of the second traverse that are scored at a time."""
 
 MOST_PAIRS = 512
 """The largest number of pairs that are stored for each frame of the first traverse."""

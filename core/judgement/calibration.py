@@ -243,7 +243,7 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
         trials: judged with ``base``, whose background and kind of decision value stay, and whose terms of geometric
             evidence, which were not measured on this map.  Curve, margin and threshold are of two stages; what is
             reported of trials that were verified is of three.
-        target: what the threshold is to achieve.
+        target: the target of the threshold.
         source: recorded in the calibration.
 
     Raises:

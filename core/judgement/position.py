@@ -66,10 +66,10 @@ class PoseEstimate:
     places: how many places the estimate rests on.
     covariance: float64 [6, 6], of errors in x, y, z (metres) and of rotations about x, y and z (radians), as in ROS.
         The axes are those of the map's frame or, for a pose on the Earth, east, north and up at the pose.  The rotation
-        about z is counter-clockwise, also where headings are clockwise.  What is not known has a large variance.
+        about z is counter-clockwise, also where headings are clockwise.  Unknown components have a large variance.
     heading_offset, offset_spread: degrees, by which the heading differs from that of the best match, counted as
         headings are, and its standard deviation; None if no view gives it.
-    source: what the covariance rests on: the poses of places alone, or also views with intrinsics, or without.
+    source: the basis of the covariance: the poses of places alone, or also views with intrinsics, or without.
     """
 
     pose: Pose

@@ -27,7 +27,7 @@ class Share(BaseModel):
 
 
 class Bin(BaseModel):
-    """Answers whose probability lies between ``low`` and ``high``: what was promised, and what came of it."""
+    """Answers whose probability lies between ``low`` and ``high``: the promised share, and the outcome."""
 
     low: float
     high: float

@@ -136,8 +136,8 @@ class Judgement:
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
-    rivals: what makes the query ambiguous; empty for other verdicts.
-    evidence: what verification found of the best match, -ln of the number of false alarms; None if it was not verified.
+    rivals: the places that make the query ambiguous; empty for other verdicts.
+    evidence: of verification for the best match, -ln of the number of false alarms; None if it was not verified.
     """
 
     verdict: Verdict
@@ -250,7 +250,7 @@ def judge(
             0: it has no second stage.
         likeness: compares the best match with its rivals; it is called at most once, and only where rivals matter.
             None: which rivals show the same place is not known, and they explain nothing.
-        geometry: what verification found of the n places, in the same order; None: none was verified.
+        geometry: the results of verification for the n places, in the same order; None: none was verified.
 
     Returns:
         ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
@@ -286,7 +286,7 @@ class _Ranking:
     others: int64 [m], positions of the other places, of frames of one view only the first.
     compared: int64 [k], those of them whose scores are compared with the best, one for each station.
     apart: bool [n], the places that cannot overlap with the best match.
-    geometry: what verification found of the n places; None if none was verified.
+    geometry: the results of verification for the n places; None if none was verified.
     """
 
     scores: NDArray[np.float32]

@@ -22,7 +22,7 @@ class CameraRecord(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Camera
-    mask: Mask | None = Field(description="What to ignore in its frames; null: nothing.")
+    mask: Mask | None = Field(description="The areas to ignore in its frames; null: none.")
     intrinsics: Intrinsics | None = Field(default=None, description="Of its upright frames; null: not known.")
     updated_at: Timestamp
 

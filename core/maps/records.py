@@ -85,7 +85,7 @@ class MapSettings(BaseModel):
 
 
 class MapRecord(MapSettings):
-    """A map as it is listed: its settings, what it is bound to, and its history in brief."""
+    """A map as it is listed: its settings, its encoder, and its history in brief."""
 
     id: str
     encoder: str = Field(description="Identity of the one encoder whose descriptors the map holds.")

@@ -20,7 +20,7 @@ class ReviewFrame:
     digest: the SHA-256 of the file, 32 bytes.
     size: of the file, in bytes.
     answer: how the map answered it; a JSON object.
-    label: what it shows, and who said so and when; a JSON object.  None: nobody has said it.
+    label: the place that it shows, who said so, and when; a JSON object.  None: it has no label.
     """
 
     number: int
@@ -91,7 +91,7 @@ class Review(Protocol):
         """
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Say what a frame shows, in place of what was said before.
+        """Label a frame; the label replaces an earlier one.
 
         Raises:
             UnknownFrame: it is not stored.

@@ -12,7 +12,7 @@ from core.maps.records import TierSetting
 Tier = Literal["exact", "compact"]
 
 Progress = Callable[[int, int], None]
-"""Is called with the rows done and all rows; what it raises ends the work."""
+"""Called with the number of rows done and of all; its exceptions end the work."""
 
 
 def no_progress(done: int, total: int) -> None:
@@ -38,7 +38,7 @@ class IndexStatus(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    setting: TierSetting = Field(description="What its owner chose.")
+    setting: TierSetting = Field(description="The setting that its owner chose.")
     tier: Tier = Field(description="exact: every place compared; compact: codes first.")
     wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
     state: Literal["ready", "building", "unopened"] = Field(
@@ -59,7 +59,7 @@ class KeypointsStatus(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     places: int = Field(ge=0, description="How many places have keypoints.")
-    bytes: int = Field(ge=0, description="What they take in map.sqlite.")
+    bytes: int = Field(ge=0, description="Their size in map.sqlite.")
 
 
 class StorageStatus(BaseModel):

@@ -57,7 +57,7 @@ def merged(a: Ranking, b: Ranking) -> Ranking:
 
 
 class Scope(Protocol):
-    """The places that a query may find, at one moment, and what speaks for them before the frame is compared."""
+    """The places that a query may find, at one moment, and their prior before the frame is compared."""
 
     @property
     def snapshot(self) -> Snapshot:
@@ -81,7 +81,7 @@ class Scope(Protocol):
 
         Args:
             descriptor: of the query, float32 [D].
-            ranking: what :meth:`search` returned for it.
+            ranking: the result of :meth:`search` for it.
             neighborhood: which places are the same place; None: also the best places that are, unless the ranking has
                 them.
 
@@ -111,14 +111,14 @@ class Snapshot(Protocol):
         """The descriptors of rows: float32 [k, D].
 
         Raises:
-            UnknownPlace: the place of a row was deleted since, and what was stored of it as well.
+            UnknownPlace: the place of a row was deleted since, together with its data.
         """
 
     def locals_at(self, rows: Rows) -> NDArray[np.int8]:
         """The local descriptors of rows: int8 [k, C, L].
 
         Raises:
-            UnknownPlace: the place of a row was deleted since, and what was stored of it as well.
+            UnknownPlace: the place of a row was deleted since, together with its data.
         """
 
     # For work on all places of a map, such as its calibration; a query needs none of these.
@@ -312,7 +312,7 @@ class Map(Protocol):
         """How the map is searched; this does not wait."""
 
     def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
-        """Build what makes searches fast again from the descriptors; searches use the present one meanwhile.
+        """Build the index again from the descriptors; searches use the present one meanwhile.
 
         Args:
             progress: called with the number of rows that are done and of all; if it raises, nothing changes.
@@ -437,10 +437,10 @@ class Store(Protocol):
 
         Args:
             map_id: of the new map; it may differ from that in the file.
-            advance: is called with the number of places done and of all; what it raises ends the work.
+            advance: called with the number of places done and of all; its exceptions end the work.
             check_picture: raises InvalidImage for bytes that must not be shown as a picture.
             most_picture_bytes: a larger picture is refused before it is read.
-            before_listing: is called when the map is complete; what it raises ends the work.
+            before_listing: called when the map is complete; its exceptions end the work.
 
         Raises:
             InvalidArchive: the file is damaged, or its content is not valid for a map.
@@ -470,7 +470,7 @@ class Store(Protocol):
     def abandoned(self) -> list[str]:
         """The ids of the unlisted maps that nobody builds unless a job of this service does.
 
-        None of a store that several services use, which removes by itself what nobody has built on for long.
+        None of a store that several services use, which removes abandoned maps by itself.
         """
 
     def publish(self, map_id: str) -> Map:

@@ -58,7 +58,7 @@ class Look:
 
 
 def reach_of(radius: float) -> float:
-    """So many metres may a further look at a view be from the first one, in a map with a ``same_place_radius``."""
+    """The largest distance in metres from a view's first look, in a map with a ``same_place_radius``."""
     return SAME_VIEW * radius
 
 
@@ -114,8 +114,8 @@ class LatestViews:
     """The end of a sequence: its last frame, and the first frame of each of its last positions.
 
     Args:
-        last: the position of the last frame, and what it shows; None: the sequence has no frames.
-        first: what the first frame at each of the last positions shows.
+        last: the position and the look of the last frame; None: the sequence has no frames.
+        first: the look of the first frame at each of the last positions.
         positions: the number of positions that may lie between two frames of one view.
         reach: the distance in metres that may lie between the poses of a frame and of the first frame of its view.
     """
@@ -159,7 +159,7 @@ def latest_views(
         last: position and row of the last frame; None: the sequence has no frames.
         first: the row of the first frame at each of the last positions.
         positions, reach: as of :class:`LatestViews`.
-        looks: reads what the frames in some rows show.
+        looks: reads the looks of the frames in some rows.
     """
     if last is None:
         return LatestViews(None, {}, positions, reach)
@@ -176,7 +176,7 @@ def leaves_view(pose: Pose | None, look: Look | None, first: Look, beside: Seque
 
     Args:
         pose: its pose now.
-        look: what it shows now; None: its picture stays.
+        look: its new look; None: its picture stays.
         first: the first frame there, which is before this one.
         beside: the last frame before it there that has got another picture since this one had its last, and the frames
             next before and after it there; empty if there is no such frame.

@@ -11,7 +11,7 @@ corresponding cells, C cells in all, a candidate's score grows by
 which :func:`agreement` computes for many candidates at once with a compiled loop.  More places than can be compared so
 may be screened first: :func:`promise` selects these from a sample of their cells.
 
-What all cells of a frame have in common, as its light and weather, may be taken from them before they are compared
+The common part of all cells of a frame, as its light and weather, may be taken from them before they are compared
 (:func:`standardized`).
 """
 

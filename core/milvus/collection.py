@@ -72,7 +72,7 @@ def collection_name(encoder: str, dimension: int) -> str:
 
 @contextmanager
 def milvus_errors(action: str) -> Iterator[None]:
-    """Turn what Milvus refuses into an Unreachable that says why in plain words."""
+    """Turn an error of Milvus into an Unreachable that says why in plain words."""
     try:
         yield
     except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through

@@ -34,7 +34,7 @@ class Importing(Unpacking):
 
         Raises:
             InvalidArchive: the file is damaged, or its content is not valid for a map.
-            StorageFull, StorageFailure: what was stored until then has to be removed.
+            StorageFull, StorageFailure: the part stored until then has to be removed.
         """
         self._map, self._database, self._number = map_, database, map_.number
         self._form = Form(map_.record)
@@ -102,7 +102,7 @@ class Importing(Unpacking):
         return self._lost[line.track]
 
     def _check(self) -> None:
-        """Check what concerns several places; each place was checked by itself."""
+        """Check conditions across places; each place was checked by itself."""
         with self._database.reading() as connection:
             wrong = ledger.wrong_sequence(connection, self._number)
         if wrong is not None:

@@ -1,6 +1,6 @@
 """How descriptors are stored and searched in a Milvus, by what its version can.
 
-Tried on real servers: version 2.3 alone.  What newer ones get follows their documentation.
+Tried on real servers: version 2.3 alone.  The choice for newer ones follows their documentation.
 """
 
 from __future__ import annotations

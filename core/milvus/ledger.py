@@ -238,7 +238,7 @@ def delete(connection: Connection[Any], map_id: str, number: int | None = None) 
 
 
 def update(connection: Connection[Any], state: MapState) -> None:
-    """Store what a write has changed of the map itself."""
+    """Store the changes by a write of the map itself."""
     query = (
         "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s, collection = %s,"
         " touched = now() WHERE number = %s"
@@ -305,7 +305,7 @@ def entries_after(
 
 
 def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
-    """Store a place, in the place of what is stored under its number."""
+    """Store a place, in the place of one stored under its number."""
     place = entry.place
     columns = {
         "map": map_number, "number": entry.number, "id": place.id, "row": entry.row, "key": entry.key,
@@ -322,7 +322,7 @@ def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None
 
 
 def remove(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
-    """Remove a place; what belongs to it is left for a while."""
+    """Remove a place; its data is left for a while."""
     connection.execute("DELETE FROM places WHERE map = %s AND number = %s", (map_number, entry.number))
 
 

@@ -357,9 +357,9 @@ class MilvusMap:
         self._tidy()
 
     def _tidy(self) -> None:
-        """Delete what was left over a while ago; what cannot be deleted now is deleted after another write."""
+        """Delete old orphans; those that cannot be deleted now are deleted after another write."""
         try:
-            with self._database.transaction("delete what is left over") as connection:
+            with self._database.transaction("delete orphans") as connection:
                 if keys := ledger.old_orphans(connection, self.number):
                     self.collection.delete(keys)
                     ledger.clear(connection, self.number, keys)

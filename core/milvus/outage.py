@@ -33,7 +33,7 @@ class Outage:
 
     Args:
         name: of the server, as its :class:`Unreachable` names it.
-        thing: what it is about, as the log shall name it; by default the server.
+        thing: the name in the log; by default that of the server.
         probe: finds out quickly whether a server that was gone is back, before any other request; raises
             Unreachable if it is not.
     """

@@ -38,7 +38,7 @@ _RECONNECTING_SECONDS = 1.0
 
 @contextmanager
 def postgres_errors(action: str) -> Iterator[None]:
-    """Turn what PostgreSQL refuses into our errors."""
+    """Turn the errors of PostgreSQL into our own."""
     try:
         yield
     except psycopg.errors.DiskFull as error:
@@ -143,7 +143,7 @@ class Postgres:
         """A connection of the pool; what the block does not commit is undone if it raises, else committed.
 
         Args:
-            action: what the block does, for the message of an error.
+            action: the work of the block, for the message of an error.
         """
         with self._outage.noticed():
             pool = self._opened()

@@ -43,7 +43,7 @@ Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
 class MilvusSnapshot:
     """The places of a map at one moment (:class:`core.maps.store.Snapshot`).
 
-    What was written to the map since may show in what is read by row for the first time: a row belongs to the same
+    Later writes to the map may show in rows that are read for the first time: a row belongs to the same
     frame for ever, but its place may have got another pose.
 
     state: of the map at that moment.

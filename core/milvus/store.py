@@ -262,7 +262,7 @@ class MilvusStore:
         return 0 if self._objects is None else sweep_objects(self._database, self._objects)
 
     def sweep(self) -> int:
-        """Delete what writes that came to no end have left; returns how many descriptors that were.
+        """Delete the orphans of writes that did not end; returns the number of descriptors.
 
         Raises:
             StoreUnavailable, StorageFailure.
@@ -286,10 +286,10 @@ class MilvusStore:
             try:
                 sweep()
             except StorageFailure as error:
-                log.debug("what is left over stays for now: %s", error)
+                log.debug("orphans stay for now: %s", error)
                 return AGAIN_SECONDS
             except Exception:  # a defect, which must not end the thread
-                log.exception("what is left over stays for now")
+                log.exception("orphans stay for now")
             return SWEEP_SECONDS
 
         def run() -> None:
@@ -351,6 +351,6 @@ class MilvusStore:
 
 
 def _objects_of(bucket: Bucket) -> Objects:
-    from core.milvus.pictures.objects import Objects  # with it comes what speaks S3
+    from core.milvus.pictures.objects import Objects  # it imports the client of S3
 
     return Objects(bucket)

@@ -1,4 +1,4 @@
-"""Deleting what no place names: what a service left that died after it gave it to Milvus, or to the object store.
+"""Deleting orphans, which no place names: left by a service that died after it gave them to Milvus or the object store.
 
 A key is drawn, and its entity inserted or its object written, by a write that holds a lock on its map's row until it
 has ended.  So once that lock was had of every map, all keys up to the last one drawn before belong to writes that have

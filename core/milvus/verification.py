@@ -1,4 +1,4 @@
-"""Comparing what PostgreSQL has of a map with what Milvus searches."""
+"""Comparing a map in PostgreSQL with its entities in Milvus."""
 
 from __future__ import annotations
 
@@ -79,7 +79,6 @@ class _Report:
 def _damage(
     entry: PlaceEntry, stored: dict[str, dict[int, bytes]], there: dict[int, NDArray[np.float32]], form: Form
 ) -> str | None:
-    """The damage of a place, in words; None if it has none."""
     name, row = repr(entry.place.id), entry.row
     if row not in stored["descriptor"]:
         return f"PostgreSQL: place {name} has no frame"

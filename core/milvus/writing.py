@@ -1,4 +1,4 @@
-"""One write to a map: what a transaction of PostgreSQL changes, and the entities that Milvus gets before its COMMIT."""
+"""One write to a map: the changes of a transaction in PostgreSQL, and the entities for Milvus before its COMMIT."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Write:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
-            keep: what to keep of the frame; by default what the map's settings say.
+            keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, self.state.number, item.id)
@@ -203,7 +203,7 @@ class Write:
         """A place with other fields, under a new key; its position in its sequence changes only with the sequence.
 
         Args:
-            look: what its new frame shows; None: its frame stays.
+            look: the look of its new frame; None: its frame stays.
         """
         code, ordinal = stored.sequence, stored.ordinal
         if place.sequence != stored.place.sequence or self._leaves(stored, place, look):

@@ -1,4 +1,4 @@
-"""The cameras of a map: what is ignored in their frames, and the intrinsics by which a pose is measured in them."""
+"""The cameras of a map: the masks of their frames, and the intrinsics by which a pose is measured in them."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ class Write:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
-            keep: what to keep of the frame; by default what the map's settings say.
+            keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, item.id)
@@ -171,7 +171,7 @@ class Write:
         """Change the fields of a place.
 
         Args:
-            look: what its new frame shows; None: its frame stays.
+            look: the look of its new frame; None: its frame stays.
         """
         moves = fields.sequence != stored.place.sequence
         leaves = not moves and self._leaves(stored, fields, look)
@@ -297,7 +297,7 @@ class Write:
 
 
 class FailedWrites:
-    """Remembers what a failed write may have left in the files of a map, and removes it before the next write.
+    """Remembers rows that a failed write may have left in the files of a map, and removes them before the next one.
 
     Only the thread that writes may use this.
     """

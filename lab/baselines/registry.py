@@ -41,7 +41,7 @@ from lab.baselines.system import About, Resources, System
 
 @dataclass(frozen=True)
 class Baseline:
-    """One row: what a system is, known without reading a weight, and how it is built, once per evaluation."""
+    """One row: the description of a system, known without reading a weight, and its making, once per evaluation."""
 
     about: About
     build: Callable[[About, Resources], System]

@@ -76,7 +76,7 @@ def read_in_child(
 
     Args:
         module: calls :func:`serve` when it is run.
-        arguments: what the module's reader takes besides the path.
+        arguments: of the module's reader, besides the path.
         room: bytes that it may take beside those of any reader.
 
     Raises:

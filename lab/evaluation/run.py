@@ -64,7 +64,7 @@ def compare_systems(
     """Evaluate each system in turn; each result is cached as soon as it exists.
 
     Args:
-        load: decodes an image; what it raises ends the run.
+        load: decodes an image; its exceptions end the run.
         others: runs whose scores were computed elsewhere.
 
     Raises:

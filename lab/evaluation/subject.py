@@ -57,7 +57,7 @@ class Subject:
     Nothing is computed before it is needed; training comes first where a system learns.
 
     Args:
-        load: decodes an image; what it raises ends the run.
+        load: decodes an image; its exceptions end the run.
         advance: called after each image that is learned from or described, and after each query that is scored.
     """
 

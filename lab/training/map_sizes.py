@@ -1,4 +1,4 @@
-"""Maps of any size, cut from real traverses: what the verdicts are on frames whose place is there, and on strangers.
+"""Maps of any size, cut from real traverses: the verdicts on frames whose place is there, and on strangers.
 
 A map holds some of a traverse's references, a run of neighbours or frames drawn at random.  Queries are frames whose
 place it holds, and strangers: frames whose true references are all more than ``APART`` frames from any that it holds.

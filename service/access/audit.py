@@ -79,7 +79,7 @@ def note_change(asker: Asker, path: Mapping[str, str], noted: Mapping[str, Any],
 
     Args:
         path: the parameters of its path.
-        noted: what its operation noted, such as the map's id or a count; ``"change": None`` says that nothing was
+        noted: the notes of its operation, such as the map's id or a count; ``"change": None`` says that nothing was
             changed.
         status: the status of the answer; 0 if there was none, which leaves open whether the change was made.
     """

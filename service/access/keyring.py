@@ -76,7 +76,7 @@ class Keyring:
     """The keys of a service.  It may be used from any thread.
 
     Args:
-        store: what keeps the keys.
+        store: the stored keys.
         wall, monotonic: the clocks, in seconds.
         may_open: whether everybody may be let in while there are no keys; else nobody is, if that is learnt only after
             the start.

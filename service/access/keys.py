@@ -77,7 +77,7 @@ class Key:
     Args:
         id: 12 hexadecimal digits, which are part of the key.
         name: whose it is; unique among the keys in force.
-        role: what it may do.
+        role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
         digest: SHA-256 of the whole key, as its holder sends it.
         created_at: when it was created.

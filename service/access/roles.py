@@ -34,7 +34,7 @@ class Principal:
     Args:
         name: of its key; it appears in logs and in the audit trail.
         key_id: None without a key.
-        role: what it may do.
+        role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
     """
 
@@ -125,7 +125,7 @@ OPERATIONS: dict[str, Rule] = {
     "delete_map": Rule("admin", "path", changes=True),
     "follow_map": Rule("query", "path"),  # pictures need the role enrol, which also sees the callers
     "verify_map": Rule("admin", "path"),  # it reads all that is stored, which keeps the disk busy
-    # Places, traverses, cameras: what an enrolment creates, replaces and deletes
+    # Places, traverses, cameras: the objects that an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),

@@ -119,7 +119,7 @@ def _files(path: Path) -> list[tuple[Path, int]]:
 def _backwards(file: BinaryIO, end: int | None) -> Iterator[tuple[int, bytes]]:
     """The whole lines of a file from the last to the first, each with the position of its first byte.
 
-    What follows the last newline is being written, or torn, and left out.  Of a line that is too long only pieces are
+    The text after the last newline is being written, or torn, and left out.  Of a line that is too long only pieces are
     given, so that the caller can count what was read.
 
     Args:

@@ -1,4 +1,4 @@
-"""The route of the service's own state: what an operator wants to see at a glance."""
+"""The route of the service's own state, for an operator's glance."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ class ServiceState(BaseModel):
     sessions: int
     listeners: int = Field(description="Clients that listen to the events of maps.")
     maps: int = Field(description="Maps in service that the key may use.")
-    limits: dict[str, int | float] = Field(description="What callers have to keep to, by the names of the settings.")
+    limits: dict[str, int | float] = Field(description="The limits for callers, by the names of the settings.")
     memory: MemoryState | None = Field(
         description="Null unless the key is an admin's for all maps; so are the next two."
     )

@@ -75,7 +75,7 @@ def enroll(
     ] = None,
     keep: Annotated[
         Literal["none", "thumbnail", "image"] | None,
-        typer.Option(help="What a map that is created keeps of each frame."),
+        typer.Option(help="The picture of each frame that a created map stores."),
     ] = None,
     sequence: Annotated[
         str | None, typer.Option(help="Name of the traverse; default: the name of RECORDING.", show_default=False)
@@ -113,7 +113,7 @@ def enroll(
     (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
     images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
-    shows, as where the robot stood, are left out. What is neither JPEG nor PNG nor WebP is sent as PNG.
+    shows, as where the robot stood, are left out. Pictures of other formats than JPEG, PNG and WebP are sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
     """
     options = RecordingOptions(
@@ -189,7 +189,7 @@ async def _enroll(
     """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
 
     Returns:
-        What became of them, and how many they are.
+        The outcome, and the number of frames.
     """
     report = Report()
     async with open_service(target) as service:

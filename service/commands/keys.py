@@ -26,7 +26,7 @@ def create(
     name: Annotated[str, typer.Argument(help="Whose key it is; the name appears in logs.", show_default=False)],
     role: Annotated[
         Literal["query", "enrol", "admin"],
-        typer.Option(help="What it may do; enrol includes query, and admin includes everything.", show_default=False),
+        typer.Option(help="Its role; enrol includes query, and admin includes everything.", show_default=False),
     ],
     maps: Annotated[
         list[str] | None, typer.Option("--map", "-m", help="Limit the key to this map; may be repeated.")

@@ -45,7 +45,7 @@ class Problem(BaseModel):
     type: str = Field(description="The stable name of this kind of problem.")
     title: str = Field(description="The kind of problem in a few words; always the same for a type.")
     status: int = Field(description="The HTTP status.")
-    detail: str = Field(description="What is wrong with this request, and what to do about it.")
+    detail: str = Field(description="The fault of this request, and the remedy.")
     instance: str | None = Field(default=None, description="The path of the request.")
     request_id: str | None = Field(default=None, description="The id of the request, which is also in the log.")
 

@@ -121,7 +121,7 @@ class JobEvent(Event):
     kind: ClassVar[EventKind] = "job"
 
     job: str
-    job_kind: str = Field(description="What the job does, such as re-encode.")
+    job_kind: str = Field(description="The kind of the job, such as re-encode.")
     state: str
     progress: dict[str, Any] = Field(description="`done`, `total` and `message`.")
     cancelling: bool

@@ -88,7 +88,7 @@ class JobContext:
         Args:
             done: steps that are done.
             total: all steps; None while their number is not known.
-            message: what the job is doing; at most 500 characters are stored.
+            message: the present step of the job; at most 500 characters are stored.
         """
         now = time.monotonic()
         writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
@@ -186,7 +186,7 @@ def run_after_requests(
 
     Raises:
         JobCancelled, JobInterrupted: the job has to stop.
-        Others: what the coroutine raises.
+        Others: the exceptions of the coroutine.
     """
 
     async def stopped() -> None:

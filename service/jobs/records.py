@@ -63,7 +63,7 @@ class Job:
     attempt: how often the job was started.
     change: counts the changes of the job within the attempt.
     done, total: steps that are done, and all steps; the total is None while it is not known.
-    notes: what the job has stored for its next attempt.
+    notes: stored by the job for its next attempt.
     result: the result of a job that has succeeded.
     problem: why the job failed, as a problem object (RFC 9457).
     maps: the ids of the maps that the job uses, with the time at which each was created: a map of the same id that was

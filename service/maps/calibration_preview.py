@@ -51,8 +51,8 @@ class CalibrationState(BaseModel):
     revision: int = Field(description="Of the map's settings; the ETag contains it.")
     calibration: Calibration | None = Field(description="The one in force; null if the encoder is not installed.")
     measured: LatestMeasurement | None = Field(description="Null if nothing was measured, or it is not known any more.")
-    now: Effect | None = Field(description="What the calibration in force does with the frames that were measured.")
-    then: Effect | None = Field(description="What it would do with the threshold and the margin that were given.")
+    now: Effect | None = Field(description="The effect of the calibration in force on the frames that were measured.")
+    then: Effect | None = Field(description="Its effect with the threshold and the margin that were given.")
 
 
 @router.get("", responses=problem_documentation(errors.StorageFull))

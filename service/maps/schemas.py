@@ -68,7 +68,7 @@ class MapView(BaseModel):
     encoder: str = Field(description="Identity of its encoder.")
     dimension: int = Field(description="Values of one descriptor.")
     description: str
-    keep: Keep = Field(description="What is stored of each frame besides its descriptor.")
+    keep: Keep = Field(description="The picture that is stored of each frame.")
     same_place_radius: float = Field(
         description="Distance in metres up to which two enrolled places count as the same place, so that neither is "
         "a rival of the other."
@@ -83,7 +83,7 @@ class MapView(BaseModel):
         "null if the encoder is not installed."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
-    storage: StorageStatus = Field(description="What the map occupies on disk.")
+    storage: StorageStatus = Field(description="The size of the map on disk.")
     places: int
     last_day: VerdictCounts | None = Field(
         description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."
@@ -251,9 +251,7 @@ class CalibrationOrder(BaseModel):
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
         "neighbours, which is the least reliable method. `labels`: the frames that were stored for review and labelled."
     )
-    target: Target = Field(
-        default=Target(rule="precision", value=0.95), description="What the threshold is chosen to reach."
-    )
+    target: Target = Field(default=Target(rule="precision", value=0.95), description="The target of the threshold.")
     dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")
     background: bool = Field(strict=True, default=False, description="Answer 202 with a job; its result is the report.")
     sequence: str | None = Field(default=None, max_length=128, description="The traverse whose frames query the map.")

@@ -365,7 +365,7 @@ class _RayThread:
 
         Raises:
             TimeoutError: it does.
-            Others: what the work raises.
+            Others: the exceptions of the work.
         """
         made: Future[Made] = Future()
 

@@ -46,7 +46,7 @@ class SentFrame:
     """A frame on its way to a replica.
 
     identity: of the encoder.
-    keypoints, features: what is wanted besides descriptors.
+    keypoints, features: outputs wanted besides descriptors.
     seconds: until its deadline, from the moment at which it was sent; clocks of two machines need not agree.
     """
 

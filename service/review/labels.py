@@ -13,7 +13,7 @@ from core.method.encoder import Encoding
 from service.engine.encoders import Encoded
 
 TOGETHER = 32
-"""So many frames are read and encoded at a time."""
+"""Number of frames that are read and encoded at a time."""
 
 
 @dataclass(frozen=True)

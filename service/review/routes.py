@@ -119,7 +119,7 @@ async def label_frame(
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
     Or throw it away. A label that is given again replaces the one before; what was enrolled stays. Labels serve to
-    calibrate the map, with the method `labels`. What is said of one frame at the same time is done one after the other.
+    calibrate the map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)
     async with engine.review_keeper.turn(map_, number):

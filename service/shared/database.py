@@ -44,7 +44,7 @@ class SharedDatabase(Postgres):
         """Execute one statement, which is durable when this returns; the rows that it gives.
 
         Args:
-            action: what it does, for the message of an error.
+            action: its work, for the message of an error.
         """
         with self.connection(action) as connection:
             cursor = connection.execute(query, values)

@@ -41,7 +41,7 @@ class ServiceReplica:
     id: of the data directory, the same after a restart.
 
     Args:
-        database: what the services share; it is closed by its owner.
+        database: shared by the services; it is closed by its owner.
         directory: the data directory.
 
     Raises:

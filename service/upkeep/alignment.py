@@ -1,6 +1,6 @@
 """The job that aligns a traverse with others: which of its frames show the places of another.
 
-Descriptors as they are stored are compared, by inner products; nothing is encoded.  What was found is stored in one
+Descriptors as they are stored are compared, by inner products; nothing is encoded.  The result is stored in one
 commit, for the places that are then still as they were compared; so an attempt that was cancelled or killed has stored
 nothing, or everything, and the next attempt begins again.
 """
@@ -122,7 +122,7 @@ def check_request(map_: Map, sequence: str, others: Sequence[str] | None) -> Non
 class TraversesToAlign:
     """The traverses of a map at one moment, with at least one frame each.
 
-    snapshot: what is searched at that moment.
+    snapshot: the searched places at that moment.
     whereabouts: of its rows.
     places: the places by their rows.
     """
@@ -216,7 +216,7 @@ def _change(
 ) -> Correspondence:
     """The changes for the places that are unchanged since they were compared; call it while no write begins.
 
-    What an earlier alignment of these traverses stored gives way, unless nothing was found in its place.
+    The result of an earlier alignment of these traverses gives way, unless nothing was found in its place.
 
     Args:
         own: the rows of the aligned traverse.

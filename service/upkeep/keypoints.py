@@ -37,7 +37,7 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         The result of the job.
 
     Raises:
-        UnknownMap, MapQuarantined, StorageFull, StorageFailure: what was committed before stays.
+        UnknownMap, MapQuarantined, StorageFull, StorageFailure: earlier commits stay.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
     map_ = context.map(engine.maps)

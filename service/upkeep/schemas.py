@@ -95,7 +95,7 @@ class Merging(BaseModel):
     )
     on_conflict: Literal["refuse", "rename", "skip"] = Field(
         default="refuse",
-        description="What to do if an id belongs to another frame here, both maps have a sequence of the same name, or "
+        description="The action if an id belongs to another frame here, both maps have a sequence of the same name, or "
         "a camera has another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, "
         "and append places of a sequence to the sequence of the same name.",
     )
@@ -325,7 +325,7 @@ class SimilarityView(BaseModel):
     columns: int
     scale: SimilarityScale
     stretches: list[SharedPath] = Field(
-        description="What they share, the surest first; empty if they share nothing, or one has fewer than ten frames."
+        description="The shared stretches, the surest first; empty if there are none, or one has fewer than ten frames."
     )
     truth: list[int | None] | None = Field(
         description="For each row the column that is nearest by the poses, null if none is within `radius`; null as a "

@@ -8,7 +8,7 @@
         answer = client.maps["lab"].query("frame.jpg")
         print(answer.verdict, answer.place and answer.place.id)
 
-What a program does not use, such as the asynchronous half, is not imported.
+Unused parts, such as the asynchronous half, are not imported.
 """
 
 from __future__ import annotations

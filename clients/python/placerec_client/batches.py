@@ -67,11 +67,11 @@ class Enrolled:
     """The outcome of one frame.
 
     Attributes:
-        place: what was to be enrolled.
+        place: the frame to enrol.
         change: ``created``, ``replaced``, ``updated`` or ``unchanged``; None if the frame was refused.
         error: why it was refused.
         view: the place as the service has it.
-        fields: what was sent of it.
+        fields: those that were sent of it.
         uploaded: whether its bytes were sent; otherwise the service had them, or they could not be read.
     """
 
@@ -114,7 +114,7 @@ def read_place(place: NewPlace, digest: bool = False) -> Read:
         InvalidParameter: the place is none; what is wrong with one is its ``error``.
     """
     if not isinstance(place, NewPlace):
-        raise InvalidParameter(f"What is enrolled has to be a NewPlace, not a {type(place).__name__}.")
+        raise InvalidParameter(f"A frame to enrol has to be a NewPlace, not a {type(place).__name__}.")
     try:
         if not PLACE_ID.fullmatch(name_of(place.id)):
             raise InvalidName(

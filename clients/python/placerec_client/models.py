@@ -361,7 +361,7 @@ class Share(Model):
 
 
 class Bin(Model):
-    """Answers whose probability lies between ``low`` and ``high``: what was promised, and what came of it."""
+    """Answers whose probability lies between ``low`` and ``high``: the promised share, and the outcome."""
 
     low: float
     high: float

@@ -866,7 +866,7 @@ class Merging(TypedDict, total=False):
     """Only report what would be copied, and how far the maps overlap."""
 
     on_conflict: Literal["refuse", "rename", "skip"]
-    """What to do if an id belongs to another frame here, both maps have a sequence of the same name, or a camera has
+    """The action if an id belongs to another frame here, both maps have a sequence of the same name, or a camera has
     another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, and append places
     of a sequence to the sequence of the same name.
     """
@@ -889,7 +889,7 @@ class CalibrationOrder(TypedDict, total=False):
     """How a map is to be calibrated, and for which target."""
 
     target: Target
-    """What the threshold is chosen to reach."""
+    """The target of the threshold."""
 
     dry_run: bool
     """Report the calibration without storing it."""

@@ -64,7 +64,7 @@ def text_of(name: str, value: Any) -> str:
 
 
 def _single(name: str, value: Any) -> str:
-    """The text of what is no list."""
+    """The text of a value that is no list."""
     if getattr(value, "ndim", None) == 0:  # a number of NumPy, whose text is not the number's
         value = value.item()
     if isinstance(value, str):
@@ -109,7 +109,7 @@ def dumps(value: Any, name: str = "what is given") -> str:
     """A value as JSON; times become ISO 8601.
 
     Args:
-        name: what an error calls it.
+        name: its name in errors.
 
     Raises:
         InvalidParameter: it has something that JSON has not.

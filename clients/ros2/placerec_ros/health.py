@@ -74,7 +74,7 @@ class Health:
             self._log(WARN, sentence)
 
     def answered(self, seconds: float, localized: str | None) -> None:
-        """Note an answer: what it took, and the moment of the frame if the robot was localized."""
+        """Note an answer: its time, and the moment of the frame if the robot was localized."""
         with self._lock:
             self.counts["frames answered"] += 1
             self._latencies.append(seconds)

@@ -1,6 +1,6 @@
 """The thread that speaks with the service, so that the node's callbacks never wait for it.
 
-Frames come in by :meth:`Localizer.add`, answers go out by an :class:`Outlet`. What the node's services ask for is done
+Frames come in by :meth:`Localizer.add`, answers go out by an :class:`Outlet`. Requests of the node's services are done
 by the same thread, between two frames.
 """
 
@@ -43,7 +43,7 @@ OF_THE_FRAME = frozenset({400, 413, 415, 422})
 class Answered:
     """An answer with what follows from it.
 
-    report: what is published as JSON.
+    report: the answer that is published as JSON.
     robot: the robot's pose in the map; None while it is not localized.
     correction: the transform from the map to the odometry; None without odometry, or if the heading is not known.
     """
@@ -185,7 +185,6 @@ class Localizer:
         return IDLE_CHECK
 
     def _work_once(self) -> None:
-        """Do all there is to do."""
         while not self._stopped:
             if self._run is not None and self._run_generation != self._generation:
                 self._end_run()

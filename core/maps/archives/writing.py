@@ -1,4 +1,4 @@
-"""Writing the file of a map from what a store has of it at one moment.
+"""Writing the file of a map from its content in a store at one moment.
 
 The store is read twice: first the lines, for the sizes of all parts, from which it follows how long the file will be
 and where each part lies; then everything, to write it.
@@ -37,10 +37,10 @@ BYTES_PER_GROUP = 256 << 20
 """A group is also full with this number of bytes of pictures or of descriptors."""
 
 Advance = Callable[[int], None]
-"""Is called with the number of places that were written; what it raises ends the work."""
+"""Called with the number of places that were written; its exceptions end the work."""
 
 Expect = Callable[[int], None]
-"""Is called with the size of the file in bytes before it is made; what it raises ends the work."""
+"""Called with the size of the file in bytes before it is made; its exceptions end the work."""
 
 Chunks = Iterable[bytes | memoryview]
 
@@ -118,7 +118,7 @@ def write_archive(source: ArchiveSource, path: Path, advance: Advance, expect: E
     Raises:
         StorageFailure: the map is too large for one file.
         OSError: the disk refuses.
-        Others: what the source raises.
+        Others: the exceptions of the source.
     """
     manifest = _planned(source)
     tape = TarLayout(manifest, len(written(manifest)))

@@ -105,7 +105,7 @@ class Objects:
         return next((why for why in self._all(put, pictures.items()) if why is not None), None)
 
     def _all(self, do: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
-        """Do something several times at once; raises what the first one raised, when all have ended."""
+        """Do something several times at once; raises the first one's error when all have ended."""
         every = list(arguments)
         if len(every) == 1:
             return [do(*every[0])]
@@ -183,7 +183,7 @@ class Objects:
         self.put({PROBE: b"placerec"})
 
     def close(self) -> None:
-        """Wait for what is under way."""
+        """Wait for the calls under way."""
         self._workers.shutdown()
 
     def _ask(self) -> None:

@@ -36,7 +36,7 @@ LINES_BETWEEN = 1024
 """``advance``, which may end the work, is called after this number of lines of sequences."""
 
 Advance = Callable[[int, int], None]
-"""Is called with the number of places done and of all; what it raises ends the work."""
+"""Called with the number of places done and of all; its exceptions end the work."""
 
 CheckPicture = Callable[[bytes], None]
 """Raises InvalidImage for bytes that must not be shown as a picture."""
@@ -86,7 +86,7 @@ class Content(NamedTuple):
 
 
 class Unpacking(ABC):
-    """Reads a file, and has what it holds stored; used for one file.
+    """Reads a file, and has its content stored; used for one file.
 
     Args:
         most_picture_bytes: a larger picture is refused before it is read.
@@ -123,7 +123,7 @@ class Unpacking(ABC):
 
         Raises:
             InvalidArchive: it is damaged, or holds what no map may hold.
-            Others: what storing raises.
+            Others: the exceptions of storing.
         """
         manifest = self.archive.manifest
         sequences, cameras = manifest.parts[:2]

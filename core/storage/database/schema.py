@@ -143,7 +143,6 @@ SCHEMA = Schema(APPLICATION_ID, 9, _TABLES)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
-    """The columns of each table."""
     tables = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
     return {
         name: {column for (column,) in connection.execute("SELECT name FROM pragma_table_info(?)", (name,))}

@@ -1,4 +1,4 @@
-"""The tiers: how a map is searched, chosen by its size or by its owner, and what it reports about this."""
+"""The tiers: how a map is searched, chosen by its size or by its owner, and the status about it."""
 
 from __future__ import annotations
 

@@ -150,7 +150,6 @@ def read_positions(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def _rows(path: Path) -> list[Any]:
-    """The rows of an array, each a list."""
     try:
         numbers = np.load(path, allow_pickle=False, mmap_mode="r")
     except OSError as error:

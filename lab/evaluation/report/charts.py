@@ -41,7 +41,7 @@ class Chart:
     """A finished chart.
 
     name: of its file, without suffix.
-    alt: what it shows, for who cannot see it.
+    alt: the content in words, for people who cannot see it.
     svg: an element whose colours are variables of the page's style sheet.
     png: a file, on light paper.
     """

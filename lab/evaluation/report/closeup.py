@@ -26,7 +26,7 @@ class Closeup:
     size: their width and height in pixels.
     fates: the scores before and, where there is a threshold, after it.
     similarity: the matrix as a file.
-    stem: what the names of its files end in.
+    stem: the end of the names of its files.
     """
 
     run: Run
@@ -49,7 +49,7 @@ def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, thumbnails:
     """Everything about one run.
 
     Args:
-        stem: what the names of its files end in.
+        stem: the end of the names of its files.
     """
     drawn = layers(
         run.scores,

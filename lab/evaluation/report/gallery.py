@@ -74,7 +74,7 @@ class Panel:
 
     what: it is.
     index: of the image; None where the query has no true reference.
-    remark: what is said of it.
+    remark: the text about it.
     name: of its file; "" where there is none.
     picture: None where the file is gone or holds no image.
     boxes: regions of interest as x, y, width, height in pixels of the picture.

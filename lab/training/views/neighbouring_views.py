@@ -71,7 +71,7 @@ def matched_cells(
     Of several matches from one cell, that counts which is nearest to the middles of its cells.
 
     Args:
-        found: what the geometry of the second view as the query and the first as the candidate says.
+        found: the verification of the second view as the query and the first as the candidate.
         first, second: where the keypoints are, as shares of the views' sides, float [k, 2].
         side: of the views, in pixels.
     """

@@ -39,7 +39,7 @@ for name, command in (
     maps.command(name)(command)
 
 Description = Annotated[str | None, typer.Option(help="Description of the map.")]
-Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What the map keeps of each frame.")]
+Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="Picture stored of each frame.")]
 Radius = Annotated[float | None, typer.Option(min=0, help="Places within this distance (metres) are the same place.")]
 Frames = Annotated[
     int | None,

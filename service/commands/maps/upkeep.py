@@ -150,7 +150,7 @@ def merge(
     other: Annotated[str, typer.Argument(metavar="OTHER", help="The map whose places are added.", show_default=False)],
     on_conflict: Annotated[
         Literal["refuse", "rename", "skip"],
-        typer.Option(help="What to do with a name that means different things in the two maps."),
+        typer.Option(help="The treatment of a name that means different things in the two maps."),
     ] = "refuse",
     prefix: Annotated[
         str | None, typer.Option(help="Prefix of renamed places, sequences and cameras; default: the id of OTHER.")

@@ -124,7 +124,7 @@ class RecordingOptions:
 
         Args:
             encoder: name or identity of that whose descriptors show how much a frame has changed; None for the default.
-            mask: what to ignore in the frames.
+            mask: the areas to ignore in the frames.
 
         Raises:
             Failure: no frame can be judged by the options.
@@ -160,7 +160,7 @@ def without_standing(
     The frames of a folder all stay, for somebody chose them.
 
     Args:
-        mask: what to ignore in the frames.
+        mask: the areas to ignore in the frames.
     """
     if not recording.continuous:
         return frames

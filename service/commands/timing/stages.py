@@ -45,7 +45,7 @@ def medians(runs: Mapping[str, Callable[[], object]], rounds: int, warm_up: int 
 def forward_passes(encoder: Encoder, pixels: Pixels) -> dict[str, Callable[[], object]]:
     """The bare forward pass: the encoder's module, eager float32, batch of one, in two memory layouts.
 
-    The module and its input are copied into the layout beforehand: what is measured is the pass.  A network that is no
+    The module and its input are copied into the layout beforehand: only the pass is measured.  A network that is no
     torch module has one pass, its own.
     """
     backbone = encoder.extractor.backbone

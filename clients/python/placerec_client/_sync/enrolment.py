@@ -44,7 +44,7 @@ class Enrolment(Batches[Read, Enrolled]):
 
     Args:
         path: of the places of the map.
-        places: what is to be enrolled; read in a thread, a batch ahead.
+        places: the frames to enrol; read in a thread, a batch ahead.
         known: ids that the map has already; for these frames a first request finds out whether it has their bytes.
         options: of the request, such as ``encoder``.
     """

@@ -97,7 +97,7 @@ def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     """The proxy that the environment names for a service, by the rules of httpx; None for none.
 
     Raises:
-        ConnectionFailed: what the environment names is no proxy.
+        ConnectionFailed: the environment names no usable proxy.
     """
     named = getproxies()
     found = named.get(url.scheme) or named.get("all")
