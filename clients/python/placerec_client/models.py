@@ -1,4 +1,4 @@
-"""What the service answers with: a model for each schema of its interface, under the same name.
+"""Models of the answers of the service: one for each schema of its interface, under the same name.
 
 Written from openapi.json by scripts/client.  Do not edit.
 """

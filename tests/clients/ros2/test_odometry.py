@@ -59,7 +59,7 @@ def test_messages_out_of_order_are_sorted_and_a_clock_that_is_set_back_begins_an
     assert at(odometer, 5.0) is None, "another frame is another odometry"
 
 
-def test_what_is_kept_is_bounded() -> None:
+def test_stored_readings_are_bounded() -> None:
     odometer = Odometer()
     for number in range(3 * MOST_KEPT // 2):
         odometer.add(odometry(100 + number * 1e-4, 0.0, 0.0))
@@ -110,7 +110,7 @@ def test_the_covariance_is_that_of_the_plane() -> None:
         assert told(odometer, 11.0 + number).covariance is None
 
 
-def test_odometry_that_begins_anew_is_told_as_another() -> None:
+def test_odometry_that_begins_anew_has_another_origin() -> None:
     odometer = Odometer()
     origins = []
     for stamp, x, yaw, frame in (

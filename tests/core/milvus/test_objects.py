@@ -135,7 +135,7 @@ def test_a_page_for_review_is_of_one_moment(store: MilvusStore, lab: MilvusMap) 
     check_pages_are_of_one_moment(lab.review, store.get("lab").review)
 
 
-def test_what_is_lost_or_damaged_is_told(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
+def test_lost_and_damaged_objects_are_reported(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
     lab.enrol([frame(name) for name in ("whole", "lost", "damaged")])
     objects.delete([where(lab, "lost").name])
     objects.put({where(lab, "damaged").name: b"image of daMaged"})

@@ -44,7 +44,7 @@ def test_a_request_that_changed_nothing_is_no_change(caplog: pytest.LogCaptureFi
     ]
 
 
-def test_a_job_tells_at_its_end_who_asked_for_it_over_a_restart(
+def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = Jobs(tmp_path)

@@ -84,7 +84,7 @@ async def test_the_oldest_events_go_by_number_and_by_bytes(monkeypatch: pytest.M
 @given(
     st.lists(st.one_of(st.tuples(st.just("add"), st.integers(1, 30)), st.tuples(st.just("read"), st.integers(1, 12))))
 )
-def test_whatever_the_pace_nothing_is_told_twice_or_lost_without_a_count(steps: list[tuple[str, int]]) -> None:
+def test_whatever_the_pace_no_event_is_sent_twice_or_lost_without_a_count(steps: list[tuple[str, int]]) -> None:
     async def run() -> None:
         feed = Feed(threading.Lock())
         add(feed, 3)
@@ -109,7 +109,7 @@ def edited(map_id: str = "lab") -> MapEvent:
     return MapEvent.now(map_id, change="edited", revision=2)
 
 
-async def test_nothing_is_kept_of_a_map_without_listeners() -> None:
+async def test_no_event_of_a_map_without_listeners_is_stored() -> None:
     events = Events()
     events.publish(edited())
     assert not events.heard("lab")
@@ -120,7 +120,7 @@ async def test_nothing_is_kept_of_a_map_without_listeners() -> None:
         assert numbers(listener) == (0, [1])
 
 
-async def test_events_are_kept_for_a_while_after_the_last_listener_has_left() -> None:
+async def test_events_are_stored_for_a_while_after_the_last_listener_has_left() -> None:
     now = 0.0
     events = Events(clock=lambda: now)
     with events.listening("lab") as listener:
@@ -237,7 +237,7 @@ async def test_frames_whose_pictures_are_being_made_are_bounded(monkeypatch: pyt
     events.stop_soon()
 
 
-async def test_who_asked_is_for_the_eyes_of_higher_roles() -> None:
+async def test_callers_are_for_the_eyes_of_higher_roles() -> None:
     events = Events()
     with events.listening("lab") as listener:
         events.publish(asked("front"))

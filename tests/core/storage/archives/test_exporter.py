@@ -245,7 +245,7 @@ def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, a
     shutil.rmtree(directory)
 
 
-def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_error_is_reported(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite ends some transactions by itself, when the disk fails."""
 
     def ended(connection: sqlite3.Connection) -> None:
