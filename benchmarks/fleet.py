@@ -188,7 +188,7 @@ class Fleet:
             line.close()
 
     async def work(self, seconds: float, exports: bool) -> None:
-        """Let all of them work for so long; what they saw is in ``seen``."""
+        """Let all of them work for this time; the results are in ``seen``."""
         self.until = time.perf_counter() + seconds
         hands: list[Awaitable[None]] = [self._guarded("query", self._robot, n) for n in range(self.plan.robots)]
         hands += [self._guarded("enrol", self._operator, n) for n in range(self.plan.operators)]

@@ -249,7 +249,7 @@ class Smoother:
 def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
     """Carry a belief over, row by row, to a graph in which places were added, removed or moved.
 
-    New places start with the least probability of the others.  The probability of places of which no frame is left is
+    New places start with the least probability of the others.  The probability of places without a frame left is
     added to ``unknown``: the robot is where the map no longer has a place.
     """
     n = len(new)

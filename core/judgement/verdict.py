@@ -58,7 +58,7 @@ MOST_RIVALS = 8
 """The largest number of rivals, the best ones, that are examined, each with its neighbours."""
 
 MOSTLY_IMAGINED = 0.5
-"""A map of which more of the background than this is imagined has few places."""
+"""Imagined share of the background above which a map counts as one of few places."""
 
 DOUBT = (0.1, 0.5)
 """Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, queried in the whole other
@@ -71,7 +71,7 @@ class Calibration(BaseModel):
     ``threshold`` is on the decision value, ``margin`` on the difference of
     two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
     frames, in units of the score.  ``curve`` gives the probability that a decision value is right; a calibration on
-    frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
+    frames that are all alike has none.  ``decision`` names the kind of decision value.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map does
     not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
     ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes the

@@ -31,7 +31,7 @@ VERSION = 2
 """Of the tables; it grows when a placerec that knows only the former ones could not use them."""
 
 WAIT_SECONDS = 10
-"""A write that waits for others to the same map is refused after so long."""
+"""A write that waits for others to the same map is refused after this time."""
 
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
@@ -184,7 +184,7 @@ def unlisted(connection: Connection[Any], untouched_seconds: float = 0) -> dict[
     """The numbers of the maps that are being built, by the ids that they have meanwhile.
 
     Args:
-        untouched_seconds: only those that nobody has written to for so long.
+        untouched_seconds: only those without a write for this time.
     """
     query = "SELECT id, number FROM maps WHERE NOT listed AND touched <= now() - make_interval(secs => %s)"
     return dict(connection.execute(query, (untouched_seconds,)).fetchall())
@@ -611,7 +611,7 @@ def known_objects(connection: Connection[Any], names: Sequence[str]) -> set[str]
 
 
 def swept_objects(connection: Connection[Any], whole_seconds: float) -> int:
-    """The key from which on objects may be litter; 0 if all were not listed for so long."""
+    """The key from which on objects may be litter; 0 if the last full listing is older than ``whole_seconds``."""
     query = "SELECT swept FROM placerec WHERE listed > now() - make_interval(secs => %s)"
     found = connection.execute(query, (whole_seconds,)).fetchone()
     return 0 if found is None else int(found[0])

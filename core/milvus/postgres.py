@@ -31,7 +31,7 @@ SETTINGS: Mapping[str, Any] = {
     "tcp_user_timeout": 10_000,
 }
 
-# The pool waits twice as long between two attempts each time, up to minutes; after so long it gives up instead, and the
+# The pool waits twice as long between two attempts each time, up to minutes; after this time it gives up, and the
 # next request begins anew.
 _RECONNECTING_SECONDS = 1.0
 

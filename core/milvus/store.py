@@ -37,7 +37,7 @@ IMPORTED = ".import-"
 """How the names begin under which imports keep their maps; no map id begins like this."""
 
 ABANDONED_SECONDS = 3600
-"""An unlisted map that nobody has written to for so long is not being built any more."""
+"""An unlisted map without a write for this time is abandoned."""
 
 SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 """Between two sweeps, and after one that the servers refused."""

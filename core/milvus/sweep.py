@@ -26,7 +26,7 @@ SWEEPING_OBJECTS = 7064
 """The same for objects."""
 
 LISTED_SECONDS = 24 * 3600
-"""All objects are listed when they have not been for so long: a write whose service was thought dead may leave one."""
+"""Time between two full listings of the objects: a write whose service was thought dead may leave one."""
 
 log = logging.getLogger(__name__)
 

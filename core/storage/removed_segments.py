@@ -32,7 +32,7 @@ class RemovedSegments:
     """
 
     def __init__(self, folder: Path, layout: Layout) -> None:
-        """For the map in ``folder``, of which no segment waits."""
+        """For the map in ``folder``, without waiting segments."""
         self._folder, self._layout = folder, layout
         self._waiting: dict[int, weakref.ref[object]] = {}
         self._suspects: set[int] | None = None  # segments that may have no living row; None: any of them

@@ -303,7 +303,7 @@ class FailedWrites:
     """
 
     def __init__(self, folder: Path) -> None:
-        """For the map in ``folder``, of which no write has failed."""
+        """For the map in ``folder``, whose writes have not failed."""
         self._folder = folder
         self._rows = False
         self._log = False

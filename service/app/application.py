@@ -89,7 +89,7 @@ TAGS = [
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
-    {"name": "keys", "description": "A key says who asks, what its holder may do, and with which maps."},
+    {"name": "keys", "description": "A key identifies the caller, and sets its holder's rights and maps."},
     {"name": "audit", "description": "The audit trail says who changed what, and who was refused."},
     {"name": "service", "description": "Health, metrics and version of the service."},
 ]

@@ -26,7 +26,7 @@ WRITING_SECONDS = 2.0
 """The progress of a job is written to disk at most once in this time; its end is always written."""
 
 SLICE_SECONDS = 5.0
-"""A resumable job works for so long before it gives way to waiting jobs of other maps."""
+"""A resumable job works for this time before it gives way to waiting jobs of other maps."""
 
 
 class JobCancelled(Exception):

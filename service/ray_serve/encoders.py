@@ -42,7 +42,7 @@ GLANCE = 0.25
 """Seconds between two looks whether anybody still waits for the frames of a call; most have ended by then."""
 
 LONGEST_CALL = 60.0
-"""Seconds after which a call is given up, and its frames are sent elsewhere: no replica computes so long."""
+"""Seconds after which a call is given up, and its frames are sent elsewhere: no replica computes longer."""
 
 UNSERVED = 5.0
 """Seconds without a replica after which robots' frames are refused; until then, one may be starting."""

@@ -20,7 +20,7 @@ BEAT_SECONDS = 2.0
 """How often a service says that it is there."""
 
 LOSING_SECONDS = 7.0
-"""A service that could not say so for so long stops its jobs, by its own clock: before it counts as gone by the
+"""A service that cannot write its beat for this time stops its jobs, by its own clock: before it counts as gone by the
 database's, and others take them over (``service.living`` in tables.sql)."""
 
 LIVING = "SELECT id FROM service.living"

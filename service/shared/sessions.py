@@ -44,7 +44,7 @@ ADDING = 7_061_636_574
 """The lock of whoever adds a session, so that together they keep to the limit."""
 
 LATE_SECONDS = 30
-"""A session is ended so long after it has expired, since a frame that came in time may still be in the works."""
+"""A session is ended this time after it has expired, since a frame that came in time may still be in the works."""
 
 TIDYING_BEATS = 30
 """Number of beats between deletions of the records of sessions that ended long ago."""

@@ -411,11 +411,11 @@ class Calibration(Model):
     """When to believe a match; measured on frames held out of training. ``threshold`` is on the decision value,
     ``margin`` on the difference of two scores. ``background_mean`` and ``background_deviation`` describe the score
     of unrelated frames, in units of the score. ``curve`` gives the probability that a decision value is right; a
-    calibration on frames that are all alike has none. ``decision`` names the decision value, of which there is one.
-    ``environment`` describes the scores of other places of one environment, which stand for those that a small map
-    does not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames
-    do. ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence
-    changes the order of the candidates only.
+    calibration on frames that are all alike has none. ``decision`` names the kind of decision value. ``environment``
+    describes the scores of other places of one environment, which stand for those that a small map does not have
+    yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
+    ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes
+    the order of the candidates only.
     """
 
     source: str
@@ -1096,7 +1096,7 @@ class OperationState(Model):
 
 
 class OwnKey(Model):
-    """Who asks, and what the asker may do."""
+    """The caller, and the caller's rights."""
 
     id: str | None = None
     name: str

@@ -42,7 +42,7 @@ CONNECT_SECONDS, ANSWER_SECONDS = 2, 10
 """A request that takes longer has failed; a write to a map does not wait much longer for others either."""
 
 PROBE_SECONDS = 1.5
-"""A store that was gone, and does not answer in so long, is still gone."""
+"""A store that was gone, and does not answer within this time, is still gone."""
 
 PROBE = "probe"
 """The name of the object that is written to see whether objects can be written."""

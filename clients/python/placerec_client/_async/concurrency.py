@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 
 async def sleep(seconds: float) -> None:
-    """Wait so long."""
+    """Wait for this time."""
     await asyncio.sleep(seconds)
 
 
@@ -30,7 +30,7 @@ async def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
 
 
 async def within(seconds: float, work: Callable[[], Awaitable[Result]]) -> Result:
-    """The result of work that is waited for so long.
+    """The result of work, awaited for a limited time.
 
     Raises:
         TimeoutError: there is none yet; the work is broken off.
