@@ -101,7 +101,7 @@ def main() -> None:
         found = asyncio.run(measure(Path(folder)))
     report(
         "access",
-        "What the access layer adds to a request",
+        "Time that the access layer adds to a request",
         ["request", "µs"],
         list(found.items()),
         {"microseconds": found},

@@ -61,7 +61,7 @@ for line in sys.stdin:
 def main(
     other: Annotated[Path, typer.Argument(help="The checkout to compare this one with.")],
     rounds: Annotated[int, typer.Option(help="Turns of each checkout.")] = 5,
-    places: Annotated[int, typer.Option(help="Places of the map that is asked.")] = 1622,
+    places: Annotated[int, typer.Option(help="Places of the map that is queried.")] = 1622,
     seconds: Annotated[float, typer.Option(help="Seconds of load in each turn.")] = 4.0,
 ) -> None:
     """Compare this checkout with another one."""
@@ -92,7 +92,7 @@ def main(
         for turn in range(rounds):
             for name in list(checkouts)[:: 1 if turn % 2 else -1]:
                 values, (client, _) = found[name], services[name]
-                values["encode ms"].append(asked(encoders[name], 60))
+                values["encode ms"].append(encoding_milliseconds(encoders[name], 60))
                 for robots in (1, 4, 16):
                     seen = load(str(client.base_url), folder / "frames", robots, seconds)
                     values[f"{robots} robots, answers/s"].append(len(seen["milliseconds"]) / seen["seconds"])
@@ -141,7 +141,7 @@ def running(checkout: Path, data_dir: Path) -> Iterator[tuple[httpx.Client, int,
 
 @contextmanager
 def encoding(checkout: Path, frame: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process of a checkout that encodes a frame whenever it is asked."""
+    """A process of a checkout that encodes a frame on request."""
     words = [sys.executable, "-c", ENCODE, str(frame)]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     pipe = subprocess.PIPE
@@ -151,8 +151,8 @@ def encoding(checkout: Path, frame: Path) -> Iterator[subprocess.Popen[str]]:
         _stream(process.stdin).close()
 
 
-def asked(process: subprocess.Popen[str], times: int) -> float:
-    """Milliseconds of one encoding, the median of so many."""
+def encoding_milliseconds(process: subprocess.Popen[str], times: int) -> float:
+    """Milliseconds of one encoding, the median of ``times``."""
     stdin = _stream(process.stdin)
     stdin.write(f"{times}\n")
     stdin.flush()
@@ -178,7 +178,7 @@ def enrol(client: httpx.Client, map_id: str, frames: list[bytes], first: int, co
 
 
 def load(url: str, frames: Path, robots: int, seconds: float) -> dict[str, Any]:
-    """What robots saw that asked the map for some seconds; they are a process of their own."""
+    """The measurements of robots that query the map for some seconds, in a process of their own."""
     words = ["--url", url, "--path", "/v1/maps/lab/query", "--frames", str(frames)]
     words += ["--robots", str(robots), "--seconds", str(seconds)]
     command = [sys.executable, "-m", "service.commands.load", *words]

@@ -6,7 +6,7 @@
 
 16 robots query at a fixed rate, two operators enrol, one deletes as much as they enrol, and someone lists, verifies and
 (where the service can) exports the map, while the process is looked at from outside every five seconds.  Wanted: no
-answer but those asked for, every enrolled place found and no deleted one; p99 of the last sixth at most 1.2 times that
+answer but those expected, every enrolled place found and no deleted one; p99 of the last sixth at most 1.2 times that
 of the first; memory, open files, threads and disk that do not grow.  Robots and service share the machine's cores.
 """
 
@@ -150,9 +150,9 @@ def judge(seen: Seen, samples: list[dict[str, float]], start: float, stop: float
     figures["growth"] = {name: growth(samples, name) for name in samples[0] if name != "at"}
     for name, unit in (("resident_mb", "MB"), ("disk_mb", "MB")):
         one = figures["growth"][name]
-        told = f"{one['first']:.0f}, {one['last']:.0f} {unit} (most {one['most']:.0f}, {one['slope_per_hour']:+.0f}/h)"
+        trend = f"{one['first']:.0f}, {one['last']:.0f} {unit} (most {one['most']:.0f}, {one['slope_per_hour']:+.0f}/h)"
         what = f"{name.split('_')[0]}: least of first and last third"
-        rows.append((what, "", told, _bar(one["last"] / one["first"], GROWTH_LIMIT)))
+        rows.append((what, "", trend, _bar(one["last"] / one["first"], GROWTH_LIMIT)))
     for name in ("files", "connections", "threads", "places"):
         one = figures["growth"][name]
         bar = "" if name == "places" else verdict(one["last_median"] - one["first_median"], MORE_LIMIT)
@@ -164,9 +164,7 @@ def judge(seen: Seen, samples: list[dict[str, float]], start: float, stop: float
                 bar,
             )
         )
-    rows.append(
-        ("errors that were not asked for", sum(seen.complaints.values()), "", verdict(sum(seen.complaints.values()), 0))
-    )
+    rows.append(("unexpected errors", sum(seen.complaints.values()), "", verdict(sum(seen.complaints.values()), 0)))
     figures["complaints"] = dict(seen.complaints)
     return rows, figures
 
@@ -187,7 +185,7 @@ def main(
     scenes = [draw(number) for number in range(places + 300 * operators)]
     strangers = [draw(100_000 + number).seen for number in range(60)]
     fixed = {f"fixed-{number:05d}": number for number in range(places)}
-    settings = {"EXPORT_SECONDS": 30}  # the file of an export is kept for so long
+    settings = {"EXPORT_SECONDS": 30}  # the file of an export is stored for this time
     with (
         tempfile.TemporaryDirectory() as text,
         service(Path(text) / "data", settings=settings, log=Path(text) / "log") as process,

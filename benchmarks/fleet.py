@@ -1,10 +1,10 @@
-"""A fleet that works on one map for as long as it is told: robots, operators who enrol, one who deletes, housekeeping.
+"""A fleet that works on one map for a given time: robots, operators who enrol, one who deletes, housekeeping.
 
 Standard library and bytes made beforehand, like :mod:`service.commands.load`, but every answer is read and judged: a
 place that was enrolled before a frame was sent, and whose deletion was not begun before the answer came, must be the
 best match of its own scene; one whose deletion was acknowledged before the frame was sent must not occur at all.
 
-Robots keep to a timetable.  What an answer took counts from the moment when its frame was due, so that a robot that had
+Robots keep to a timetable.  The time of an answer counts from when its frame was due, so that a robot that had
 to wait for the answer before does not hide the wait.
 """
 
@@ -31,7 +31,7 @@ NEVER = float("inf")
 
 @dataclass
 class Enrolled:
-    """What is known of one place: when its enrolment was acknowledged, its deletion begun and acknowledged."""
+    """The known history of one place: when its enrolment was acknowledged, its deletion begun and acknowledged."""
 
     scene: int
     since: float = NEVER
@@ -58,7 +58,7 @@ class Scene:
 
 @dataclass
 class Plan:
-    """What the fleet does, and with what.
+    """The work of the fleet, and its means.
 
     rate: frames a second of each robot; 0: the next as soon as the last is answered.
     enrol_rate: frames a second of each operator.
@@ -78,7 +78,7 @@ class Plan:
 
 @dataclass
 class Seen:
-    """What came of it: (when due, seconds) by kind of request, statuses, and complaints in words."""
+    """The results: (when due, seconds) by kind of request, statuses, and complaints in words."""
 
     times: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     statuses: Counter[str] = field(default_factory=Counter)
@@ -95,7 +95,7 @@ class Seen:
 
 
 class Connection:
-    """One kept connection, opened again when the other end has closed it between two requests."""
+    """One persistent connection, opened again when the other end has closed it between two requests."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -188,7 +188,7 @@ class Fleet:
             line.close()
 
     async def work(self, seconds: float, exports: bool) -> None:
-        """Let all of them work for so long; what they saw is in ``seen``."""
+        """Let all of them work for this time; the results are in ``seen``."""
         self.until = time.perf_counter() + seconds
         hands: list[Awaitable[None]] = [self._guarded("query", self._robot, n) for n in range(self.plan.robots)]
         hands += [self._guarded("enrol", self._operator, n) for n in range(self.plan.operators)]

@@ -18,7 +18,7 @@ REAL = Path(__file__).parents[2] / "shared" / "datasets" / "eval" / "lip6_outdoo
 
 
 def camera_frames(count: int, traverse: str = "query") -> tuple[list[bytes], str]:
-    """So many JPEG files of 640 x 480, and what they are: those of lip6_outdoor enlarged, or drawn where it is not.
+    """``count`` JPEG files of 640 x 480, and their name: lip6_outdoor enlarged, or drawn where that is absent.
 
     Args:
         traverse: ``query`` or ``reference``; sample frames differ between the two as well.

@@ -1,4 +1,4 @@
-"""What ``scripts/serve`` installs, how long that takes, and what it weighs once it runs; of commits beside each other.
+"""The installation by ``scripts/serve``: its packages, time, and memory once it runs; of commits beside each other.
 
     python -m benchmarks.installation [COMMIT …] [--keep FOLDER]
 
@@ -40,7 +40,7 @@ def checked_out(commit: str, folder: Path) -> Path:
 
 
 def megabytes(folder: Path) -> float:
-    """What a folder takes on disk; files that it shares with a cache count."""
+    """The size of a folder on disk; files that it shares with a cache count."""
     text = subprocess.run(["du", "-sm", folder], check=True, capture_output=True, text=True).stdout
     return float(text.split()[0])
 

@@ -1,4 +1,4 @@
-"""What every benchmark prints and keeps: a table, and JSON in ``benchmarks/results`` (not in the repository)."""
+"""The output of every benchmark: a table, and JSON in ``benchmarks/results`` (not in the repository)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells it."""
+    """The processor's name, as far as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -52,6 +52,6 @@ def report(
 
 
 def verdict(value: float, limit: float, at_least: bool = False) -> str:
-    """A limit and whether it is kept."""
-    kept = value >= limit if at_least else value <= limit
-    return f"{'≥' if at_least else '≤'} {limit:g}: {'kept' if kept else 'MISSED'}"
+    """A limit and whether it is met."""
+    met = value >= limit if at_least else value <= limit
+    return f"{'≥' if at_least else '≤'} {limit:g}: {'met' if met else 'MISSED'}"

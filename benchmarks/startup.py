@@ -36,7 +36,7 @@ def frame(index: int) -> bytes:
 
 
 def enrol(process: Process, places: int) -> float:
-    """Send so many frames; seconds that it took."""
+    """Send frames; seconds that it took."""
     process.client.post("/v1/maps", json={"id": "benchmark"}).raise_for_status()
 
     def send(index: int) -> None:

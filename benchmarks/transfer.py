@@ -1,4 +1,4 @@
-"""What a map as a file costs: time and memory of writing it, of checking it, of building a map from it.
+"""The cost of a map as a file: time and memory of writing it, of checking it, of building a map from it.
 
     python -m benchmarks.transfer [--places 2000 --places 8000] [--folder DIR]
 

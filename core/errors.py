@@ -156,7 +156,7 @@ class StoreUnavailable(StorageFailure):
 
 
 class StoreOfAnotherVersion(StorageFailure):
-    """What the servers keep was made by another version of placerec, which this one does not read."""
+    """The data on the servers was made by another version of placerec, which this one does not read."""
 
 
 class MapQuarantined(PlacerecError):

@@ -1,4 +1,4 @@
-"""What can be a name: of a map, a place, a sequence, a camera, an encoder, a key, and of whatever else is given one.
+"""The rules of names: of maps, places, sequences, cameras, encoders, keys, and everything else that has a name.
 
 Names stand in paths, which clients, proxies and browsers put in order before a request is sent: a segment ``..`` goes,
 and takes the one before it along.  They also stand in tables and logs, where an invisible character makes two names
@@ -34,7 +34,7 @@ TEXT = rf"(\.{{0,2}}[^.\s{_NONE_OF}]|\.{{3}})[^{_NONE_OF}]*"
 begin with a space, also behind these, so that it is not empty for those who look."""
 
 _NO_NAME = re.compile(r"(\.|%2e){1,2}|.*[\ud800-\udfff\U000e0001\U000e0020-\U000e007f].*", re.IGNORECASE | re.DOTALL)
-"""What is a text by the pattern and no name: the dots of a path, what UTF-8 has not, and tags, which nobody sees."""
+"""Texts that fit the pattern and are no names: the dots of a path, surrogates, and invisible tags."""
 
 LONGEST = 128
 """Characters of the longest name."""
@@ -47,13 +47,13 @@ def word(most: int, more: str = "~") -> str:
 
 @dataclass(frozen=True)
 class Names:
-    """What can be a name of one kind: for code, and as a mark of a model's field, ``Annotated[str, names]``.
+    """The rule of names of one kind: for code, and as a mark of a model's field, ``Annotated[str, names]``.
 
     A field that is no name is refused with the same sentence as an argument; the JSON Schema has the pattern.
 
-    what: what it names, with its article.
+    what: the named thing, with its article.
     pattern: of every name, without anchors.
-    rule: what the pattern says, in words that go on after "a name".
+    rule: the pattern in words that go on after "a name".
     most: characters of the longest one; None: the pattern says it.
     but: a text of the pattern that is no name all the same; the schema does not say so.
     """
@@ -110,5 +110,5 @@ def file_names(what: str, but: str | None = None) -> Names:
 
 
 def rule_of_words(most: int, marks: str, letters: str = "letters") -> str:
-    """What a word has, in words."""
+    """The rule of a word as a sentence for people."""
     return f"has 1 to {most} characters: {letters} of ASCII, digits and {marks}, and begins with a letter or a digit"

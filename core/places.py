@@ -70,7 +70,7 @@ class Pose(BaseModel):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84).
 
     ``heading`` is in degrees: counter-clockwise from +x beside x and y, clockwise from north beside
-    latitude and longitude.  It is kept within [0, 360).
+    latitude and longitude.  It is normalized to [0, 360).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -147,7 +147,7 @@ Camera = Annotated[str, CAMERAS]
 
 
 class PlaceFields(BaseModel):
-    """What a caller says about a frame; each may be left out."""
+    """A caller's statements about a frame; each may be left out."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -165,12 +165,12 @@ class Place(PlaceFields):
     sequence: str | None = None
     pose_of: str | None = Field(default=None, description="The place whose pose it got from an alignment.")
     regions: int = Field(ge=0, description="Regions of interest found in the frame.")
-    picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
+    picture: Literal["none", "thumbnail", "image"] = Field(description="The stored form of the frame.")
     created_at: Timestamp
     updated_at: Timestamp
 
     def fields(self) -> PlaceFields:
-        """What a caller once said about the frame."""
+        """The statements of a caller about the frame, when it was enrolled or later."""
         return PlaceFields.model_construct(**{name: getattr(self, name) for name in PlaceFields.model_fields})
 
 
@@ -182,7 +182,7 @@ class Neighborhood:
     frames: int
 
     def times(self, factor: float) -> Neighborhood:
-        """The neighbourhood that reaches so many times as far."""
+        """The neighbourhood with its distances multiplied by ``factor``."""
         return Neighborhood(self.radius * factor, int(self.frames * factor))
 
 

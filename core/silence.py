@@ -1,4 +1,4 @@
-"""What keeps dependencies from telling others about this machine: variables that they read when they are imported.
+"""Switches that stop dependencies from reporting about this machine: variables that they read when they are imported.
 
 ONNX Runtime counts its runs, writes an identity of the machine and looks up the host that collects them; Ray reports
 the use of a cluster; FastAPI sends what OpenTelemetry's variables ask for.  Nothing leaves the machine but answers, so

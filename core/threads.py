@@ -96,7 +96,7 @@ def _openmp() -> list[LibController]:
 
 
 def use_threads(threads: int) -> None:
-    """Let what this thread computes from now on use so many threads, itself among them; others keep their number."""
+    """Set the number of threads, itself among them, that this thread computes with from now on; others keep theirs."""
     import torch
 
     torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following

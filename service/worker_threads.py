@@ -32,7 +32,7 @@ async def to_its_end(
     thread still writes to it.
 
     Args:
-        work: what to run; its error is raised unless the task was cancelled.
+        work: the function to run; its error is raised unless the task was cancelled.
         limiter: limits how many threads run; that of the whole pool if left out.
         give_up: is called when the task is cancelled; it may ask the work to end soon.
 

@@ -84,7 +84,7 @@ def test_only_what_lies_in_the_root_counts_and_what_sqlite_rebuilds_does_not() -
     assert (report.acknowledgements, report.writes, report.violations) == (1, 0, [])
 
 
-def test_a_shared_mapping_for_writing_is_told() -> None:
+def test_a_shared_mapping_for_writing_is_reported() -> None:
     mapping = "7 mmap(NULL, 4096, PROT_READ|PROT_WRITE, MAP_SHARED, 3</data/a>, 0) = 0x7f0000000000\n"
     assert len(read(mapping).violations) == 1
     assert read(mapping.replace("MAP_SHARED", "MAP_PRIVATE")).violations == []

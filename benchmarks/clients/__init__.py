@@ -1,1 +1,1 @@
-"""What clients of the service cost beside plain HTTP."""
+"""The cost of clients of the service beside plain HTTP."""

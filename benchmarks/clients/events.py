@@ -1,4 +1,4 @@
-"""What live events cost a query: with nobody listening, and with listeners, as the whole request sees it.
+"""The cost of live events for a query: with nobody listening, and with listeners, as the whole request sees it.
 
     python -m benchmarks.clients.events [--other ../other-checkout]
 

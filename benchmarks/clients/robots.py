@@ -23,7 +23,7 @@ Verify = Literal["auto", "always", "never"]
 
 
 async def drive(url: str, map_id: str, frames: list[bytes], robots: int, seconds: float, verify: Verify) -> Any:
-    """Let so many robots drive; each answer's time in milliseconds, and what they cost."""
+    """Let robots drive; each answer's time in milliseconds, and what they cost."""
     times: list[float] = []
 
     async def robot(index: int) -> None:

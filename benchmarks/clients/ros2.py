@@ -1,10 +1,10 @@
-"""What the ROS 2 node adds to an answer: the time from a published image to the published answer, beside HTTP.
+"""The time that the ROS 2 node adds to an answer: from a published image to the published answer, beside HTTP.
 
     PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2               # on drawn frames
     PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2 --corridor    # the real corridor as a bag at 10 Hz
 
 For the times, two sessions of one service get the same frames in turn, one over HTTP from this process, one by the
-node, whose peer publishes each frame and hears the answer; what the node adds is also told beside its own request,
+node, whose peer publishes each frame and hears the answer; the node's share is also given beside its own request,
 which does not depend on what else the machine does meanwhile.  The corridor's verdicts and places are compared with
 those over HTTP.  All of it runs in a network of its own and needs ``.venv-ros`` (``. scripts/environment; environment
 ros``).

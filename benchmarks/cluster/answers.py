@@ -1,4 +1,4 @@
-"""Corridor and lip6 asked of a data directory and of PostgreSQL and Milvus: the same answers.
+"""Corridor and lip6 queried in a data directory and of PostgreSQL and Milvus: the same answers.
 
     python -m benchmarks.cluster.answers [--milvus ADDRESS --postgres ADDRESS]
 

@@ -1,4 +1,4 @@
-"""What an object store costs: places enrolled, pictures read, and the 30 frames of a query, with it and without.
+"""The cost of an object store: places enrolled, pictures read, and the 30 frames of a query, with it and without.
 
     python -m benchmarks.cluster.objects [--places 320] [--bytes 8000]
 
@@ -19,8 +19,8 @@ import typer
 from core.maps import MapSettings
 from core.milvus import ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.kept import StoredObject, new_object
 from core.milvus.pictures.objects import Objects
+from core.milvus.pictures.stored import StoredObject, new_object
 from tests.core.milvus.servers import running_servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 

@@ -3,7 +3,7 @@
     python -m benchmarks.cluster.search [--places 100000] [--milvus ADDRESS --postgres ADDRESS]
 
 Places and queries are those of ``benchmarks.maps.search``.  The store asks Milvus and then PostgreSQL for the places
-of the hits; *alone* is the first of these two.  What index Milvus has depends on its version (core.milvus.indexes);
+of the hits; *alone* is the first of these two.  The index of Milvus depends on its version (core.milvus.indexes);
 that of scripts/cluster is flat.  Recall@1 is how often the first of a ranking is the one that exact float32 products
 put first.  *Core ms* is processor time of a server for one search, which other load does not change.
 """
@@ -91,26 +91,26 @@ def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> 
         ((keys, _),) = milvus.collection.search(query[np.newaxis], f"map == {state.number}", SHORTLIST, state.inserted)
         return keys
 
-    asked: list[tuple[str, Callable[[Array], NDArray[np.int64]]]] = [
+    queried: list[tuple[str, Callable[[Array], NDArray[np.int64]]]] = [
         ("embedded", lambda query: snapshot.search(query)[0]),
         (f"PostgreSQL and Milvus, {milvus.collection.index_type}", lambda query: scope.search(query[np.newaxis])[0][0]),
         (f"Milvus alone, {milvus.collection.index_type}", alone),
     ]
-    contenders = [Contender(len(snapshot), name, search) for name, search in asked]
+    contenders = [Contender(len(snapshot), name, search) for name, search in queried]
     found = []
     for contender, times in zip(contenders, measure(contenders, of.queries, rounds), strict=True):
         low, middle, high = statistics.quantiles(times, n=4)
         found.append({"store": contender.name, "milliseconds": middle, "quartiles": [low, high]})
-    for row, (_, search) in zip(found[:2], asked, strict=False):
+    for row, (_, search) in zip(found[:2], queried, strict=False):
         first = np.array([int(search(query)[0]) for query in of.queries])
         row["recall"] = float(np.mean(first == truth))
     for part, process in stores.processes.items():
-        found[1][f"{part}_milliseconds"] = processor_milliseconds(process, asked[1][1], of.queries)
+        found[1][f"{part}_milliseconds"] = processor_milliseconds(process, queried[1][1], of.queries)
     return found
 
 
 def processor_milliseconds(process: int, search: Callable[[Array], object], queries: Array) -> float:
-    """Of a server for one search, without what it takes when it is asked nothing."""
+    """Processor time of a server for one search, without its time when idle."""
     before, began = processor_seconds(process), time.monotonic()
     time.sleep(IDLE_SECONDS)
     idle = (processor_seconds(process) - before) / (time.monotonic() - began)
@@ -128,14 +128,14 @@ def main(
     milvus: MilvusAddress = "",
     postgres: PostgresAddress = "",
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
-    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are stored.")] = Path(".cache/references"),
 ) -> None:
     """Measure and report."""
     share_cores(cores())
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     of = material(datasets, encoder, cache)
-    asked = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
-    of = replace(of, queries=of.queries[asked], walks=of.walks[asked])
+    queried = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
+    of = replace(of, queries=of.queries[queried], walks=of.walks[queried])
     with both_stores(milvus, postgres) as stores:
         began = time.monotonic()
         truth = fill(stores, encoder, of, places)

@@ -1,4 +1,4 @@
-"""What it costs that services share their state in PostgreSQL, beside the files of a data directory.
+"""The cost of state shared by services in PostgreSQL, beside the files of a data directory.
 
     python -m benchmarks.cluster.shared_state [--rounds 200]
 
@@ -51,7 +51,7 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
 
 
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
-    """A frame of a session: what is asked before it, and what is saved after it."""
+    """A frame of a session: the reads before it and the writes after it."""
     session = StoredSession(
         "s-1", "lab", "2026", '{"expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
         bytes(BELIEF_BYTES), '{"frame": 7}' + " " * 4000,
@@ -59,8 +59,8 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     store, table = SessionStore(folder), SessionTable(database)
     store.write(session)
     table.write(session)
-    asked = median(rounds, lambda _: (table.head("s-1"), table.newer("s-1", 0)))
-    print(f"session, asked before a frame    {'':>8}  {asked:8.2f}")
+    read = median(rounds, lambda _: (table.head("s-1"), table.newer("s-1", 0)))
+    print(f"session, read before a frame     {'':>8}  {read:8.2f}")
     saved = median(rounds, lambda _: store.renew(session)), median(rounds, lambda n: table.renew(session, n))
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
     store.close()
@@ -136,12 +136,12 @@ def of_notices(folders: list[Path], address: str, rounds: int) -> None:
     other.start()
     time.sleep(1)
 
-    def told(_: int) -> None:
+    def notice(_: int) -> None:
         heard.clear()
         one.say("test")
         assert heard.wait(5)
 
-    print(f"a notice, said and heard         {'':>8}  {median(rounds, told):8.2f}")
+    print(f"a notice, said and heard         {'':>8}  {median(rounds, notice):8.2f}")
     for replica, database in zip((one, other), databases, strict=True):
         replica.close()
         database.close()

@@ -39,7 +39,7 @@ IN_POSTGRES = HALF + 24_000
 
 MACHINE_CORES, MACHINE_GB = 16, 128
 SMALLEST = {"front": 2, "encoder": 4, "milvus": 2, "postgres": 2}
-"""Cores of compose.cluster.yaml on a machine of its own each, of which the first to give out is told."""
+"""Cores of compose.cluster.yaml on a machine of its own each, for the part that is exhausted first."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class Times:
     per_place: float
 
     def of(self, part: str, places: int) -> float:
-        """Of a part, in a map of so many places."""
+        """Seconds of a part, in a map with ``places`` places."""
         return places * self.per_place if part == "milvus" else float(getattr(self, part))
 
 
 @dataclass(frozen=True)
 class Index:
-    """What Milvus keeps in memory of a place, in bytes, and the share of its exact time that a search takes."""
+    """Milvus's memory of a place, in bytes, and the share of its exact time that a search takes."""
 
     name: str
     memory: int
@@ -73,7 +73,7 @@ INDEXES = (
 
 
 def load_measured() -> dict[str, Any]:
-    """What was measured: the file beside this one, and newer results where they are."""
+    """The measurements: the file beside this one, and newer results where they are."""
     found: dict[str, Any] = json.loads((HERE / "measured.json").read_text())
     search = RESULTS / "cluster_search.json"
     if search.exists():
@@ -144,7 +144,7 @@ def first_to_give_out(times: Times, places: int, share: float) -> list[tuple[flo
 
 def main(
     rate: Annotated[float, typer.Option(help="Queries a second of a robot.")] = 1.0,
-    places_per_map: Annotated[int, typer.Option(help="At most so many places are searched by a query.")] = 100_000,
+    places_per_map: Annotated[int, typer.Option(help="The most places that a query searches.")] = 100_000,
     wait: Annotated[float, typer.Option(help="Mean wait of a part, in its service times, at most.")] = 0.5,
     machine: Annotated[float, typer.Option(help="Price of an hour of 16 cores and 128 GB, assumed.")] = 0.8,
     gigabyte: Annotated[float, typer.Option(help="Price of a GB of disk a month, assumed.")] = 0.1,
@@ -189,8 +189,8 @@ def main(
     report("cluster_sizing", f"cores, machines of {MACHINE_CORES} cores and {MACHINE_GB} GB", columns, rows, figures)
     for index in INDEXES:
         limits = first_to_give_out(times, places_per_map, index.share)
-        told = ", ".join(f"{part} at {limit:.0f}/s" for limit, part in limits)
-        print(f"smallest cluster, {index.name}: first {told}")
+        limited = ", ".join(f"{part} at {limit:.0f}/s" for limit, part in limits)
+        print(f"smallest cluster, {index.name}: first {limited}")
 
 
 if __name__ == "__main__":

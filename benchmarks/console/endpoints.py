@@ -1,4 +1,4 @@
-"""What the console asks of a large map: its plan, pages of filtered places, forgetting many places.
+"""The console's requests for a large map: its plan, pages of filtered places, forgetting many places.
 
     python -m benchmarks.console.endpoints [--places 100000] [--rounds 5]
 

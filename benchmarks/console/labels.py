@@ -1,4 +1,4 @@
-"""What labels made in the console are worth: the Brier score of held-out frames before and after they calibrate a map.
+"""The gain of labels made in the console: the Brier score of held-out frames before and after they calibrate a map.
 
     python -m benchmarks.console.labels ../shared/datasets/eval [--most 130] [--only corridor]
 
@@ -38,9 +38,9 @@ def kept_frames(client: httpx.Client, map_id: str) -> dict[int, str]:
     return found
 
 
-def label_by_clicks(page: Page, console: str, map_id: str, frames: dict[int, str], asked: Sequence[Frame]) -> None:
+def label_by_clicks(page: Page, console: str, map_id: str, frames: dict[int, str], queried: Sequence[Frame]) -> None:
     """Label frames in the view Review, as a person would who knows the way."""
-    shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in asked}
+    shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in queried}
     page.goto(f"{console}#/maps/{map_id}/review")
     panel = page.get_by_role("region", name="Frame to be labelled")
     for number, sha256 in frames.items():
@@ -76,17 +76,17 @@ def measure(client: httpx.Client, page: Page, of: Walk, other: Walk) -> list[dic
     """The figures of a data set by the half that was held out."""
     console, found = f"{client.base_url}/console", []
     parts = halves(of, other)
-    for turn, (asked, held_out) in enumerate((parts, parts[::-1])):
+    for turn, (queried, held_out) in enumerate((parts, parts[::-1])):
         map_id = f"{of.name}-{turn}"
         make_map(client, map_id, of, KEPT["doubtful"])
-        for frame in asked:
+        for frame in queried:
             query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
         before = ask(client, map_id, held_out)
         frames = kept_frames(client, map_id)
         began = time.perf_counter()
-        label_by_clicks(page, console, map_id, frames, asked)
+        label_by_clicks(page, console, map_id, frames, queried)
         took = time.perf_counter() - began
         labels = client.get(f"/v1/maps/{map_id}/review/labels").raise_for_status().json()["items"]
         assert len(labels) == len(frames), (len(labels), len(frames))

@@ -97,7 +97,7 @@ class Clock:
 
 
 class Taken(NamedTuple):
-    """What something took: seconds, and the processor time of the service and of the browser."""
+    """The cost of an action: seconds, and the processor time of the service and of the browser."""
 
     seconds: float
     server: float

@@ -1,4 +1,4 @@
-"""Drives a robot through a situation, and holds what it is told against the truth."""
+"""Drives a robot through a situation, and compares its answers with the truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from benchmarks.day.maps import shown_by
-from benchmarks.day.robots import Mode, Told, on_its_way
+from benchmarks.day.robots import Mode, RobotAnswer, on_its_way
 from benchmarks.day.situations import Moment
 from core.maps import MapSettings
 from placerec_client import ConnectionFailed
@@ -34,7 +34,7 @@ NEAR = MapSettings().same_place_radius
 
 @dataclass(frozen=True)
 class Drive:
-    """What became of each frame.
+    """The outcome of each frame.
 
     again: seconds from the first frame after a disturbance until one is recognized and right, the longest of them;
         infinite if none is; None without a disturbance.
@@ -73,16 +73,16 @@ def drive(url: str, map_id: str, mode: Mode, way: Iterable[Moment], restart: Cal
                 since = moment.second
             radio.fate = moment.fate
             try:
-                told = robot.ask(moment)
+                answer = robot.ask(moment)
             except ConnectionFailed:
                 if moment.fate == "answered":
                     raise
                 outcomes.append("silent")
                 continue
-            found = _outcome(told, moment, enrolled)
+            found = _outcome(answer, moment, enrolled)
             outcomes.append(found)
-            if told.enrolled is not None:
-                enrolled[told.enrolled] = moment
+            if answer.enrolled is not None:
+                enrolled[answer.enrolled] = moment
             if found == "right" and since is not None:
                 waited.append(moment.second - since)
                 since = None
@@ -90,14 +90,14 @@ def drive(url: str, map_id: str, mode: Mode, way: Iterable[Moment], restart: Cal
     return Drive(tuple(outcomes), max(waited, default=None))
 
 
-def _outcome(told: Told, moment: Moment, enrolled: dict[str, Moment]) -> Outcome:
-    if told.verdict == "ambiguous":
+def _outcome(answer: RobotAnswer, moment: Moment, enrolled: dict[str, Moment]) -> Outcome:
+    if answer.verdict == "ambiguous":
         return "ambiguous"
-    if told.place is None:
+    if answer.place is None:
         here = moment.right or any(_same(moment, one) for one in enrolled.values())
         return "unknown" if here else "nowhere"
-    own = enrolled.get(told.place)
-    is_right = _same(moment, own) if own is not None else shown_by(told.place) in moment.right
+    own = enrolled.get(answer.place)
+    is_right = _same(moment, own) if own is not None else shown_by(answer.place) in moment.right
     return "right" if is_right else "wrong"
 
 

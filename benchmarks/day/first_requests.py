@@ -1,4 +1,4 @@
-"""What the first request of a kind takes in an opened map of a service that has just started, beside its steady time.
+"""The time of the first request of a kind in an opened map of a service that has just started, beside its steady time.
 
 Numba's cache is an empty folder at the beginning, which the rehearsal of the first start fills, as the build of an
 image does.  Each kind of request then has a service of its own, whose maps one listing of places has opened.
@@ -77,7 +77,7 @@ def kinds(client: httpx.Client) -> dict[str, Callable[[], Request]]:
             answer = client.post(f"{path}/{identity}/frames", params=about, content=view(number, 2), headers=JPEG)
             return answer.raise_for_status()
 
-        # The first frame moves nothing: a motion is first asked of the second one.
+        # The first frame moves nothing: a motion is first given with the second one.
         request(0)
         return lambda number: request(number + 1)
 

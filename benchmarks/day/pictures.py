@@ -1,4 +1,4 @@
-"""What happens to the pictures of a camera: noise, people, hands, dirt, light, and how the camera is mounted."""
+"""Disturbances of the pictures of a camera: noise, people, hands, dirt, light, and how the camera is mounted."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ MODES = tuple(
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a robot was told: a verdict, the place if it was recognized, and the place that was made of the frame."""
+class RobotAnswer:
+    """An answer to a robot: a verdict, the place if it was recognized, and the place that was made of the frame."""
 
     verdict: str
     place: str | None = None
@@ -55,7 +55,7 @@ class Told:
 
 
 class Radio(httpx.BaseTransport):
-    """The robot's connection, which loses what it is told to lose."""
+    """The robot's connection, which loses messages on purpose."""
 
     def __init__(self) -> None:
         """Nothing is lost."""
@@ -81,7 +81,7 @@ class Radio(httpx.BaseTransport):
 class Robot(Protocol):
     """One robot on its way."""
 
-    def ask(self, moment: Moment) -> Told:
+    def ask(self, moment: Moment) -> RobotAnswer:
         """Send a frame, once.
 
         Raises:
@@ -89,9 +89,9 @@ class Robot(Protocol):
         """
 
 
-def _told(answer: models.QueryAnswer | models.SessionAnswer | models.ClosureAnswer) -> Told:
+def _answer_of(answer: models.QueryAnswer | models.SessionAnswer | models.ClosureAnswer) -> RobotAnswer:
     enrolled = answer.enrolled.id if isinstance(answer, models.ClosureAnswer) and answer.enrolled else None
-    return Told(answer.verdict, answer.place.id if answer.place else None, enrolled)
+    return RobotAnswer(answer.verdict, answer.place.id if answer.place else None, enrolled)
 
 
 @dataclass
@@ -102,9 +102,9 @@ class Single:
     map_id: str
     verify: Verify
 
-    def ask(self, moment: Moment) -> Told:
+    def ask(self, moment: Moment) -> RobotAnswer:
         """A query."""
-        return _told(self.client.maps[self.map_id].query(moment.picture, verify=self.verify))
+        return _answer_of(self.client.maps[self.map_id].query(moment.picture, verify=self.verify))
 
 
 @dataclass
@@ -117,14 +117,14 @@ class Enrolling:
     size: Size
     sent: int = 0
 
-    def ask(self, moment: Moment) -> Told:
+    def ask(self, moment: Moment) -> RobotAnswer:
         """A query that may enrol."""
         self.sent += 1
         place: parameters.QueryOrEnrol = {"sequence": ENROLLED, "verify": self.verify}
         if self.size != "bare":
             place |= fields(moment.pose, ENROLLED)  # type: ignore[typeddict-item]
         made = self.client.maps[self.map_id]
-        return _told(made.query_or_enrol(f"{ENROLLED}-{self.sent:05d}-own", moment.picture, **place))
+        return _answer_of(made.query_or_enrol(f"{ENROLLED}-{self.sent:05d}-own", moment.picture, **place))
 
 
 @dataclass
@@ -134,11 +134,11 @@ class Following:
     session: Session
     odometry: bool
 
-    def ask(self, moment: Moment) -> Told:
+    def ask(self, moment: Moment) -> RobotAnswer:
         """A frame of the session."""
         x, y, heading = moment.wheels
         odometry = Odometry(x, y, float(np.degrees(heading))) if self.odometry else None
-        return _told(self.session.send(moment.picture, odometry=odometry))
+        return _answer_of(self.session.send(moment.picture, odometry=odometry))
 
 
 @contextmanager

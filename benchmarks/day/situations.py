@@ -38,7 +38,7 @@ class Stretch:
     pace: frames of the walk a second; negative backwards, facing ahead.
     start: where the robot is put at first, as a share of the walk, if it is not where it was: it is carried there.
     aside: metres a second to the left, out of what the map shows and back.
-    look: what the camera makes of the view.
+    look: the view as the camera renders it.
     orientation: that the files state.
     own: the pictures are those that the map was made of.
     fate: of every second frame, of all if ``whole``.
@@ -82,7 +82,7 @@ class Moment:
     second: when, from the beginning.
     at: where, in frames of the robot's walk.
     aside: metres beside the walk; the map shows nothing of it there.
-    pose: the true one, in the map's frame; ``wheels``: what the odometry says, in its own.
+    pose: the true one, in the map's frame; ``wheels``: that of the odometry, in its own.
     right: the references whose place the frame shows; none if it shows nothing of the map.
     again: it is the first after a disturbance.
     """
@@ -144,7 +144,7 @@ def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Mo
 
 
 def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float, same: bool, random: Random) -> bytes:
-    """What the camera sends; a view that is between two frames of the walk, or stays, is drawn anew each time."""
+    """The camera's picture; a view that is between two frames of the walk, or stays, is drawn anew each time."""
     nearest, out = round(at), abs(aside) > 1e-9
     if out:
         data = walk.strangers[round(aside / walk.spacing) % len(walk.strangers)]
@@ -164,7 +164,7 @@ def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float,
 
 
 def _measured(wheels: Pose, old: Pose, new: Pose, random: Random) -> Pose:
-    """What the odometry says after a motion: the motion with its errors, on top of what it said before."""
+    """The odometry after a motion: the motion with its errors, on top of what it said before."""
     way = (new.x - old.x) + 1j * (new.y - old.y)
     length = abs(way)
     slipped = way * np.exp(1j * (wheels.heading - old.heading)) * (1 + SLIP * random.normal())

@@ -1,4 +1,4 @@
-"""What a session makes of a robot's speed if nobody tells it: recognized frames, right and wrong, at each camera rate.
+"""Sessions that have to learn a robot's speed: recognized frames, right and wrong, at each camera rate.
 
     python -m benchmarks.day.speeds --datasets ../shared/datasets
 
@@ -40,7 +40,7 @@ from lab.training.map_sizes import corridor_and_lip6
 from lab.training.validation import TraverseTask, describe
 
 DRAWN = 10
-"""So many frames at ten times the rate for one."""
+"""Number of frames at ten times the rate for one."""
 
 STRETCHES, LENGTH = 3, 10
 """Stretches of a walk that are seen at ten times the rate, and how many of its frames each has."""
@@ -152,7 +152,7 @@ def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[Dri
 
 
 def _around(truth: Truth, kept: NDArray[np.int64]) -> Truth:
-    """What is right in a map of every third reference: those of which one beside them is."""
+    """The truth in a map of every third reference: those next to a true one."""
     wide = truth.copy()
     wide[:, 1:] |= truth[:, :-1]
     wide[:, :-1] |= truth[:, 1:]
@@ -176,9 +176,9 @@ def followed(drive: Drive, options: RunOptions) -> tuple[int, int]:
     run, alive, found = Run(options, graph), np.ones(len(graph), np.bool_), []
     for number, look in enumerate(drive.looks):
         run.advance(look.seen, Step(), look.view)
-        told = run.estimate(1, alive)
-        if number >= drive.uncounted and told.verdict == "recognized":
-            found.append(bool(look.right[told.candidates[0].row]))
+        estimate = run.estimate(1, alive)
+        if number >= drive.uncounted and estimate.verdict == "recognized":
+            found.append(bool(look.right[estimate.candidates[0].row]))
     return sum(found), len(found) - sum(found)
 
 

@@ -3,11 +3,11 @@
     python -m benchmarks.day.standing --datasets ../shared/datasets
 
 Forty neighbouring references of corridor, and as many of lip6_outdoor, are a map.  At five of them the robot stood, and
-the map has k looks: the picture with the noise of a camera, a little more or less light, and compression.  It is asked
-further looks at the five spots, the frames of the other traverse that show them, and strangers, of the same traverse
-(farther than ``FAR`` frames) and of the other environment.  Places have no poses, poses a few decimetres off, or poses
-rounded to ten metres.  ``walk`` is the same walk at 25 times the rate, frames between two references made by optical
-flow: a thousand frames of a walk of forty seconds.
+the map has k looks: the picture with the noise of a camera, a little more or less light, and compression. Its queries
+are further looks at the five spots, the frames of the other traverse that show them, and strangers, of the same
+traverse (farther than ``FAR`` frames) and of the other environment.  Places have no poses, poses a few decimetres off,
+or poses rounded to ten metres.  ``walk`` is the same walk at 25 times the rate, frames between two references made by
+optical flow: a thousand frames of a walk of forty seconds.
 
 Three kinds of sessions go over the same answers: of all frames of the other traverse that pass; one that begins at each
 spot, of a robot that stands there; and one of the frames of the other traverse that pass each spot.  A spot is
@@ -76,7 +76,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Questions:
-    """What maps of one traverse are asked.
+    """The queries of maps of one traverse.
 
     fresh: FRESH further looks at each spot, spot by spot.
     run: the frames of the other traverse that pass the map, in their order.
@@ -168,8 +168,8 @@ def fill(atlas: Atlas, name: str, encoder: Encoder, shots: Sequence[tuple[int, S
     return made
 
 
-def asked(map_: Map, encoder: Encoder, shots: Sequence[Shot], verify: Verify) -> list[Answer]:
-    """The answers to frames, each asked alone."""
+def answered(map_: Map, encoder: Encoder, shots: Sequence[Shot], verify: Verify) -> list[Answer]:
+    """The answers to frames, each a query of its own."""
     question = Question(k=1, verify=verify)
     return [
         locate(map_, encoder, [Query(shot.encoding, question, partial(getattr, shot, "keypoints"))])[0]
@@ -189,7 +189,7 @@ def recognized(shots: Sequence[Shot], answers: Sequence[Answer]) -> int:
 
 @dataclass(frozen=True)
 class Session:
-    """What became of a session's frames: ``right`` and ``wrong`` tell of each whether it was recognized and so."""
+    """The outcomes of a session's frames: whether each was recognized rightly (``right``) or wrongly (``wrong``)."""
 
     right: list[bool]
     wrong: list[bool]
@@ -203,13 +203,13 @@ def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Ses
     for shot, answer in zip(shots, answers, strict=True):
         run.advance(evidence_of(answer, neighborhood), Step(), shot.view)
         found = run.estimate(1, snapshot.alive)
-        told = None
+        correct = None
         if found.verdict == "recognized":
             (place,) = map_.places_at([found.candidates[0].row])
             assert place is not None
-            told = right(shot, place.id)
-        session.right.append(told is True)
-        session.wrong.append(told is False)
+            correct = right(shot, place.id)
+        session.right.append(correct is True)
+        session.wrong.append(correct is False)
     return session
 
 
@@ -227,7 +227,7 @@ def held(sessions: Sequence[Session]) -> str:
 
 
 def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: TraverseTask) -> Questions:
-    """What the maps of a traverse are asked."""
+    """The queries of the maps of a traverse."""
     random, first = np.random.default_rng(11), FROM[name]
     window = np.arange(first, first + PLACES)
 
@@ -296,17 +296,17 @@ def _most(kinds: Sequence[str]) -> int:
 def measured(encoder: Encoder, map_: Map, ask: Questions, verify: Verify) -> tuple[object, ...]:
     """A row of the table."""
     fresh, other, strangers, run = (
-        asked(map_, encoder, some, verify) for some in (ask.fresh, ask.other, ask.strangers, ask.run)
+        answered(map_, encoder, some, verify) for some in (ask.fresh, ask.other, ask.strangers, ask.run)
     )
     sessions = each_of(map_, ask.run, run, ask.stretches)
-    standing = [range(at, at + FRESH) for at in range(0, len(fresh), FRESH)]
+    by_spot = [range(at, at + FRESH) for at in range(0, len(fresh), FRESH)]
     return (
         len(np.unique(map_.snapshot().whereabouts.ordinal)),
         f"{recognized(ask.fresh, fresh)} of {len(fresh)}",
         f"{recognized(ask.other, other)} of {len(other)}",
         f"{recognized(ask.run, run)} of {len(run)}",
         f"{sum(sum(one.right) for one in sessions)}, {sum(sum(one.wrong) for one in sessions)}",
-        held(each_of(map_, ask.fresh, fresh, standing)),
+        held(each_of(map_, ask.fresh, fresh, by_spot)),
         held(each_of(map_, ask.run, run, ask.passing)),
         f"{sum(one.place is not None for one in strangers)} of {len(strangers)}",
     )
@@ -328,7 +328,7 @@ def main(
     verify: Annotated[list[str] | None, typer.Option(help="Of: never, auto, always.")] = None,
     looks: Annotated[list[str] | None, typer.Option(help="Looks at a spot: 1 to 200, or walk.")] = None,
 ) -> None:
-    """One table: what is recognized and right, by environment, poses, mode and looks at a spot; of all, or of some."""
+    """One table: the share recognized rightly, by environment, poses, mode and looks at a spot; of all, or of some."""
     kinds = chosen(KINDS, looks)
     share_cores(cores())
     camera = Camera(EncoderCatalogue().get(encoder))

@@ -36,7 +36,7 @@ class Row:
         return " ".join([counts, *more, *([seconds(self.drive.again)] if self.drive.again is not None else [])])
 
     def figures(self) -> dict[str, Any]:
-        """As they are kept; the trail has a letter for each frame."""
+        """The outcomes as they are stored; the trail has a letter for each frame."""
         again = self.drive.again
         return {
             "situation": self.situation,

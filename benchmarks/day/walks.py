@@ -1,4 +1,4 @@
-"""The walks at hand: what the map is made of, what a robot sees later, and which places each of its frames shows."""
+"""The walks at hand: the frames of the map, the later frames of a robot, and the places that each of these shows."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Walk:
         return along, np.cumsum(0.1 * np.exp(1j * BEND * np.sin(along / BEND_METRES)))
 
     def pose(self, metres: float, aside: float = 0.0) -> Pose:
-        """The pose at so many metres along the curve, ``aside`` metres to its left."""
+        """The pose at ``metres`` along the curve, ``aside`` metres to its left."""
         along, points = self._curve
         heading = BEND * float(np.sin(metres / BEND_METRES))
         x, y = (float(np.interp(metres, along, part)) for part in (points.real, points.imag))

@@ -1,1 +1,1 @@
-"""What processors and GPUs make of the encoder."""
+"""The encoder on processors and GPUs."""

@@ -1,4 +1,4 @@
-"""What a query costs with one encoder and with another: that of the thesis beside the default.
+"""The cost of a query with two encoders: that of the thesis beside the default.
 
     python -m benchmarks.devices.encoders [--encoder NAME] [--encoder NAME] [--places 300] [--rounds 60]
 

@@ -1,1 +1,1 @@
-"""What geometric verification brings and costs."""
+"""The gain and the cost of geometric verification."""

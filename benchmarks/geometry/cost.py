@@ -1,4 +1,4 @@
-"""What geometric verification costs: keypoints of a frame, ten candidates of a query, keypoints of an enrolment.
+"""The cost of geometric verification: keypoints of a frame, ten candidates of a query, keypoints of an enrolment.
 
     python -m benchmarks.geometry.cost [--images FOLDER]
 

@@ -96,7 +96,7 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def turned_view(photograph: Pixels, attitude: Array) -> Pixels:
-    """What a virtual camera sees of a photograph, uint8 [180, 240, 3]."""
+    """A photograph as a virtual camera sees it, uint8 [180, 240, 3]."""
     height, width = photograph.shape[:2]
     inner = pinhole(width, height, FIELD)
     optical = OPTICAL.T @ attitude @ OPTICAL
@@ -166,7 +166,7 @@ class Hall:
     sides: list[Pixels]
 
     def seen(self, position: Array, attitude: Array) -> Pixels:
-        """What a camera sees, uint8 [180, 240, 3]."""
+        """The picture of a camera, uint8 [180, 240, 3]."""
         columns, rows = 2 * SIZE[0], 2 * SIZE[1]
         x, y = np.meshgrid((np.arange(columns) + 0.5) / 2 - 0.5, (np.arange(rows) + 0.5) / 2 - 0.5)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(CAMERA.matrix()).T
@@ -215,7 +215,7 @@ class Traverse:
     """Places and queries with their pictures and poses; x, y and heading in degrees, [n, 3]."""
 
     places: list[Pixels]
-    standing: Array
+    poses: Array
     queries: list[Pixels]
     true: Array
     camera: Intrinsics | None
@@ -245,10 +245,10 @@ def frames_traverse(folder: Path) -> Traverse:
         for name in names
     )
     truth = read_ground_truth(folder / "ground_truth.csv", len(queries), len(places))
-    asked = [number for number, references in enumerate(truth) if len(references)][:: max(1, len(queries) // 110)]
-    true = np.array([(float(np.mean(truth[number])), np.nan, np.nan) for number in asked])
-    standing = np.array([(number, 0, 0) for number in range(len(places))], np.float64)
-    return Traverse(places, standing, [queries[number] for number in asked], true, None)
+    queried = [number for number, references in enumerate(truth) if len(references)][:: max(1, len(queries) // 110)]
+    true = np.array([(float(np.mean(truth[number])), np.nan, np.nan) for number in queried])
+    poses = np.array([(number, 0, 0) for number in range(len(places))], np.float64)
+    return Traverse(places, poses, [queries[number] for number in queried], true, None)
 
 
 Found = tuple[Array, PoseEstimate, PoseEstimate | None, PoseEstimate | None]
@@ -257,10 +257,10 @@ Found = tuple[Array, PoseEstimate, PoseEstimate | None, PoseEstimate | None]
 def estimates(encoder: Encoder, network: XFeat, traverse: Traverse) -> Iterator[Found]:
     """The true pose, and the estimates without views, with views of unknown cameras, and with intrinsics, of each query
     that is recognized near where it was taken."""
-    kept = [find_keypoints(network, frame) for frame in traverse.places]
+    keypoints = [find_keypoints(network, frame) for frame in traverse.places]
     described = [encoder.encode(frame) for frame in traverse.places]
     with tempfile.TemporaryDirectory() as folder:
-        poses = [Pose(x=x, y=y, heading=heading % 360) for x, y, heading in traverse.standing]
+        poses = [Pose(x=x, y=y, heading=heading % 360) for x, y, heading in traverse.poses]
         enrolments = ((place.descriptor, place.local) for place in described)
         write_map(Path(folder), "poses", encoder, enrolments, fields=lambda index: PlaceFields(pose=poses[index]))
         atlas = Atlas(Path(folder))
@@ -276,13 +276,15 @@ def estimates(encoder: Encoder, network: XFeat, traverse: Traverse) -> Iterator[
             log_odds = decision_slope(answer.calibration) * candidates.ordered.astype(np.float64)
             x = candidates.whereabouts.position[:, 0]
             near = np.flatnonzero(np.abs(x - x[0]) <= reach)[:CANDIDATES].tolist()
-            numbers = {row: int(np.abs(traverse.standing[:, 0] - x[row]).argmin()) for row in near}
-            verified = dict(zip(near, verify(query, [kept[number] for number in numbers.values()]), strict=True))
+            numbers = {row: int(np.abs(traverse.poses[:, 0] - x[row]).argmin()) for row in near}
+            verified = dict(zip(near, verify(query, [keypoints[number] for number in numbers.values()]), strict=True))
 
             made: list[PoseEstimate | None] = []
             for camera in (None, traverse.camera):
                 views = [
-                    relative_view(query, kept[numbers[row]], verified[row], camera, camera) if row in verified else None
+                    relative_view(query, keypoints[numbers[row]], verified[row], camera, camera)
+                    if row in verified
+                    else None
                     for row in range(near[-1] + 1)
                 ]
                 made.append(estimate_pose(candidates.whereabouts, log_odds, reach, views=views))

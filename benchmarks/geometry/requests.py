@@ -1,8 +1,8 @@
-"""What verification costs a whole request over HTTP: never, auto and always, asked in turns.
+"""The cost of verification for a whole request over HTTP: never, auto and always, in turns.
 
     python -m benchmarks.geometry.requests --data ../shared/datasets [--rounds 1]
 
-Each traverse's references are enrolled as one sequence, with and without keypoints, and its queries are asked one
+Each traverse's references are enrolled as one sequence, with and without keypoints, and its queries are sent one
 after the other, each in all three ways.  ``auto`` may take 1.5 times as long as ``never`` on average, ``always`` 60 ms
 more.
 """
@@ -44,7 +44,7 @@ def enrol(client: httpx.Client, map_id: str, folder: Path, verification: bool) -
     return len(paths) / (time.perf_counter() - began)
 
 
-def asked(client: httpx.Client, map_id: str, paths: list[Path], rounds: int) -> dict[str, dict[str, Any]]:
+def queried_ways(client: httpx.Client, map_id: str, paths: list[Path], rounds: int) -> dict[str, dict[str, Any]]:
     """For each way the milliseconds of every query as the client sees them, and what was verified."""
     times: dict[str, list[float]] = defaultdict(list)
     counts: dict[str, list[int]] = defaultdict(list)
@@ -90,7 +90,7 @@ def main(
                 "without": enrol(process.client, f"{name}-bare", base / references, False),
                 "with": enrol(process.client, name, base / references, True),
             }
-            found = asked(process.client, name, find_images(base / queries), rounds)
+            found = queried_ways(process.client, name, find_images(base / queries), rounds)
             never = found["never"]
             for way, seen in found.items():
                 ratio, more = seen["mean"] / never["mean"], seen["mean"] - never["mean"]

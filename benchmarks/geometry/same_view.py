@@ -140,7 +140,7 @@ class Comparison:
         return self.matches >= ENOUGH_MATCHES
 
     def fails(self, inliers: int) -> bool:
-        """Whether so many inliers are too few."""
+        """Whether the inliers are too few."""
         return self.counts and 2 * inliers < self.matches
 
 
@@ -163,7 +163,7 @@ def pictures(datasets: Path, most: int = 0) -> list[Path]:
 
 
 def thinned(found: Sequence[Path], most: int) -> list[Path]:
-    """At most so many, evenly."""
+    """At most ``most``, evenly."""
     return [found[at] for at in np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int)]
 
 
@@ -185,7 +185,7 @@ def views_in_turn(number: int, copies: int) -> tuple[str, ...]:
 
 
 def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Comparison]:
-    """Queries of a traverse, at most so many, and references that are far from all true ones."""
+    """Queries of a traverse, at most ``most``, and references that are far from all true ones."""
     task = load_traverses(datasets / "eval" / name, *TRAVERSES[name])
     truth = task.truth.copy()
     if name == "lip6_outdoor":

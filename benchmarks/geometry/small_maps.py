@@ -31,7 +31,7 @@ WEIGHT = 0.7
 """Of the share of inliers, as benchmarks.geometry.verification chooses it."""
 FAR = 8
 MAPS, KNOWN, STRANGERS = 6, 15, 25
-"""Maps of each size, and queries of each kind asked of a map, at most."""
+"""Maps of each size, and queries of each kind on a map, at most."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Answers:
 
 
 def thinned(flags: NDArray[np.bool_], most: int) -> list[int]:
-    """At most about so many of the numbers that are flagged, evenly."""
+    """At most about ``most`` of the numbers that are flagged, evenly."""
     numbers = np.flatnonzero(flags)
     return [int(number) for number in numbers[:: max(1, len(numbers) // most)]]
 
 
-def asked(task: Task, scores: NDArray[np.float32], size: int) -> Answers:
+def answers_of(task: Task, scores: NDArray[np.float32], size: int) -> Answers:
     """Ask maps of ``size`` places along the references."""
     rows: list[tuple[float, bool, bool]] = []
     total = len(task.references)
@@ -87,7 +87,7 @@ def main(
         scores = score_matrix(chosen, ours.descriptors @ theirs.descriptors.T, ours.local, theirs.local)
         figures[task.name] = {}
         for size in SIZES:
-            made = asked(task, scores, size)
+            made = answers_of(task, scores, size)
             passed = {limit: made.passed(limit) for limit in LIMITS}
             figures[task.name][size] = passed
             counts = f"{(~made.known).sum()} / {made.known.sum()}"
@@ -96,7 +96,7 @@ def main(
     report(
         "geometry_small_maps",
         "strangers that pass / known queries that pass and are right, by the least evidence",
-        ["places", "asked", *map(str, LIMITS)],
+        ["places", "queries", *map(str, LIMITS)],
         rows,
         {"encoder": chosen.identity, "figures": figures},
     )

@@ -1,11 +1,11 @@
-"""What geometric verification of the best candidates brings, and which of its figures a probability should use.
+"""The gain of geometric verification of the best candidates, and which of its figures a probability should use.
 
     python -m benchmarks.geometry.verification
 
 Constants are fitted on tasks made of training photographs: nights of the fixed cameras that the encoder was trained on,
 whole and cut on one side; hallways of 160 x 120, cut and disturbed; every second frame of a drive, cut and disturbed,
 against the others.  They are judged on traverses that nothing was fitted on: corridor, lip6_outdoor by the corrected
-truth, webcams, and nights of the cameras that were kept out of training.
+truth, webcams, and nights of the cameras that were held out of training.
 
 The second table asks whether the best match is right: of every task one half of the references is left out, then the
 other.  A logistic regression on each choice of features is fitted on the first tasks and judged on the others.
@@ -142,7 +142,7 @@ def nights(camera: Camera, train: Path, distractors: Pictures, held_out: bool) -
     for frame in shown:
         columns = int(frame.shape[1] * generator.uniform(0.1, 0.25))
         cut.append(frame[:, columns:] if generator.random() < 0.5 else frame[:, :-columns])
-    kind = "kept-out" if held_out else "training"
+    kind = "held-out" if held_out else "training"
     return [
         Task(f"nights of {kind} cameras", camera.take(shown), references, truth, 0, not held_out),
         Task(f"the same, cut on one side ({kind})", camera.take(cut), references, truth, 0, not held_out),
@@ -150,15 +150,15 @@ def nights(camera: Camera, train: Path, distractors: Pictures, held_out: bool) -
 
 
 def hallways(camera: Camera, train: Path) -> Task:
-    """Hallways of 25 floors that look alike, at 160 x 120; every third frame is asked again, cut and disturbed."""
+    """Hallways of 25 floors that look alike, at 160 x 120; every third frame is queried again, cut and disturbed."""
     generator = np.random.default_rng(1)
     paths = [path for path in find_photographs(train / "tower") if "hallway" in path.name]
     clips = [path.name.partition("_frame")[0] for path in paths]
     size = (160, 120)
     shown = [np.asarray(cv2.resize(read(path), size, interpolation=cv2.INTER_AREA), np.uint8) for path in paths]
-    asked = range(0, len(paths), 3)
-    queries = camera.take([zoomed(read(paths[index]), 0.3, size, generator) for index in asked])
-    truth = [[abs(q - r) <= 1 and clips[q] == clips[r] for r in range(len(paths))] for q in asked]
+    queried = range(0, len(paths), 3)
+    queries = camera.take([zoomed(read(paths[index]), 0.3, size, generator) for index in queried])
+    truth = [[abs(q - r) <= 1 and clips[q] == clips[r] for r in range(len(paths))] for q in queried]
     return Task("hallways", queries, camera.take(shown), np.array(truth), MapSettings().same_place_frames, True)
 
 
@@ -166,10 +166,10 @@ def drive(camera: Camera, train: Path) -> Task:
     """Every second frame of a drive against the frames between, which are cut and disturbed."""
     generator = np.random.default_rng(2)
     paths = find_photographs(train / "camvid")
-    kept, asked = range(0, len(paths), 2), range(1, len(paths), 2)
-    queries = camera.take([zoomed(read(paths[index]), 0.35, (320, 240), generator) for index in asked])
+    kept, queried = range(0, len(paths), 2), range(1, len(paths), 2)
+    queries = camera.take([zoomed(read(paths[index]), 0.35, (320, 240), generator) for index in queried])
     runs = [path.name[:6] for path in paths]
-    truth = [[abs(q - r) <= 1 and runs[q] == runs[r] for r in kept] for q in asked]
+    truth = [[abs(q - r) <= 1 and runs[q] == runs[r] for r in kept] for q in queried]
     references = camera.take([read(paths[index]) for index in kept])
     return Task("drive", queries, references, np.array(truth), MapSettings().same_place_frames, True)
 
@@ -185,11 +185,11 @@ def webcams(camera: Camera, folder: Path, distractors: Pictures) -> list[Task]:
     for turn in range(3):
         daytime = [np.flatnonzero((cameras == number) & day) for number in range(cameras.max() + 1)]
         kept = np.array([found[turn * len(found) // 3] for found in daytime])
-        asked = np.setdiff1d(np.arange(len(paths)), kept)
-        truth = np.zeros((len(asked), len(kept) + len(distractors)), np.bool_)
-        truth[np.arange(len(asked)), cameras[asked]] = True
+        queried = np.setdiff1d(np.arange(len(paths)), kept)
+        truth = np.zeros((len(queried), len(kept) + len(distractors)), np.bool_)
+        truth[np.arange(len(queried)), cameras[queried]] = True
         references = pictures.take(kept).and_then(distractors)
-        tasks.append(Task("webcams", pictures.take(asked), references, truth, 0, False))
+        tasks.append(Task("webcams", pictures.take(queried), references, truth, 0, False))
     return tasks
 
 
@@ -240,8 +240,8 @@ class Verified:
 
 def verified(encoder: Encoder, task: Task, kept: NDArray[np.int64], store: Store) -> Verified:
     """Verify the best candidates in a map of some of the references; ``store`` keeps pairs for other maps."""
-    asked, shown = task.queries.encodings, task.references.take(kept).encodings
-    scores = score_matrix(encoder, asked.descriptors @ shown.descriptors.T, asked.local, shown.local)
+    queried, shown = task.queries.encodings, task.references.take(kept).encodings
+    scores = score_matrix(encoder, queried.descriptors @ shown.descriptors.T, queried.local, shown.local)
     order = np.argsort(-scores, axis=1, kind="stable")
     best = order[:, :CANDIDATES]
     figures = np.zeros((5, *best.shape))

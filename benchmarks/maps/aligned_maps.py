@@ -3,11 +3,12 @@
     python -m benchmarks.maps.aligned_maps [--encoder NAME] [--cache FOLDER]
 
 
-The references are one traverse.  *Query visit*: every other query is the second one, and the queries between are asked.
-*Twice*: the second traverse has the pictures of the first, and all queries are asked.  Asked are queries whose place is
-among the references.  An answer is right if it names a reference within ``same_place_frames`` of a true one, or a frame
-of the second traverse that shows such a reference.  ``once`` is a map of the references alone.  ``query:enrol`` would
-enrol what is ``unknown``.  Maps and their alignment are those of the service: the job writes to a real data directory.
+The references are one traverse.  *Query visit*: the second one is every other query, and the others query the map.
+*Twice*: the second traverse has the pictures of the first, and all queries query the map.  Only queries whose place is
+among the references count.  An answer is right if it names a reference within ``same_place_frames`` of a true one, or a
+frame of the second traverse that shows such a reference.  ``once`` is a map of the references alone.  ``query:enrol``
+would enrol what is ``unknown``.  Maps and their alignment are those of the service: the job writes to a real data
+directory.
 
 Corridor, lip6 (truth put right) and two stretches of nordland_tiny; the cache keeps the encodings.
 """
@@ -119,16 +120,16 @@ def enrol(map_: Map, sequence: str, frames: Encodings, numbers: Positions) -> No
 
 
 def verdicts(
-    map_: Map, encoder: Encoder, frames: Encodings, asked: Positions, right: dict[str, Truth]
+    map_: Map, encoder: Encoder, frames: Encodings, queried: Positions, right: dict[str, Truth]
 ) -> dict[str, float]:
-    """The shares of asked frames that are recognized and right, recognized and wrong, ambiguous and unknown.
+    """The shares of query frames that are recognized and right, recognized and wrong, ambiguous and unknown.
 
     Args:
         right: for each traverse bool [frames, its frames], which of its frames show the place of a frame.
     """
     counts = dict.fromkeys(("right", "wrong", "ambiguous", "unknown"), 0)
-    for start in range(0, len(asked), 16):
-        some = asked[start : start + 16].tolist()
+    for start in range(0, len(queried), 16):
+        some = queried[start : start + 16].tolist()
         encodings = [Encoding(frames.descriptors[one], frames.local[one], NO_REGIONS, {}) for one in some]
         queries = [Query(one, Question(k=1)) for one in encodings]
         for number, answer in zip(some, locate(map_, encoder, queries), strict=True):
@@ -138,7 +139,7 @@ def verdicts(
                 sequence, _, shown = answer.place.id.rpartition("-")
                 kind = "right" if right[sequence][number, int(shown)] else "wrong"
             counts[kind] += 1
-    return {kind: count / len(asked) for kind, count in counts.items()}
+    return {kind: count / len(queried) for kind, count in counts.items()}
 
 
 def align(runtime: Runtime, map_id: str) -> dict[str, Any]:
@@ -154,7 +155,7 @@ def align(runtime: Runtime, map_id: str) -> dict[str, Any]:
 def main(
     datasets: Annotated[Path, typer.Option(help="Folder with eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
-    cache: Annotated[Path | None, typer.Option(help="Folder where the encodings are kept.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder where the encodings are stored.")] = None,
 ) -> None:
     """Measure and report."""
     share_cores(1)
@@ -176,15 +177,15 @@ def main(
             }
             once = create(runtime, f"once-{number}", loaded)
             enrol(once, FIRST, references, np.arange(truth.shape[1]))
-            for layout, (source, second, asked, alike) in layouts.items():
+            for layout, (source, second, queried, alike) in layouts.items():
                 both = create(runtime, f"{layout.replace(' ', '-')}-{number}", loaded)
                 enrol(both, FIRST, references, np.arange(truth.shape[1]))
                 enrol(both, SECOND, source, second)
                 right = {FIRST: wide, SECOND: alike}
-                made = {"once": verdicts(once, loaded, queries, asked, right)}
-                made["not aligned"] = verdicts(both, loaded, queries, asked, right)
+                made = {"once": verdicts(once, loaded, queries, queried, right)}
+                made["not aligned"] = verdicts(both, loaded, queries, queried, right)
                 result = align(runtime, both.record.id)
-                made["aligned"] = verdicts(both, loaded, queries, asked, right)
+                made["aligned"] = verdicts(both, loaded, queries, queried, right)
                 least = LEAST * made["once"]["right"]
                 for case, shares in made.items():
                     bar = verdict(round(shares["right"], 3), round(least, 3), True) if case == "aligned" else ""

@@ -55,9 +55,9 @@ def nothing_shared(scores: Scores, truth: Truth, pieces: int) -> list[bool]:
     for _ in range(pieces):
         length = int(generator.integers(25, len(truth) // 2))
         start = int(generator.integers(0, len(truth) - length))
-        asked = slice(start, start + length)
-        others = longest_run(np.logical_not(np.any(wide[asked], axis=0)))
-        found.append(bool(len(paired(scores[asked][:, others])[0])))
+        queried = slice(start, start + length)
+        others = longest_run(np.logical_not(np.any(wide[queried], axis=0)))
+        found.append(bool(len(paired(scores[queried][:, others])[0])))
     return found
 
 
@@ -82,7 +82,7 @@ def overlaps(scores: Scores, truth: Truth, pieces: int) -> tuple[list[float], li
 
 
 def cost(first: int, second: int, values: int = 32) -> dict[str, float]:
-    """What matching long traverses of made-up descriptors takes beside their inner products.
+    """The cost of matching long traverses of made-up descriptors beside their inner products.
 
     Args:
         first, second: frames of the two, of which the first is a part of the second.
@@ -103,10 +103,10 @@ def cost(first: int, second: int, values: int = 32) -> dict[str, float]:
 def main(
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
-    cache: Annotated[Path | None, typer.Option(help="Folder where the scores are kept.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder where the scores are stored.")] = None,
     pieces: Annotated[int, typer.Option(min=1, help="Pairs of pieces of each kind.")] = 30,
     long: Annotated[
-        tuple[int, int] | None, typer.Option(help="Instead: the cost for made-up traverses of so many frames.")
+        tuple[int, int] | None, typer.Option(help="Instead: the cost for made-up traverses of these lengths.")
     ] = None,
 ) -> None:
     """Measure and report."""

@@ -1,11 +1,11 @@
-"""What filters cost: queries of a large map that may find 1 % of it, against the same queries unfiltered.
+"""The cost of filters: queries of a large map that may find 1 % of it, against the same queries unfiltered.
 
     python -m benchmarks.maps.filters [--places 100000] [--rounds 15] [--keep FOLDER]
 
 The map is written through the storage, of descriptors mixed from those of sample frames, and
 every place has a pose, a heading, a time, a sequence and metadata.  Measured is all that a query takes after its
 encoding (what may be found, search, second stage, verdict, look-up), for every kind of filter in turn, so that all see
-the same machine; told are medians, and that of the ratio to the same query unfiltered.  ``--keep`` is where the map
+the same machine; given are medians, and that of the ratio to the same query unfiltered.  ``--keep`` is where the map
 lies, used again when it is there already.
 """
 
@@ -52,7 +52,7 @@ def fields(index: int) -> PlaceFields:
 
 
 def selections(places: int) -> dict[str, Selection | None]:
-    """What to ask for by name; but for the first and the last three they allow about 1 % of the places."""
+    """The filters by name; but for the first and the last three they allow about 1 % of the places."""
     share = places // 100
     radius = (share * 10 / np.pi) ** 0.5  # one place to ten square metres
     middle = {"x": 500.0, "y": places / 200}

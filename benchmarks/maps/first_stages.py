@@ -1,8 +1,8 @@
-"""What a first stage could be: indexes of FAISS on the same descriptors, beside the one that maps have.
+"""Candidates for a first stage: indexes of FAISS on the same descriptors, beside the one that maps have.
 
     python -m benchmarks.maps.first_stages [--places 20000] [--rounds 20] [--only NAME]
 
-Each answers with its 100 best, in one thread; told are how often the exact best is among them, the median time of one
+Each answers with its 100 best, in one thread; given are how often the exact best is among them, the median time of one
 query and of each of eight together, taken in turns, the bytes of a place in memory, the milliseconds that adding one
 takes, and the seconds of training.  All but the flat index get descriptors that are rotated at random, as RaBitQ wants
 them; what learns is trained on descriptors that are not searched.  ``FAISS_SIMD_LEVEL=AVX2`` lets FAISS do without
@@ -67,7 +67,7 @@ class Stage:
 
 
 class Table:
-    """What maps have, its blocks joined."""
+    """The index of maps, its blocks joined."""
 
     name = "core.index"
     train_seconds = 0.0
@@ -138,7 +138,7 @@ def products(dimension: int) -> Any:
 
 
 def refined(base: Callable[[int], Any], candidates: float) -> Callable[[int], Any]:
-    """Whole codes compared of so many candidates for each row that is answered."""
+    """An index that compares the whole codes of ``candidates`` candidates for each row that it returns."""
 
     def make(dimension: int) -> Any:
         index = faiss.IndexRefine(base(dimension), rabitq(dimension))
@@ -172,7 +172,7 @@ def main(
     queries: Annotated[int, typer.Option(help="Of which the recall is taken.")] = 400,
     only: Annotated[list[str], typer.Option(help="Words of the names of what is measured beside the flat index.")] = [],  # noqa: B006
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
-    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are stored.")] = Path(".cache/references"),
 ) -> None:
     """Measure and report."""
     share_cores(1)
@@ -180,23 +180,23 @@ def main(
     plain, *others = stages(of.dimension)
     chosen = [stage for stage in others if not only or any(word in stage.name for word in only)]
     coder = Coder.of(of.dimension)
-    asked = of.queries[np.unique(np.linspace(0, len(of.queries) - 1, queries).astype(int))]
+    queried = of.queries[np.unique(np.linspace(0, len(of.queries) - 1, queries).astype(int))]
     blocks = [block for _, block in of.blocks(places, BLOCK)]
     plain.fill(blocks[0], blocks)
-    truth = plain.search(asked)[:, 0]
-    flat = _timed([plain], {plain.name: asked}, rounds)[0]
+    truth = plain.search(queried)[:, 0]
+    flat = _timed([plain], {plain.name: queried}, rounds)[0]
     sample = coder.rotated(of.references(SAMPLE_FROM, SAMPLE_FROM + SAMPLE))
     turned = [coder.rotated(block) for block in blocks]
     questions: dict[str, Array] = {}
     for stage in chosen:
         is_table = isinstance(stage, Table)
         stage.fill(sample, blocks if is_table else turned)
-        questions[stage.name] = asked if is_table else coder.rotated(asked)
+        questions[stage.name] = queried if is_table else coder.rotated(queried)
         print(f"{stage.name}: filled in {stage.train_seconds + stage.add_seconds:.0f} s")
     times = [flat, *_timed(chosen, questions, rounds)]
     rows = []
     for stage, (alone, beside) in zip([plain, *chosen], times, strict=True):
-        found = stage.search(questions.get(stage.name, asked))
+        found = stage.search(questions.get(stage.name, queried))
         rows.append(
             {
                 "name": stage.name,
@@ -233,7 +233,7 @@ def main(
         "train, s",
     ]
     level = faiss.SIMDConfig.get_level_name()
-    figures = {"places": places, "rounds": rounds, "queries": len(asked), "level": level, "rows": rows}
+    figures = {"places": places, "rounds": rounds, "queries": len(queried), "level": level, "rows": rows}
     report("first-stages", f"one query against {places:,} places, {level}", columns, table, figures)
 
 
@@ -242,11 +242,11 @@ def _timed(chosen: Sequence[Stage | Table], questions: dict[str, Array], rounds:
     times: list[tuple[list[float], list[float]]] = [([], []) for _ in chosen]
     for turn in range(rounds + 1):
         for stage, of_stage in zip(chosen, times, strict=True):
-            asked = np.roll(questions[stage.name], -7 * turn, axis=0)
+            queried = np.roll(questions[stage.name], -7 * turn, axis=0)
             for some, kept in zip((1, TOGETHER), of_stage, strict=True):
                 time.sleep(PAUSE)
                 began = time.thread_time()
-                stage.search(np.ascontiguousarray(asked[:some]))
+                stage.search(np.ascontiguousarray(queried[:some]))
                 if turn:
                     kept.append(1e3 * (time.thread_time() - began) / some)
     return [(statistics.median(alone), statistics.median(beside)) for alone, beside in times]

@@ -1,12 +1,12 @@
-"""What labels of doubtful frames are worth: the Brier score of held-out frames before and after they calibrate a map.
+"""The gain of labels of doubtful frames: the Brier score of held-out frames before and after they calibrate a map.
 
     python -m benchmarks.maps.labels ../shared/datasets/eval
 
-A service has a map of the first walk, which keeps frames for review.  It is asked one half of the second walk, and as
-many strangers again by half: frames of the other data set.  The kept frames are labelled through the API by the truth
+A service has a map of the first walk, which stores frames for review.  One half of the second walk queries it, and half
+as many strangers: frames of the other data set.  The stored frames are labelled through the API by the truth
 of the data set, as a person would, first those that were answered ambiguous or unknown, then all; and the map is
 calibrated by its own frames, by the labels, by both, or by the labels beside the encoder's calibration.  Then it is
-asked the other half of the walk, and strangers that it has not seen.  Both halves take their turn at being held out.
+queried with the other half of the walk, and strangers that it has not seen.  Both halves are held out in turn.
 
 The Brier score is the mean square of the difference between a stated probability and what is true: 1 if the best match
 shows the place, else 0.  A frame without a probability counts as one of 0.
@@ -48,7 +48,7 @@ LABELLED: Mapping[str, Mapping[str, str] | None] = {
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame that is asked, with the ids of the places that it shows; none of a stranger."""
+    """A query frame, with the ids of the places that it shows; none of a stranger."""
 
     data: bytes
     places: tuple[str, ...]
@@ -56,7 +56,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Walk:
-    """A data set: the frames of the map, and those that are asked, in their order."""
+    """A data set: the frames of the map, and the query frames, in their order."""
 
     name: str
     references: Sequence[bytes]
@@ -64,7 +64,7 @@ class Walk:
 
 
 def walk(name: str, folder: Path, most: int) -> Walk:
-    """A data set from its folder, with at most so many queries."""
+    """A data set from its folder, with a limited number of queries."""
     pair = open_dataset(find_dataset(name), folder / FOLDERS[name])
     queries = [
         Frame(path.read_bytes(), tuple(place_id(int(row)) for row in true))
@@ -80,7 +80,7 @@ def place_id(row: int) -> str:
 
 
 def halves(of: Walk, other: Walk) -> tuple[list[Frame], list[Frame]]:
-    """The two halves of what a map is asked: of the walk, and half as many strangers, evenly taken from another."""
+    """The two halves of a map's queries: of the walk, and half as many strangers, evenly taken from another."""
     middle, count = len(of.queries) // 2, len(of.queries) // 2
     chosen = np.linspace(0, len(other.queries) - 1, count).astype(int)
     strangers = [Frame(other.queries[index].data, ()) for index in chosen]
@@ -127,7 +127,7 @@ def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str
 
 
 def label_kept(client: httpx.Client, map_id: str, frames: Sequence[Frame], verdicts: Sequence[str]) -> int:
-    """Label the kept frames that were answered so by the truth; returns how many there are."""
+    """Label the stored frames with these verdicts by the truth; returns how many there are."""
     shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in frames}
     items: list[dict[str, Any]] = []
     cursor: str | None = ""

@@ -2,7 +2,7 @@
 
     python -m benchmarks.maps.map_sizes [--encoder NAME] [--cache FOLDER] [--fitted] [--repeats 24] [--verify always]
 
-A map holds a run of neighbouring references, or references drawn at random (``spread``).  It is asked frames whose
+A map holds a run of neighbouring references, or references drawn at random (``spread``).  Its queries are frames whose
 place it holds, and strangers, whose place is more than eight frames from all that it holds.  ``strangers`` is the share
 of these that is recognized, and ``ambiguous`` the share that is ambiguous; ``right`` is the share of the other frames
 that is recognized and right, and ``best`` that whose best match is right whatever the verdict.  The calibration error
@@ -179,9 +179,9 @@ def halves(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict
 def whole(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
     """All references: recall@1, and the verdicts."""
     kept = np.arange(traverse.truth.shape[1])
-    asked = np.flatnonzero(traverse.truth.any(axis=1)).tolist()
-    found = [traverse.judged(query, kept, calibration, np.zeros(len(kept), np.int64), verify) for query in asked]
-    right = np.array([traverse.truth[query, one.best] for query, one in zip(asked, found, strict=True)])
+    queried = np.flatnonzero(traverse.truth.any(axis=1)).tolist()
+    found = [traverse.judged(query, kept, calibration, np.zeros(len(kept), np.int64), verify) for query in queried]
+    right = np.array([traverse.truth[query, one.best] for query, one in zip(queried, found, strict=True)])
     recognized = np.array([one.judgement.verdict == "recognized" for one in found])
     return {
         "recall_at_1": float(right.mean()),
@@ -199,8 +199,8 @@ def verdicts(
     verify: Verify,
 ) -> Any:
     """The shares of the verdicts on all frames whose place is there."""
-    asked = np.flatnonzero(traverse.truth[:, kept].any(axis=1)).tolist()
-    found = [traverse.judged(query, kept, calibration, sequence, verify).judgement.verdict for query in asked]
+    queried = np.flatnonzero(traverse.truth[:, kept].any(axis=1)).tolist()
+    found = [traverse.judged(query, kept, calibration, sequence, verify).judgement.verdict for query in queried]
     return {name: found.count(name) / len(found) for name in ("recognized", "ambiguous", "unknown")}
 
 
@@ -211,8 +211,8 @@ def duplicates(traverse: Traverse, calibration: Calibration, verify: Verify) -> 
     twins: list[str] = []
     for reference in range(0, len(once), 5):
         pair, alone = np.full(2, reference), np.full(2, -1)
-        asked = np.flatnonzero(traverse.truth[:, reference]).tolist()
-        twins += [traverse.judged(query, pair, calibration, alone, verify).judgement.verdict for query in asked]
+        queried = np.flatnonzero(traverse.truth[:, reference]).tolist()
+        twins += [traverse.judged(query, pair, calibration, alone, verify).judgement.verdict for query in queried]
     return {
         "once": verdicts(traverse, once, nothing, calibration, verify),
         "twice": verdicts(traverse, np.tile(once, 2), np.repeat([0, 1], len(once)), calibration, verify),
@@ -224,7 +224,7 @@ def duplicates(traverse: Traverse, calibration: Calibration, verify: Verify) -> 
 def main(
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
-    cache: Annotated[Path | None, typer.Option(help="Folder where the scores are kept.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder where the scores are stored.")] = None,
     fitted: Annotated[bool, typer.Option(help="Show the traverses that are fitted to as well.")] = False,
     repeats: Annotated[int, typer.Option(min=1, help="Maps of each size.")] = 24,
     verify: Annotated[list[str] | None, typer.Option(help="never, auto or always; all if left out.")] = None,
@@ -304,8 +304,8 @@ def tables(mode: Verify, found: dict[str, dict[str, Any]], encoder: str, figures
         for case in ("recognized_right", "recognized_wrong", "verified", "candidates"):
             others.append([f"{name}, whole, {case.replace('_', ' and ')}", all_places[case], ""])
         for case, shares in made["duplicates"].items():
-            told = ", ".join(f"{kind} {value:.2f}" for kind, value in shares.items())
-            others.append([f"{name}, {case}", told, ""])
+            listed = ", ".join(f"{kind} {value:.2f}" for kind, value in shares.items())
+            others.append([f"{name}, {case}", listed, ""])
     measures = ["strangers", "ambiguous", "right", "best", "AUC", "error", "verified", "candidates"]
     report("map-sizes", f"verdicts by size of map, {encoder}, {mode}", ["map", *measures, "missed"], by_size, figures)
     rows = [[name, f"{value:.3f}" if isinstance(value, float) else value, bar] for name, value, bar in others]

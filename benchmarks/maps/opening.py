@@ -3,7 +3,7 @@
     python -m benchmarks.maps.opening [--places 100000] [--precision half] [--keep FOLDER]
 
 The map is written through the storage, of descriptors mixed from those of sample frames, and
-what it is searched by is built as the service would.  Then a service is started on it and asked once, from a cold
+what it is searched by is built as the service would.  Then a service is started on it and queried once, from a cold
 cache of the system as far as it lets us; and a process of its own opens it and searches, with and without a filter.
 ``--keep`` is where the map lies, used again when it is there already.
 """
@@ -76,8 +76,8 @@ def first_query(folder: Path) -> dict[str, float]:
         began = time.monotonic()
         answer = process.client.post(f"/v1/maps/{MAP}/query", content=frame, headers={"Content-Type": "image/jpeg"})
         answer.raise_for_status()
-        asked = time.monotonic() - began
-        return {"ready": process.ready, "query": asked, "together": process.ready + asked}
+        queried = time.monotonic() - began
+        return {"ready": process.ready, "query": queried, "together": process.ready + queried}
 
 
 def searched(folder: Path) -> dict[str, float]:
@@ -98,7 +98,7 @@ def searched(folder: Path) -> dict[str, float]:
     del loose
     built(map_)
     snapshot = map_.snapshot()
-    for query in queries:  # the first of each reads what the system has not kept of the files
+    for query in queries:  # the first of each reads the parts of the files that the system has not cached
         for name, mask in (("cold", None), ("all", None), ("all", None), ("allowed", allowed), ("allowed", allowed)):
             began = time.perf_counter()
             snapshot.search(query, mask)

@@ -65,7 +65,7 @@ def main(folder: Annotated[Path, typer.Argument()]) -> None:
         for name, values in errors.items()
     }
     rows = [(name, found["rms"], found["mean"]) for name, found in figures.items()]
-    rows += [("spread told", float(np.sqrt(np.mean(np.square(spreads)))), float(np.mean(spreads)))]
+    rows += [("spread stated", float(np.sqrt(np.mean(np.square(spreads)))), float(np.mean(spreads)))]
     title = f"{folder.name}: {len(spreads)} queries recognized; {100 * within.mean():.0f} % within twice the spread"
     more = {"queries": len(spreads), "within_twice_the_spread": float(within.mean()), "errors": figures}
     report(f"poses-{folder.name}", title, ("places apart", "root mean square", "mean"), rows, more)

@@ -1,8 +1,8 @@
-"""What keeping descriptors in fewer bits costs: AUC-PR of both stages, by how a map keeps what it searches.
+"""The cost of storing descriptors in fewer bits: AUC-PR of both stages, by the stored form that a map searches.
 
     python -m benchmarks.maps.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz]
 
-Queries are never kept and stay float32; references go through the storage's own packing and back.  ``first`` is
+Queries are never stored and stay float32; references go through the storage's own packing and back.  ``first`` is
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another
 reference is the best of the first stage, and of both, ``deviation`` by how much a first-stage score differs at most,
 and ``error`` how long the differences of the descriptors are, by the length of the descriptors.  ``products`` is the
@@ -66,14 +66,14 @@ def sides(encoder: Encoder, queries: Path, references: Path, cache: Path | None)
     if cache is not None and cache.is_file():
         with np.load(cache) as kept:
             return (kept["qd"], kept["ql"]), (kept["rd"], kept["rl"])
-    asked, known = encoded(encoder, queries), encoded(encoder, references)
+    queried, known = encoded(encoder, queries), encoded(encoder, references)
     if cache is not None:
-        np.savez(cache, qd=asked[0], ql=asked[1], rd=known[0], rl=known[1])
-    return asked, known
+        np.savez(cache, qd=queried[0], ql=queried[1], rd=known[0], rl=known[1])
+    return queried, known
 
 
 def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side, int]:
-    """What comes back of a side that was kept, or the side itself for float32, and bytes a place."""
+    """A side as it is read back from its stored form, or itself for float32, and bytes a place."""
     descriptors, local = side
     if precision == "float32":
         return side, descriptors[0].nbytes + local[0].nbytes
@@ -151,12 +151,12 @@ def main(
     references: Path,
     truth_file: Annotated[Path, typer.Argument(metavar="TRUTH.csv")],
     encoder: str = DEFAULT_ENCODER,
-    cache: Annotated[Path | None, typer.Option(help="Where encoded frames are kept, .npz.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Where encoded frames are stored, .npz.")] = None,
 ) -> None:
     """Measure, print a table and write JSON."""
     chosen = EncoderCatalogue().get(encoder)
-    asked, known = sides(chosen, queries, references, cache)
-    truth = read_ground_truth(truth_file, len(asked[0]), len(known[0]))
+    queried, known = sides(chosen, queries, references, cache)
+    truth = read_ground_truth(truth_file, len(queried[0]), len(known[0]))
     faiss.omp_set_num_threads(1)
     torch.set_num_threads(1)
     ways: dict[str, tuple[Side, int, Products]] = {}
@@ -171,8 +171,8 @@ def main(
     figures: dict[str, dict[str, float]] = {}
     exact: list[NDArray[Any]] = []
     for name, (back, size, products) in ways.items():
-        scores = asked[0] @ back[0].T
-        first, both = chosen.scores_from_inner_products(scores), score_matrix(chosen, scores, asked[1], back[1])
+        scores = queried[0] @ back[0].T
+        first, both = chosen.scores_from_inner_products(scores), score_matrix(chosen, scores, queried[1], back[1])
         if not figures:
             exact = [first, first.argmax(axis=1), both.argmax(axis=1)]
         figures[name] = {
@@ -183,7 +183,7 @@ def main(
             "changed_both": int((both.argmax(axis=1) != exact[2]).sum()),
             "deviation": float(np.abs(first - exact[0]).max()),
             "error": float(np.linalg.norm(back[0] - known[0]) / np.linalg.norm(known[0])),
-            "products_ms": milliseconds(products, asked[0]),
+            "products_ms": milliseconds(products, queried[0]),
         }
     rows = [
         (
@@ -197,7 +197,7 @@ def main(
     ]
     columns = ["precision", "bytes", "first, AUC-PR", "both, AUC-PR", "changed", "deviation", "error", "products, ms"]
     more = {"encoder": chosen.identity, "precisions": figures}
-    report("precision", f"{len(asked[0])} queries, {len(known[0])} references", columns, rows, more)
+    report("precision", f"{len(queried[0])} queries, {len(known[0])} references", columns, rows, more)
 
 
 def _products(kept: NDArray[Any], precision: str, queries: Array) -> Array:

@@ -1,6 +1,6 @@
 """References for maps of 100 000 and 1 000 000 places, synthesized from real descriptors; real queries to ask of them.
 
-Photographs of the data sets are encoded once by the default encoder and kept.  A *distractor* mixes two photographs of
+Photographs of the data sets are encoded once by the default encoder.  A *distractor* mixes two photographs of
 like places, A and one of the ten that score highest against A among those of A's kind (its folder): each word's part
 is A's with probability 1/2, else B's; 0.8 of it with 0.6 of the other one's, scaled back to unit length; empty where
 the first one's is.  These two numbers were chosen so that the best score of a real query among n distractors is
@@ -109,7 +109,7 @@ def _recombine(sources, neighbours, words, first, made):  # type: ignore[no-unty
 
 
 def material(datasets: Path, encoder: Encoder, cache: Path) -> Material:
-    """Encode all photographs, or take what an earlier run kept in the folder ``cache`` (about half a gigabyte)."""
+    """Encode all photographs, or take those of an earlier run from the folder ``cache`` (about half a gigabyte)."""
     paths = _photographs(datasets)
     names = [path.relative_to(datasets).as_posix() for path in paths]
     descriptors = _encoded(paths, encoder, cache)

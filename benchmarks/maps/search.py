@@ -68,7 +68,7 @@ BARS = {
     (MILLION, "compressed"): Bar(150.0, 0.98, 8192, 32_768),
 }
 GROWTH = 4.0
-"""A query against a million places is to take at most so many times as long as one against a hundred thousand."""
+"""A query against a million places is to take at most this many times as long as one against a hundred thousand."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def run(
 
 
 def bars(rows: Sequence[dict[str, Any]], precision: str) -> list[list[str]]:
-    """What is asked of the larger sizes, each in the precision meant for it: what, measured, verdict."""
+    """The bars of the larger sizes, each in the precision meant for it: name, measured, verdict."""
     found = []
     for row in rows:
         bar = BARS.get((row["places"], precision))
@@ -260,15 +260,15 @@ def main(
     rounds: int = 30,
     queries: Annotated[int, typer.Option(help="Spread evenly over all there are.")] = 1040,
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
-    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are stored.")] = Path(".cache/references"),
     keep: Annotated[Path | None, typer.Option(help="Where maps lie, used again when they are there.")] = None,
 ) -> None:
     """Measure and report."""
     share_cores(cores())
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     of = material(datasets, encoder, cache)
-    asked = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
-    of = replace(of, queries=of.queries[asked], walks=of.walks[asked])
+    queried = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
+    of = replace(of, queries=of.queries[queried], walks=of.walks[queried])
     sizes = [100_000, MILLION] if million else places or [1000, 10_000, 100_000]
     precision: Precision = "compressed" if million else "half"
     with ExitStack() as stack:

@@ -99,7 +99,7 @@ def histogram(path: Path, of: Material) -> dict[str, list[float]]:
 def main(
     output: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("docs/figures"),
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
-    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are stored.")] = Path(".cache/references"),
 ) -> None:
     """Draw both."""
     cost(output / "search-cost.png", measured())

@@ -1,11 +1,11 @@
-"""What following a run is worth: recall@1 of single frames and of the filter; and what it costs.
+"""The gain of following a run: recall@1 of single frames and of the filter; and what it costs.
 
     python -m benchmarks.maps.sequences --data ../shared/datasets/eval
 
 Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
 lab/training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames;
 the bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
-Nothing is told of the motion, and no map has poses.  As in a service, the positions of references count views
+No motion is given, and no map has poses.  As in a service, the positions of references count views
 (``core.maps.views``), and a run sees how much the view has changed.  Beside it, over 5 000 places with poses, the time
 that one frame's belief takes, against encoding a frame in the same minute.
 """
@@ -93,30 +93,31 @@ def positions(references: Encodings) -> NDArray[np.int64]:
 
 
 def followed(
-    told: list[tuple[int, Evidence]], views: list[View], graph: PlaceGraph, options: RunOptions
+    first: list[tuple[int, Evidence]], views: list[View], graph: PlaceGraph, options: RunOptions
 ) -> list[tuple[int, bool]]:
     """The place believed most after each frame, and whether it is recognized."""
     run, alive, best = Run(options, graph), np.ones(len(graph.index), np.bool_), []
-    for (_, seen), view in zip(told, views, strict=True):
+    for (_, seen), view in zip(first, views, strict=True):
         run.advance(seen, Step(), view)
         found = run.estimate(1, alive)
         best.append((found.candidates[0].row, found.verdict == "recognized"))
     return best
 
 
-def judged(right: Truth, told: list[tuple[int, bool]], where: Whereabouts) -> dict[str, int]:
+def judged(right: Truth, answers: list[tuple[int, bool]], where: Whereabouts) -> dict[str, int]:
     """How many answers are wrong, and of those that are recognized how many are right and wrong.
 
     A place is right if any frame of its view is.
     """
-    found = np.array([right[query, where.ordinal == where.ordinal[best]].any() for query, (best, _) in enumerate(told)])
-    recognized = np.array([sure for _, sure in told])
+    same = enumerate(answers)
+    found = np.array([right[query, where.ordinal == where.ordinal[best]].any() for query, (best, _) in same])
+    recognized = np.array([sure for _, sure in answers])
     sure = {"recognized": int((found & recognized).sum()), "misled": int((~found & recognized).sum())}
     return {"wrong": int((~found).sum())} | sure
 
 
 def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -> dict[str, Truth]:
-    """What is right, by each truth that there is."""
+    """The right references, by each truth that there is."""
     if name == "nordland_tiny":
         apart = np.abs(np.arange(len(queries))[:, None] - np.arange(len(references)))
         return {f"±{FRAMES}": apart <= FRAMES}
@@ -131,23 +132,23 @@ def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -
 def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) -> dict[str, dict[str, Any]]:
     """By each truth of a pair of traverses: queries, and how single frames and sessions are judged.
 
-    One session learns the pace, the other is told it: a frame of the map from each frame to the next.
+    One session learns the pace, the other gets it: a frame of the map from each frame to the next.
 
     Args:
-        frames: of each traverse only the first so many.
+        frames: the number of first frames taken of each traverse; None: all.
     """
     folder = data / name
-    asked, known = ([read(path) for path in find_photographs(folder / part)][:frames] for part in TRAVERSES[name])
-    references, views = describe(encoder, known), [view_of(frame) for frame in asked]
+    queried, known = ([read(path) for path in find_photographs(folder / part)][:frames] for part in TRAVERSES[name])
+    references, views = describe(encoder, known), [view_of(frame) for frame in queried]
     where = Whereabouts.along_sequence(positions(references))
     graph = place_graph(where, np.arange(len(known)), len(known), SAME_PLACE)
-    told = list(evidences(encoder, describe(encoder, asked), references, where))
-    answers = {"single": [(best, False) for best, _ in told]}
-    answers["session"] = followed(told, views, graph, RunOptions())
-    answers["session, told the pace"] = followed(told, views, graph, RunOptions(Stride()))
+    first = list(evidences(encoder, describe(encoder, queried), references, where))
+    answers = {"single": [(best, False) for best, _ in first]}
+    answers["session"] = followed(first, views, graph, RunOptions())
+    answers["session, told the pace"] = followed(first, views, graph, RunOptions(Stride()))
     return {
-        truth: {"queries": len(asked)} | {how: judged(right, best, where) for how, best in answers.items()}
-        for truth, right in truths(name, folder, asked, known).items()
+        truth: {"queries": len(queried)} | {how: judged(right, best, where) for how, best in answers.items()}
+        for truth, right in truths(name, folder, queried, known).items()
     }
 
 
@@ -218,7 +219,7 @@ def main(
     times = costs(chosen, places, rounds)
     figures |= {"milliseconds": times, "places": places}
     for name, milliseconds in times.items():
-        # Looking back is asked for apart, and paid for apart.
+        # Looking back is requested apart, and paid for apart.
         held = "" if name in ("encode", "odometry, lag 5") else verdict(milliseconds / times["encode"], SHARE)
         kind = f"{name}, {places} places" if name != "encode" else "encode"
         rows.append((kind, f"{milliseconds:.2f} ms", "", "", held))

@@ -1,4 +1,4 @@
-"""What a session makes of the rarer things: a robot that is carried off, leaves the map, stands, or sees nothing.
+"""Sessions in rarer situations: a robot that is carried off, leaves the map, stands, or sees nothing.
 
     python -m benchmarks.maps.sessions --datasets ../shared/datasets
 
@@ -6,7 +6,7 @@ Runs along lip6_outdoor (by the truth put right) and corridor are cut and splice
 goes on at another stretch of the map, in the other traverse, or in the half of its own traverse that the map does not
 have.
 A frame *says so* if its own verdict is unknown, or recognized at a place where the robot cannot have gone.  Counted are
-the frames that say so until the session no longer tells the old place; the bar is three.  Nothing of the filter is
+the frames that say so until the session no longer gives the old place; the bar is three.  Nothing of the filter is
 fitted to these traverses but one rate (``core.belief.filter.RETURNING``).
 """
 
@@ -57,7 +57,7 @@ SPLICED = 40
 """Spliced runs of each kind."""
 
 FAR = 30
-"""A robot is carried to a stretch whose places are all more than so many frames from where it was."""
+"""A robot is carried to a stretch whose places are all more than this number of frames from where it was."""
 
 STANDS = 90
 """Frames of a robot that stands, three seconds at 30 frames a second."""
@@ -67,7 +67,7 @@ WITHIN, NOTICED, HALVED = 3, 0.9, 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """One frame: what it says alone, and what it says to a session.
+    """One frame: its own verdict, and its evidence for a session.
 
     best: the reference that it matches best alone; -1: none.
     right: bool [R], the references that show its place.
@@ -128,16 +128,16 @@ class Walk:
     def noticed(self, before: Sequence[Look], after: Sequence[Look]) -> tuple[int, int] | None:
         """After how many frames that say so, and after how many frames, a session has left the old place.
 
-        None: it had not told the right place at the cut.  (AFTER + 1, AFTER + 1): it has not noticed.
+        None: it did not give the right place at the cut.  (AFTER + 1, AFTER + 1): it has not noticed.
         """
-        told = list(self.followed([*before, *after]))
-        look, found, _ = told[len(before) - 1]
+        steps = list(self.followed([*before, *after]))
+        look, found, _ = steps[len(before) - 1]
         if found.verdict != "recognized" or not look.right[found.candidates[0].row]:
             return None
         old = np.flatnonzero(before[-1].right)
         low, high = int(old.min()) - SAME_PLACE.frames, int(old.max()) + AFTER + SAME_PLACE.frames
         says = 0
-        for number, (look, found, _) in enumerate(told[len(before) :], start=1):
+        for number, (look, found, _) in enumerate(steps[len(before) :], start=1):
             elsewhere = look.verdict == "recognized" and not low <= look.best <= high
             says += look.verdict == "unknown" or elsewhere
             believed = found.candidates[0].row if found.verdict == "recognized" else None
@@ -212,16 +212,16 @@ def main(
         frames, references = encoded[name]
         walk = Walk(chosen, references)
         looks = walk.looks(task.queries, frames, task.truth)
-        told = list(walk.followed(looks))
+        steps = list(walk.followed(looks))
 
         # A run that is not spliced
         single = sum(not look.right[look.best] for look in looks)
-        wrong = sum(not look.right[found.candidates[0].row] for look, found, _ in told)
-        believed = [(look, found) for look, found, _ in told if found.verdict == "recognized"]
+        wrong = sum(not look.right[found.candidates[0].row] for look, found, _ in steps)
+        believed = [(look, found) for look, found, _ in steps if found.verdict == "recognized"]
         kept["errors"] = {"queries": len(looks), "single": single, "session": wrong}
         kept["recognized"] = {
             "single": float(np.mean([look.verdict == "recognized" for look in looks])),
-            "session": len(believed) / len(told),
+            "session": len(believed) / len(steps),
             "right": float(np.mean([look.right[found.candidates[0].row] for look, found in believed])),
         }
         bar = "errors " + verdict(wrong / single, HALVED) if name == "lip6" else ""
@@ -234,7 +234,7 @@ def main(
 
         # Spliced ones
         stated = [
-            (found.candidates[0].probability, bool(look.right[found.candidates[0].row])) for look, found, _ in told
+            (found.candidates[0].probability, bool(look.right[found.candidates[0].row])) for look, found, _ in steps
         ]
         other = next(one for one in tasks if one != name)
         strangers = walk.looks(tasks[other].queries, encoded[other][0])
@@ -269,13 +269,13 @@ def main(
             blind = walk.looks(pictures, descriptions)
             frames_until, sights = [], set()
             for first, _ in spliced(looks, None, 2):
-                told_blind = list(walk.followed([*first, *blind]))
-                if told_blind[BEFORE - 1][1].verdict != "recognized":
+                covered_steps = list(walk.followed([*first, *blind]))
+                if covered_steps[BEFORE - 1][1].verdict != "recognized":
                     continue
-                verdicts = [found.verdict for _, found, _ in told_blind[BEFORE:]]
+                verdicts = [found.verdict for _, found, _ in covered_steps[BEFORE:]]
                 last = max((n for n, one in enumerate(verdicts, 1) if one != "unknown"), default=0)
                 frames_until.append(last + 1)
-                sights.add(told_blind[-1][2].sight)
+                sights.add(covered_steps[-1][2].sight)
             kept[f"covered: {kind}"] = {
                 "unknown from frame": np.bincount(frames_until).tolist(),
                 "view": sorted(map(str, sights)),

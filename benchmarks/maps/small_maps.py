@@ -1,8 +1,8 @@
-"""What the search of a small map costs: every place compared by FAISS's flat indexes, and codes first, as maps do.
+"""The cost of a search of a small map: every place compared by FAISS's flat indexes, and codes first, as maps do.
 
     python -m benchmarks.maps.small_maps [--places 2000] [--rounds 25]
 
-One thread, of which the processor time is told; taken in turns, medians.  Descriptors are random, for what is in them
+One thread, by its processor time; taken in turns, medians.  Descriptors are random, for what is in them
 costs no time.  *Exact* and *compact* are all that a map in memory does with queries that come together, rankings
 included, in either tier.  ``FAISS_SIMD_LEVEL=AVX2`` lets FAISS do without AVX-512.
 """

@@ -1,1 +1,1 @@
-"""Encoders in a Ray cluster: what they cost, and how far one front carries them."""
+"""Encoders in a Ray cluster: their cost, and how far one front carries them."""

@@ -1,4 +1,4 @@
-"""What of a job's processor time remains in the front when its frames are encoded by others: is it worth a cluster?
+"""The share of a job's processor time that remains in the front when others encode: is it worth a cluster?
 
     python -m benchmarks.ray_serve.jobs
 

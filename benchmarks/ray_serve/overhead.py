@@ -1,4 +1,4 @@
-"""What Ray costs a query: a service whose encoders are in a Ray cluster beside one that encodes itself, both real.
+"""The cost of Ray for a query: a service whose encoders are in a Ray cluster beside one that encodes itself, both real.
 
     python -m benchmarks.ray_serve.overhead
 

@@ -49,7 +49,7 @@ def time_of_all() -> float:
 
 
 def cluster_of(folder: Path, replicas: int, batch: int) -> Cluster:
-    """A cluster in which so many replicas are deployed."""
+    """A cluster in which ``replicas`` replicas are deployed."""
     settings = Settings(
         data_dir=folder / "data",
         ray=True,
@@ -63,7 +63,7 @@ def cluster_of(folder: Path, replicas: int, batch: int) -> Cluster:
 
 
 def deploy(cluster: Cluster, replicas: int) -> None:
-    """Deploy waiting replicas in place of others, and wait until so many run and no other does."""
+    """Deploy waiting replicas in place of others, and wait until only the new ones run."""
     from ray import serve
 
     if cluster.state().running:

@@ -1,4 +1,4 @@
-"""The thesis's pipeline as one writes it from its text: what ours is measured against.
+"""The thesis's pipeline as one writes it from its text: the reference for ours.
 
 FROZEN.  This file is never changed again: the speed of encoding is quoted as a multiple of this code.  The network is
 torch's own pass; regions come from ``reference_regions``, map by map and region by region (eqs. 4.1–4.5); the VLAD

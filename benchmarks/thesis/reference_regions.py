@@ -1,4 +1,4 @@
-"""The region pass as one writes it from the thesis with scikit-image: what ours is measured against.
+"""The region pass as one writes it from the thesis with scikit-image: the reference for ours.
 
 FROZEN.  This file is never changed again: the speed of the region pass is quoted as a multiple of
 this code, per map one ``skimage.measure.label`` and one ``regionprops`` loop.

@@ -29,7 +29,7 @@ def main(
     """Compare results, then times."""
     extractor: FeatureExtractor = EncoderCatalogue().get(encoder).extractor
     definition = extractor.definition
-    # What the encoder's second stage alone compares stands behind the layers that regions come from.
+    # The layers of the encoder's second stage alone come after those that regions come from.
     layers = extractor.activations([sample_frame()])[0][: len(definition.layers)]
     planes = [np.ascontiguousarray(layer.transpose(2, 0, 1)) for layer in layers]
     steps = definition.steps if step is None else (step,) * len(layers)

@@ -9,7 +9,7 @@ NAME = "placerec_ros"
 setup(
     name=NAME,
     version="0.2.0",
-    description="A lifecycle node of ROS 2 that tells a robot where it is, by a placerec service.",
+    description="A lifecycle node of ROS 2 that localizes a robot by a placerec service.",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     python_requires=">=3.11",
     # rclpy and the messages come with ROS, or from the wheels that README.md names.

@@ -80,7 +80,7 @@ def _verdict(candidates: Sequence[Candidate], unknown: float, graph: PlaceGraph)
 
 
 def _near(row: int, candidates: Sequence[Candidate], graph: PlaceGraph, times: float = 1) -> NDArray[np.bool_]:
-    """Which candidates are within so many times the reach of what is the same place as a row; bool [k]."""
+    """Which candidates are within ``times`` the reach of the same place as a row; bool [k]."""
     places = graph.places_at(np.array([row, *(one.row for one in candidates)]))
     return graph.whereabouts.take(places).near(0, graph.neighborhood.times(times))[1:]
 

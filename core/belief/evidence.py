@@ -1,4 +1,4 @@
-"""What one frame says about every place: log likelihood ratios from the scores of a search.
+"""The evidence of one frame about every place: log likelihood ratios from the scores of a search.
 
 A score means little by itself, so it is compared with two other scores of the same frame: the mean score of listed
 places other than the best match's (a place with this score is no likelier than one that is not listed), and the
@@ -52,7 +52,7 @@ was chosen on."""
 
 @dataclass(frozen=True)
 class Sighting:
-    """What a frame that is recognized by itself says of where it was taken.
+    """The place where a frame was taken, as a frame recognized by itself gives it.
 
     row: of the map, the place that it shows.
     probability: that it does, whatever came before.
@@ -134,7 +134,7 @@ def evidence(
         examined: bool [n], which of them the encoder's second stage has examined; None, or none of them: it has no
             second stage.
         verified: float64 [n], what geometric verification found of them (``core.geometry.verification``), -ln of the
-            number of false alarms; NaN where a place was not verified, of which other frames of its view may tell.
+            number of false alarms; NaN where a place was not verified; other frames of its view may then count.
             None: none was.
         rivals: positions of places that show what the best match shows, as another traverse's do.  A robot is at one of
             them or at the best match, and in the map: they gain together what the best match would without them.
@@ -170,7 +170,7 @@ def evidence(
 
 
 def _of_views(verified: NDArray[np.float64], where: Whereabouts) -> NDArray[np.float64]:
-    """What verification found of n places, or most of other frames of the same view; NaN where neither is known."""
+    """Evidence of verification for n places, or the largest for other frames of the same view; NaN without either."""
     _, view = np.unique(where.view_keys(), return_inverse=True)
     most = np.full(len(verified), np.nan)
     np.fmax.at(most, view, verified)

@@ -3,7 +3,7 @@
 Given that the robot sees the map, its place follows the forward algorithm (Rabiner, A tutorial on hidden Markov
 models, Proceedings of the IEEE 77(2), 1989, section III.A) in its scaled form, which is causal: a frame only changes
 the belief about the present.  The robot may be carried to any place at any time (JUMP).  With a lag, the backward pass
-over the later frames tells where the robot was that many frames ago.
+over the later frames gives the place of the robot that many frames ago.
 
 Whether the robot sees the map is a second chain of two states (LEAVING, RETURNING), which compares the likelihood of
 each frame under the first chain with that of a frame from outside.  A robot whose view was blocked is therefore looked
@@ -48,7 +48,7 @@ MANY = 1000
 """In maps with fewer places than this, every place is moved: it takes little time there, and the error would count."""
 
 MOST_MOVED = 1024
-"""In maps with so many places or more, the likeliest of them are moved one by one."""
+"""In maps with at least this number of places, the likeliest are moved one by one."""
 
 FAINT = 2.0
 """At an unknown speed, places with at most this times the floor are not moved one by one."""
@@ -62,7 +62,7 @@ VANISHING = 1e-30
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed about the present.
+    """The belief about the present.
 
     given: float32 [n], the probabilities of the places, in the order of their graph, if the robot sees the map; their
         sum is 1, or 0 if there is no place.
@@ -187,8 +187,8 @@ def observed_by_speed(belief: Belief, seen: Evidence, graph: PlaceGraph, weights
     places, gains = graph.evidence_at(seen)
     speeds, factors = belief.speeds.weighed(places, np.exp(gains[:, np.newaxis] * weights))
     with np.errstate(divide="ignore"):
-        told = Evidence(graph.rows[places], np.log(factors), seen.unknown * overall)
-    return observed(replace(belief, speeds=speeds), told, graph)
+        evidence = Evidence(graph.rows[places], np.log(factors), seen.unknown * overall)
+    return observed(replace(belief, speeds=speeds), evidence, graph)
 
 
 def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses, float]:
@@ -202,7 +202,7 @@ def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """What smoothing needs of one past frame: the belief after it, the transition into it, its evidence and share."""
+    """One past frame, for smoothing: the belief after it, the transition into it, its evidence and share."""
 
     belief: Belief
     transition: Transition
@@ -211,7 +211,7 @@ class _Moment:
 
 
 class Smoother:
-    """Keeps the last frames of a run and tells where the robot was ``lag`` frames ago, given all frames since."""
+    """Stores the last frames of a run and estimates the place of ``lag`` frames ago from all frames since."""
 
     def __init__(self, lag: int) -> None:
         self.lag = lag
@@ -249,7 +249,7 @@ class Smoother:
 def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
     """Carry a belief over, row by row, to a graph in which places were added, removed or moved.
 
-    New places start with the least probability of the others.  The probability of places of which no frame is left is
+    New places start with the least probability of the others.  The probability of places without a frame left is
     added to ``unknown``: the robot is where the map no longer has a place.
     """
     n = len(new)

@@ -112,7 +112,7 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Step:
-    """What is known about the motion between two frames; nothing for a run's first frame.
+    """The known motion between two frames; unknown for a run's first frame.
 
     odometry: None if the robot reports none.
     reach: the metres that the robot can have moved, by its speed limit and the time between; None if not known.
@@ -151,7 +151,7 @@ class Move(Protocol):
     def matrix(self) -> Matrix:
         """The matrix T in plain NumPy: T_ij is the share of place i's mass that goes to place j, float64 [n, n].
 
-        What a row lacks of 1 leaves the map.
+        The mass that a row lacks to 1 leaves the map.
         """
 
 
@@ -354,7 +354,7 @@ def transition(graph: PlaceGraph, step: Step, stride: Stride | None, pending: Pe
 
     Args:
         graph: of the map's places.
-        step: what is known about the motion.
+        step: the known motion.
         stride: the usual advance along a sequence; None: any of ``speeds.SPEEDS``, as before the first frame.
         pending: collects motion that is too small to apply, until it is enough; changed.
     """

@@ -1,6 +1,6 @@
 """Where odometry says that the robot is, and the motion between two such poses.
 
-A pose is told anew with every frame, so that nothing is lost or counted twice if a frame or an answer to it is lost:
+A pose is sent anew with every frame, so that nothing is lost or counted twice if a frame or an answer to it is lost:
 the motion is always the one since the last frame that was taken in.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from core.belief.motion import Odometry
 
 FASTEST = 100.0
-"""Metres per second.  Odometry that tells a faster motion has begun anew, or was set."""
+"""Metres per second.  Odometry that reports a faster motion has begun anew, or was set."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class OdometryPose:
     def since(self, before: OdometryPose) -> Odometry:
         """The motion from an earlier pose of the same origin to this one, in the robot's coordinates at that pose.
 
-        What this pose's covariance has beyond the earlier one, as it is carried along by the motion, is that of the
+        The excess of this pose's covariance over the earlier one, as it is carried along by the motion, is that of the
         motion; it is never negative.  It is 0 if either is not known.
         """
         east, north = self.x - before.x, self.y - before.y

@@ -19,7 +19,7 @@ from core.belief.view import HEIGHT, WIDTH, View
 FORMAT = 3
 
 WHOLE = 255
-"""Shares of speeds are kept as so many parts of 1, which is nearer than they are known."""
+"""Shares of speeds are stored in units of one over this number, which is finer than they are known."""
 
 _PREFIX = struct.Struct("<II")  # checksum of all that follows it, length of the head
 

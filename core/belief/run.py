@@ -106,7 +106,7 @@ class RunState:
 
 
 def _apart(speed: ArrayLike) -> NDArray[np.float64]:
-    """The weight of frames that are so many of the map's frames apart."""
+    """The weight of frames at this distance, counted in the map's frames."""
     return np.clip(np.sqrt(speed), 1.0, FIRST)
 
 
@@ -116,7 +116,7 @@ class Run:
     frames: how many frames there were.
     unrecognized: how many frames since the last recognized one; None before the first.
     sight: why the last frame did not count; None if it did.
-    blind: how many frames since the last one that told where the robot is, or that it is not in the map.
+    blind: how many frames since the last one that gave evidence of a place, or of none in the map.
     constant: how many frames since the last one that counted showed the same as it.
     pose: where odometry said that the robot was at the last frame; None if that had no such pose.
     """
@@ -173,15 +173,15 @@ class Run:
     def advance(self, seen: Evidence, step: Step, view: View | None = None, pose: OdometryPose | None = None) -> None:
         """Update the belief with one frame.
 
-        A frame that shows hardly anything tells nothing.  One that shows the same as the last one that counted is no
-        second witness, and the robot is taken to stand, unless odometry or a speed limit tells how it has moved among
+        A frame that shows hardly anything is no evidence.  One that shows the same as the last one that counted is no
+        second witness, and the robot is taken to stand, unless odometry or a speed limit gives its motion among
         the poses of the map.  A frame that shows partly the same counts in part.
 
         Args:
             seen: the evidence of the frame.
             step: the motion since the frame before; ignored for the first frame.
-            view: what the frame shows; None: it is not known, and taken to be new.
-            pose: where odometry says that the robot is, from which the motion to the next frame is told.
+            view: the view of the frame; None: not known, and taken to be new.
+            pose: where odometry says that the robot is, from which the motion to the next frame is computed.
         """
         change = None if view is None or self._view is None else view.change(self._view)
         new = 1.0 if change is None else novelty(change)
@@ -245,10 +245,10 @@ class Run:
         return self.options.stride is None and not by_poses(self.graph, step)
 
     def _independence(self, step: Step) -> float:
-        """How much more a frame tells than one that follows another closely.
+        """The weight of a frame as evidence, relative to one that follows another closely.
 
         Frames that are some of the map's frames apart make fewer mistakes in common: the weight grows with the root of
-        the speed, up to that of a first look, which ``frames`` without any that told something come before.
+        the speed, up to that of a first look, after ``frames`` frames without evidence.
         """
         if self.blind == self.frames:
             return FIRST
@@ -318,7 +318,7 @@ class Run:
         return estimate(belief, self.graph, count, sighting, self._guided)
 
     def _now(self) -> Belief:
-        """The present belief; what is believed to be seen fades while the view is covered or tells nothing."""
+        """The present belief; the belief to see the map fades while the view is covered or shows nothing."""
         return replace(self.belief, unknown=1 - (1 - self.belief.unknown) * FADING**self.blind)
 
     def state(self) -> RunState:

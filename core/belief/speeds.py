@@ -1,4 +1,4 @@
-"""How fast a robot goes along a traverse if nothing tells it: a belief over speeds, learnt as the robot goes.
+"""The speed of a robot along a traverse without odometry: a belief over speeds, learnt as the robot goes.
 
 A speed is the number of the map's frames that go by from one frame of the robot to the next: 1 at the pace of the
 traverse, 0.1 for a camera with ten times the frame rate, 0 for a robot that stands, below 0 for one in reverse.  The
@@ -72,7 +72,7 @@ LASTING = 0.9
 """Probability that a robot that is elsewhere than believed has the speed that is believed."""
 
 TRACKED = 1024
-"""So many places have shares of their own, in maps where not all have."""
+"""Number of places with shares of their own, in maps where not all have them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ class Speeds:
         return Speeds(self.places, shares / own[:, np.newaxis], elsewhere / np.float32(rest)), own, rest
 
     def carried(self, places: NDArray[np.int64]) -> Speeds:
-        """The same on another graph of the map, of whose places int64 [m, 2] tells the old number and the new one."""
+        """The same on another graph of the map; ``places``, int64 [m, 2]: their old and new numbers."""
         _, own, at = np.intersect1d(self.places, places[:, 0], return_indices=True)
         new, first = np.unique(places[at, 1], return_index=True)
         return Speeds(new.astype(np.int32), self.shares[own[first]], self.elsewhere)

@@ -61,7 +61,7 @@ def view_of(pixels: Pixels, mask: Mask | None = None) -> View:
 
     Args:
         pixels: uint8 [H, W, 3], BGR, of any size.
-        mask: what to ignore in it.
+        mask: the pixels to ignore in it.
     """
     small = cv2.resize(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     levels = np.asarray(small, np.uint8)

@@ -132,7 +132,7 @@ def disk_errors(action: str, database: str = "map.sqlite") -> Iterator[None]:
     """Turn the errors of the file system and of SQLite in the block into ours.
 
     Args:
-        action: what the block does, as an infinitive for the message.
+        action: the work of the block, as an infinitive for the message.
         database: the SQLite file that the block uses.
 
     Raises:

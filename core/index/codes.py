@@ -50,7 +50,7 @@ class Coder:
         return Coder(dimension)
 
     def index(self, capacity: int) -> faiss.IndexRaBitQ:
-        """An index with room for so many codes, to be filled through :func:`core.index.flat.stored`."""
+        """An index with room for this number of codes, to be filled through :func:`core.index.flat.stored`."""
         index = faiss.IndexRaBitQ(self.width, faiss.METRIC_INNER_PRODUCT)
         index.train(np.zeros((1, self.width), np.float32))  # the mean that is subtracted
         index.qb, index.centered = QUERY_BITS, True
@@ -86,7 +86,7 @@ class Coder:
         return np.concatenate(parts)
 
     def blank(self, n: int) -> Codes:
-        """Codes for ``n`` rows that have no descriptor any more and are never asked for; with 0 an empty array."""
+        """Codes for ``n`` rows that have no descriptor any more and are never read; an empty array for 0 rows."""
         return np.zeros((n, self.bytes_per_place), np.uint8)
 
     def decoded(self, codes: Codes, count: int) -> Array:
@@ -100,6 +100,6 @@ class Coder:
 
     @cached_property
     def digest(self) -> str:
-        """What tells these codes from those of another rotation or layout: a CRC-32 of the signs of a known code."""
+        """The fingerprint of the rotation and layout of the codes: a CRC-32 of the signs of a known code."""
         known = np.random.default_rng(0).standard_normal((1, self.dimension)).astype(np.float32)
         return f"{zlib.crc32(self.encode(known)[0, : self.width // 8].tobytes()):08x}"

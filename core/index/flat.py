@@ -17,7 +17,7 @@ Vectors = NDArray[np.float16] | NDArray[np.float32]
 
 @contextmanager
 def in_one_thread() -> Iterator[None]:
-    """Let FAISS compute in the calling thread alone: what a search shares among threads it shares itself."""
+    """Let FAISS compute in the calling thread alone: a search distributes its work among threads itself."""
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:
@@ -56,7 +56,7 @@ def vectors(index: faiss.IndexFlatCodes) -> Vectors:
 
 
 def selector(chosen: Flags) -> faiss.IDSelector:
-    """What lets a search find only the chosen rows; bool [capacity]."""
+    """The selector that limits a search to the chosen rows; bool [capacity]."""
     return faiss.IDSelectorBitmap(np.packbits(chosen, bitorder="little"))
 
 

@@ -26,22 +26,23 @@ ROWS_PER_BLOCK = 1024
 """Rows of a block that is appended to."""
 LARGEST_BLOCK = 65_536
 LOOSE_ROWS = 8192
-"""Blocks that are not scanned are joined when they have so many rows: then reading every code takes too long."""
+"""Blocks that are not scanned are joined from this number of rows on: then reading every code takes too long."""
 SCANNED_VALUES = 2048
-"""The fast scan judges rows by so many of their rotated values; of fewer than twice as many all codes are compared."""
+"""Number of rotated values by which the fast scan ranks rows; below twice as many, all codes are compared."""
 CANDIDATES, FEWEST_CANDIDATES = 8.0, 3.0
-"""For each row of the shortlist a scan leaves so many rows, whose whole codes are compared; divided by the root of the
+"""Number of rows that a scan leaves for each row of the shortlist, to compare their whole codes; divided by
+the root of the
 number of blocks, down to the fewest, since only one block has the row that is looked for."""
 SHARED_FROM = 16_384
-"""A search of so many rows is shared among threads."""
+"""From this number of rows on, a search is shared among threads."""
 _DECODED = 256
 """Rows that are decoded at a time."""
 
 Progress = Callable[[int, int], None]
 
 
-def _untold(done: int, total: int) -> None:
-    """Nobody is told."""
+def _unreported(done: int, total: int) -> None:
+    pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,7 @@ class CodeTable:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Whether so many rows are in blocks that :meth:`joined` makes a larger one of them."""
+        """Whether enough rows are in loose blocks that :meth:`joined` makes a larger one of them."""
         return sum(block.used for block in self.blocks if block.is_full and self._is_small(block)) >= LOOSE_ROWS
 
     @property
@@ -200,11 +201,11 @@ class CodeTable:
         """Whether a block would better be part of a larger one: it has no scan, or too few rows where none has."""
         return block.scan is None if self._can_scan else block.used < LOOSE_ROWS
 
-    def joined(self, progress: Progress = _untold) -> Block | None:
+    def joined(self, progress: Progress = _unreported) -> Block | None:
         """A block that can take the place of some smaller ones; None while these have few rows.
 
         Args:
-            progress: is called with the rows done and all rows; what it raises ends the work.
+            progress: called with the number of rows done and of all; its exceptions end the work.
         """
         if not self.is_loose:
             return None

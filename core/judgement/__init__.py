@@ -1,1 +1,1 @@
-"""What scores mean: verdicts, probabilities, calibration, priors, positions.  No encoder and no map is known here."""
+"""The meaning of scores: verdicts, probabilities, calibration, priors, positions.  No encoder or map is known here."""

@@ -4,7 +4,7 @@ A single frame may resemble many places; a path of frames that resemble one plac
 hardly ever.  The scores of all frames of a traverse against all of another are first made comparable: the median of
 each row and of each column is subtracted, and the rest divided by its spread (the median of its absolute values, as a
 standard deviation), so that neither a frame that resembles everything nor a place that everything resembles counts.
-What exceeds ``ORDINARY`` is the gain of a pair of frames, and what falls short of it its loss.
+The excess over ``ORDINARY`` is the gain of a pair of frames, and the deficit its loss.
 
 A path pairs consecutive frames of the first traverse with frames of the second, of which it advances by none to three
 at a time; every step but that by one costs ``UNEVEN`` for each frame of difference.  The path with the largest sum is
@@ -12,7 +12,7 @@ found as in local alignment (Smith, Waterman, "Identification of common molecula
 begin and end anywhere; then the next among the frames that are left.  SeqSLAM (Milford, Wyeth, 2012) sums along
 straight lines instead, which holds for stretches of one pace only.
 
-Some path is always the best.  How good it is by chance is told by the same scores with the second traverse turned
+Some path is always the best.  Its quality by chance is measured on the same scores with the second traverse turned
 around: nobody sees its places in that order, but they resemble one another as before.
 
 Memory does not grow with the product of the lengths: scores are computed in tiles, of each frame the ``MOST_PAIRS``
@@ -44,7 +44,7 @@ LARGEST = 4.0
 """More deviations than this count as this, so that no single pair makes a path."""
 
 UNEVEN = 0.5
-"""What a step costs for each frame by which it differs from one."""
+"""The cost of a step for each frame by which it differs from one."""
 
 LARGEST_STEP = 3
 """A step advances by at most this many frames of the second traverse."""
@@ -53,22 +53,22 @@ LEAST_FRAMES = 10
 """A path of fewer frames is no evidence."""
 
 BY_CHANCE = 2.0
-"""A path has at least so many times the sum of the best path through the second traverse turned around."""
+"""The least ratio of a path's sum to that of the best path through the second traverse turned around."""
 
 MOST_PATHS = 64
-"""At most so many paths are looked for among the frames that are matched together."""
+"""The largest number of paths looked for among the frames that are matched together."""
 
 TOGETHER = 1024
-"""So many frames of the first traverse are matched at a time, at most; a path ends with them."""
+"""The largest number of frames of the first traverse that are matched at a time; a path ends with them."""
 
 TILE = 512
-"""So many frames of the second traverse are scored at a time."""
+"""Number of frames of the second traverse that are scored at a time."""
 
 MOST_PAIRS = 512
-"""Of each frame of the first traverse so many pairs are kept, at most."""
+"""The largest number of pairs that are stored for each frame of the first traverse."""
 
 SAMPLE = 1024
-"""The median of a row and the spread are estimated from so many frames of the second traverse, at most."""
+"""The largest number of frames of the second traverse from which the median of a row and the spread are estimated."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def shared_stretches(
             in which they were taken.
         first, second: how many frames the traverses have; the first may have at most ``LARGEST_STEP`` times fewer
             frames of the same way.
-        advance: is told how many pairs of frames were scored since it was last called; what it raises ends the search.
+        advance: called with the number of pairs of frames scored since the last call; its exceptions end the search.
     """
     if min(first, second) < LEAST_FRAMES:
         return []
@@ -201,7 +201,7 @@ def best_path(pairs: AlignedPairs) -> tuple[Frames, float]:
 
 
 def best_path_by_rows(pairs: AlignedPairs) -> tuple[Frames, float]:
-    """What :func:`best_path` computes, in NumPy."""
+    """:func:`best_path` in NumPy."""
     columns, totals = np.empty(0, np.int64), np.empty(0)
     reached: list[tuple[Frames, NDArray[np.int8]]] = []
     best, end = 0.0, (-1, -1)

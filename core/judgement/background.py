@@ -34,13 +34,13 @@ TOP_PLACES = 5
 """The best score is compared with the mean of this many of the best other places."""
 
 FULL = 60
-"""A map with so many other places gets no imagined ones.  With 60, the default threshold recognizes 5.2 % of the
+"""A map with this number of other places gets no imagined ones.  With 60, the default threshold recognizes 5.2 % of the
 strangers in maps of 1 to 30 frames of nordland_tiny and camvid; with 50 it is 6.0 %, with 40 6.7 %, with 30 8.5 %.
 Corridor had a say in it as well: there it is the least of these with which no size has more than 5 %."""
 
 
 GUARD_FACTOR = 3
-"""Only places farther than so many times the same-place distance from the best match tell how other places score."""
+"""Only places farther from the best match than this multiple of the same-place distance count as other places."""
 
 
 class Environment(BaseModel):

@@ -1,7 +1,7 @@
 """Calibrations: how a curve, a threshold and a margin are fitted from trials, for an encoder or for one map.
 
 A calibration says when an answer is believed (see ``verdict.py``).  An encoder ships with one, fitted here from frames
-that were kept out of its training (:func:`fit_encoder_calibration`).  A map may get one of its own, fitted from
+that were held out of its training (:func:`fit_encoder_calibration`).  A map may get one of its own, fitted from
 queries whose true place is known (:func:`fit_map_calibration`).  In both, the curve and the margin come from the
 trials; the threshold follows from what it is to achieve.
 
@@ -128,10 +128,10 @@ Rule = Literal["precision", "false_accept_rate", "mean_of_negatives"]
 
 
 class Target(BaseModel):
-    """What the threshold is to reach.
+    """The target of the threshold.
 
-    ``precision``: so many of the answers believed are right.  ``false_accept_rate``: at most so many of the frames of
-    places that the map lacks are believed.  ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over
+    ``precision``: the share of right answers among those believed.  ``false_accept_rate``: the share of frames of
+    places that the map lacks that may be believed.  ``mean_of_negatives``: rule of the thesis (3.4.3), the mean over
     the frames of places that the map lacks; it has no value.
     """
 
@@ -148,7 +148,7 @@ class Target(BaseModel):
 
 
 class Point(BaseModel):
-    """What one threshold on the decision value does, on all frames; the margin is not applied."""
+    """The effect of one threshold on the decision value, on all frames; the margin is not applied."""
 
     threshold: float
     precision: float = Field(description="Right ones among the answers believed.")
@@ -157,7 +157,7 @@ class Point(BaseModel):
 
 
 class Held(BaseModel):
-    """What the verdicts did with frames that had no part in the threshold by which they were judged."""
+    """The verdicts on held-out frames: those that had no part in the threshold by which they were judged."""
 
     precision: Share = Field(description="Right ones among the recognized.")
     recall: Share = Field(description="Recognized and right, of the frames whose place is in the map.")
@@ -174,7 +174,7 @@ class Mix(BaseModel):
 
 
 class Effect(BaseModel):
-    """What a calibration does with queries whose truth is known.
+    """The effect of a calibration on queries whose truth is known.
 
     The calibration may have been fitted to the same queries, so these figures are a little too good; those of
     :class:`Measurement` are cross-validated.  A best match that does not stand out counts as unknown, also where rivals
@@ -191,12 +191,12 @@ class Effect(BaseModel):
 
 
 def effect_of(trials: Trials, calibration: Calibration) -> Effect:
-    """What a calibration does with some trials, at least one."""
+    """The effect of a calibration on some trials, at least one."""
     recognized, believed = trials.recognized(calibration), trials.standing_out(calibration)
     passed, known = recognized & trials.right, trials.known
-    told = None
+    stated = None
     if calibration.curve is not None:
-        told = reliability(trials.probabilities(calibration), trials.right)
+        stated = reliability(trials.probabilities(calibration), trials.right)
     return Effect(
         threshold=calibration.threshold,
         margin=calibration.margin,
@@ -208,15 +208,15 @@ def effect_of(trials: Trials, calibration: Calibration) -> Effect:
         precision=wilson(int(passed.sum()), int(recognized.sum())),
         recall=wilson(int(passed.sum()), int(known.sum())),
         false_accept_rate=wilson(int((recognized & ~known).sum()), int((~known).sum())),
-        reliability=told,
+        reliability=stated,
     )
 
 
 class Measurement(BaseModel):
-    """What was measured in making a calibration."""
+    """The measurements made for a calibration."""
 
-    frames: int = Field(description="Frames that were asked.")
-    trials: int = Field(description="Queries: a frame is asked of the map with its place and of the map without it.")
+    frames: int = Field(description="Frames that were queried.")
+    trials: int = Field(description="Queries: each frame queries the map with its place and the map without it.")
     known: int = Field(description="Queries whose place was in the map.")
     unknown: int = Field(description="Queries whose place was not.")
     right: int = Field(description="Queries whose best match was right.")
@@ -240,10 +240,10 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
     """Fit a calibration to the trials on one map.
 
     Args:
-        trials: judged with ``base``, whose background and kind of decision value are kept, and whose terms of geometric
+        trials: judged with ``base``, whose background and kind of decision value stay, and whose terms of geometric
             evidence, which were not measured on this map.  Curve, margin and threshold are of two stages; what is
             reported of trials that were verified is of three.
-        target: what the threshold is to achieve.
+        target: the target of the threshold.
         source: recorded in the calibration.
 
     Raises:
@@ -380,7 +380,8 @@ def _check(trials: Trials, target: Target) -> None:
     area = auc_roc(trials.decision, trials.right) or 0.0
     if area < LEAST_AREA:
         raise CalibrationImpossible(
-            f"On this map right answers can hardly be told from wrong ones: the area under the ROC is {area:.2f}, "
+            "On this map right answers can hardly be distinguished from wrong ones: "
+            f"the area under the ROC is {area:.2f}, "
             f"at least {LEAST_AREA} is needed. Other places, or another encoder, may do."
         )
 

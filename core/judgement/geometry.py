@@ -1,6 +1,6 @@
-"""What geometric verification adds to a judgement: the third stage.
+"""Geometric verification in a judgement: the third stage.
 
-Verification (``core.geometry.verification``) tells of a candidate how many of its keypoints fit the query's, and how
+Verification (``core.geometry.verification``) counts the keypoints of a candidate that fit the query's, and rates how
 surprising that is, the evidence e.  The share of inliers puts the candidates into their final order,
 
     score + WEIGHT · inliers / min(keypoints of both),
@@ -37,7 +37,7 @@ tasks made of training photographs (``benchmarks.geometry.verification``)."""
 
 @dataclass(frozen=True)
 class Geometry:
-    """What verification found of the candidates of a ranking, in its order; NaN where one was not verified.
+    """The results of verification for the candidates of a ranking, in its order; NaN where one was not verified.
 
     evidence: float64 [n], at least 0.
     share: float64 [n], inliers by the number of keypoints of the picture that has fewer, in [0, 1].
@@ -58,9 +58,9 @@ class Geometry:
         """The evidence of the first candidate; None if it was not verified, or there is none."""
         return None if not len(self.evidence) or np.isnan(self.evidence[0]) else float(self.evidence[0])
 
-    def take(self, kept: NDArray[np.int64]) -> Geometry:
-        """What was found of the candidates at some positions, int64 [m]."""
-        return Geometry(self.evidence[kept], self.share[kept])
+    def take(self, positions: NDArray[np.int64]) -> Geometry:
+        """The results of the candidates at some positions, int64 [m]."""
+        return Geometry(self.evidence[positions], self.share[positions])
 
 
 class GeometryTerms(BaseModel):

@@ -5,7 +5,7 @@ of it, weighted by their odds.  Places further away that look alike are other an
 the mean is taken of points in space and projected back to the surface, and headings are directions in space, so that
 nothing jumps at ±180° or at a pole.
 
-Where verified places tell how the query's camera stands to theirs (:mod:`core.geometry.pose`), that mean is the prior
+Where verified places give the relative pose of the query's camera (:mod:`core.geometry.pose`), that mean is the prior
 of a least squares problem: the position x, the heading ψ and the logarithm of the scene's typical distance ζ are to
 agree with each place's shift s and turn t,
 
@@ -35,13 +35,13 @@ UNKNOWN_HEIGHT = 1e6
 UNKNOWN_ANGLE = float(np.pi**2 / 3)
 """Variance of an angle that nothing is known of: that of a uniform distribution over the circle, in rad²."""
 TURN = float(np.radians(20))
-"""Deviation of a query's heading from that of a place which it matches, if no view of both tells it."""
+"""Deviation of a query's heading from that of a place which it matches, if no view of both gives it."""
 PLACE_HEADING = float(np.radians(2))
 """Deviation of the errors of places' headings."""
 PLACE_POSITION = 0.05
 """Deviation of the errors of places' positions, in metres."""
 LEVEL = float(np.radians(8))
-"""Deviation of a place's pitch and roll, which poses do not tell: it tilts a shift by as much."""
+"""Deviation of a place's pitch and roll, which poses do not give: it tilts a shift by as much."""
 DISTANCE, DISTANCE_DEVIATION = float(np.log(8)), 1.0
 """Mean and deviation of the logarithm of the typical distance of a scene in metres: mostly 3 to 22 m."""
 UNUSED = 1e4
@@ -62,14 +62,14 @@ class PoseEstimate:
 
     spread: metres, the standard deviation of the distance; see :func:`estimate_pose`.
     heading_spread: degrees.  The circular standard deviation of the places' headings, None with fewer than two; or, if
-        views tell the heading, the standard deviation of its error.
+        views give the heading, the standard deviation of its error.
     places: how many places the estimate rests on.
     covariance: float64 [6, 6], of errors in x, y, z (metres) and of rotations about x, y and z (radians), as in ROS.
         The axes are those of the map's frame or, for a pose on the Earth, east, north and up at the pose.  The rotation
-        about z is counter-clockwise, also where headings are clockwise.  What is not known has a large variance.
+        about z is counter-clockwise, also where headings are clockwise.  Unknown components have a large variance.
     heading_offset, offset_spread: degrees, by which the heading differs from that of the best match, counted as
-        headings are, and its standard deviation; None if no view tells it.
-    source: what the covariance rests on: the poses of places alone, or also views with intrinsics, or without.
+        headings are, and its standard deviation; None if no view gives it.
+    source: the basis of the covariance: the poses of places alone, or also views with intrinsics, or without.
     """
 
     pose: Pose
@@ -192,13 +192,13 @@ def estimate_pose(
     rows = [place for place, row in enumerate(part) if row in seen and np.isfinite(directions[place])]
     if rows and heading is not None:
         yaw = float(np.radians(90 - heading if on_earth else heading))
-        standing = _Standing(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
-        found = _fused(found, standing, yaw, mean, axes, on_earth)
+        place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
+        found = _fused(found, place_views, yaw, mean, axes, on_earth)
     return found.without_height() if on_earth else found
 
 
 @dataclass(frozen=True)
-class _Standing:
+class _PlaceViews:
     """Positions of n places from the mean, [n, 3], headings counter-clockwise from x, [n], and the views of them."""
 
     positions: Vectors
@@ -207,17 +207,17 @@ class _Standing:
 
 
 def _fused(
-    found: PoseEstimate, standing: _Standing, yaw: float, mean: Vectors, axes: Vectors, on_earth: bool
+    found: PoseEstimate, place_views: _PlaceViews, yaw: float, mean: Vectors, axes: Vectors, on_earth: bool
 ) -> PoseEstimate:
-    """The estimate together with what views tell; as it was if all of them contradict it."""
+    """The estimate fused with the views; unchanged if all of them contradict it."""
     prior = np.zeros((5, 5))  # of x, y, z, ψ and ζ
     prior[:3, :3] = found.covariance[:3, :3]
     prior[3, 3], prior[4, 4] = found.covariance[5, 5], DISTANCE_DEVIATION**2
     begin = np.r_[np.zeros(3), yaw, DISTANCE]
     kept = [
         number
-        for number in range(len(standing.views))
-        if _contradiction(begin, prior, standing, number) < CONTRADICTION
+        for number in range(len(place_views.views))
+        if _contradiction(begin, prior, place_views, number) < CONTRADICTION
     ]
     if not kept:
         return found
@@ -226,7 +226,7 @@ def _fused(
     for _ in range(_STEPS):
         normal, gradient = information.copy(), information @ (state - begin)
         for number in kept:
-            residual, jacobian, noise = _missed(state, standing, number)
+            residual, jacobian, noise = _missed(state, place_views, number)
             weighed = jacobian.T @ np.linalg.inv(noise * len(kept))
             normal, gradient = normal + weighed @ jacobian, gradient + weighed @ residual
         state = state - np.linalg.solve(normal, gradient)
@@ -239,7 +239,7 @@ def _fused(
         pose = _geographic(position, (90 - degrees) % 360)
     else:
         pose = Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
-    sources = {standing.views[number].source for number in kept}
+    sources = {place_views.views[number].source for number in kept}
     return replace(
         found,
         pose=pose,
@@ -250,9 +250,9 @@ def _fused(
     )
 
 
-def _missed(state: Vectors, standing: _Standing, number: int) -> tuple[Vectors, Vectors, Vectors]:
+def _missed(state: Vectors, place_views: _PlaceViews, number: int) -> tuple[Vectors, Vectors, Vectors]:
     """By how much a state misses a view's shift and turn, [4], the derivatives, [4, 5], and the covariance, [4, 4]."""
-    position, angle, view = standing.positions[number], standing.directions[number], standing.views[number]
+    position, angle, view = place_views.positions[number], place_views.directions[number], place_views.views[number]
     cos, sin, nearness = np.cos(angle), np.sin(angle), np.exp(-state[4])
     back = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # W^T
     shift = back @ (state[:3] - position) * nearness
@@ -269,9 +269,9 @@ def _missed(state: Vectors, standing: _Standing, number: int) -> tuple[Vectors, 
     return np.r_[shift - view.shift, turn], jacobian, noise
 
 
-def _contradiction(state: Vectors, prior: Vectors, standing: _Standing, number: int) -> float:
+def _contradiction(state: Vectors, prior: Vectors, place_views: _PlaceViews, number: int) -> float:
     """The squared Mahalanobis distance of a view from what a state with a prior lets expect."""
-    residual, jacobian, noise = _missed(state, standing, number)
+    residual, jacobian, noise = _missed(state, place_views, number)
     return float(residual @ np.linalg.solve(jacobian @ prior @ jacobian.T + noise, residual))
 
 

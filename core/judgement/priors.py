@@ -122,7 +122,7 @@ class Facing:
         return np.minimum(apart, np.float32(360) - apart)
 
     def holds(self, places: Whereabouts) -> Flags:
-        return self._apart(places) <= np.float32(self.tolerance + 1e-4)  # headings are kept as float32
+        return self._apart(places) <= np.float32(self.tolerance + 1e-4)  # headings are stored as float32
 
     def fit(self, places: Whereabouts) -> Values:
         apart = np.nan_to_num(self._apart(places).astype(np.float64), nan=np.inf)

@@ -27,7 +27,7 @@ class Share(BaseModel):
 
 
 class Bin(BaseModel):
-    """Answers whose probability lies between ``low`` and ``high``: what was promised, and what came of it."""
+    """Answers whose probability lies between ``low`` and ``high``: the promised share, and the outcome."""
 
     low: float
     high: float
@@ -36,7 +36,7 @@ class Bin(BaseModel):
 
 
 class Reliability(BaseModel):
-    """What stated probabilities are worth, over n answers whose truth is known."""
+    """The reliability of stated probabilities over n answers whose truth is known."""
 
     answers: int
     right: int

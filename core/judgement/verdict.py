@@ -50,17 +50,18 @@ Likeness = Callable[[Positions], NDArray[np.float32]]
 """Returns what the best match scores, as if it were the query, at positions in a ranking; int64 [k] to float32 [k]."""
 
 ALIKE = 2.5
-"""A place shows the same as the best match if its score against it has a decision value of so many thresholds.  On
-corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no share of the verdicts by more than 0.05."""
+"""A place shows the same as the best match if the decision value of its score against it is this multiple of the
+threshold.  On corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no share of the verdicts by more
+than 0.05."""
 
 MOST_RIVALS = 8
-"""So many rivals, each with its neighbours, are looked at; they are the best ones."""
+"""The largest number of rivals, the best ones, that are examined, each with its neighbours."""
 
 MOSTLY_IMAGINED = 0.5
-"""A map of which more of the background than this is imagined has few places."""
+"""Imagined share of the background above which a map counts as one of few places."""
 
 DOUBT = (0.1, 0.5)
-"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, asked of the whole other
+"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, queried in the whole other
 traverse, two stages leave 0.27 and 0.23 there."""
 
 
@@ -69,8 +70,8 @@ class Calibration(BaseModel):
 
     ``threshold`` is on the decision value, ``margin`` on the difference of
     two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
-    frames, in units of the score.  ``curve`` tells how probable a decision value is right; a calibration on
-    frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
+    frames, in units of the score.  ``curve`` gives the probability that a decision value is right; a calibration on
+    frames that are all alike has none.  ``decision`` names the kind of decision value.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map does
     not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
     ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes the
@@ -135,8 +136,8 @@ class Judgement:
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
-    rivals: what makes the query ambiguous; empty for other verdicts.
-    evidence: what verification found of the best match, -ln of the number of false alarms; None if it was not verified.
+    rivals: the places that make the query ambiguous; empty for other verdicts.
+    evidence: of verification for the best match, -ln of the number of false alarms; None if it was not verified.
     """
 
     verdict: Verdict
@@ -210,7 +211,7 @@ def stands_out(decision: float, calibration: Calibration, imagined: float = 0.0,
 def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
     """Whether ``verify=auto`` verifies candidates after this judgement, because it leaves doubt.
 
-    It is asked after two stages, and again after their best match alone was verified, whose evidence may settle it.  In
+    It is called after two stages, and again after only their best match was verified: its evidence may settle it.  In
     a map of a few places two stages always leave doubt.
 
     Args:
@@ -249,7 +250,7 @@ def judge(
             0: it has no second stage.
         likeness: compares the best match with its rivals; it is called at most once, and only where rivals matter.
             None: which rivals show the same place is not known, and they explain nothing.
-        geometry: what verification found of the n places, in the same order; None: none was verified.
+        geometry: the results of verification for the n places, in the same order; None: none was verified.
 
     Returns:
         ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
@@ -285,7 +286,7 @@ class _Ranking:
     others: int64 [m], positions of the other places, of frames of one view only the first.
     compared: int64 [k], those of them whose scores are compared with the best, one for each station.
     apart: bool [n], the places that cannot overlap with the best match.
-    geometry: what verification found of the n places; None if none was verified.
+    geometry: the results of verification for the n places; None if none was verified.
     """
 
     scores: NDArray[np.float32]

@@ -27,7 +27,7 @@ def packed_products(query: Array, scales: Array, uppers: NDArray[np.uint8], lowe
         lowers: uint8 [n, 32·b], likewise.
     """
     blocks = query.reshape(-1, _FOURS, 4)
-    # What the subtracted 32 contributes is the same for every descriptor, except for the scales.
+    # The contribution of the subtracted 32 is the same for every descriptor, except for the scales.
     offsets = np.float32(32) * blocks.sum(axis=(1, 2), dtype=np.float32)
     made = np.empty(len(scales), np.float32)
     _products(np.ascontiguousarray(blocks.transpose(0, 2, 1)), offsets, scales, uppers, lowers, made)

@@ -18,8 +18,8 @@ def best_path(columns, gains, free, others, ordinary, uneven, begins):  # type: 
         gains: float64 [Q, K].
         free: bool [Q].
         others: the number of columns.
-        ordinary: what a pair that is not listed loses.
-        uneven: float64 [S + 1], what a step by 0 to S columns costs.
+        ordinary: the loss of a pair that is not listed.
+        uneven: float64 [S + 1], the cost of a step by 0 to S columns.
         begins: the step of a path's first pair, below 0.
 
     Returns:

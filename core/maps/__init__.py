@@ -1,4 +1,4 @@
-"""What a map is, whatever stores it: its records, what a caller knows of a place, and what is asked of a store."""
+"""Maps, whatever stores them: their records, a caller's knowledge of a place, and the interfaces of a store."""
 
 from core.maps.counterparts import Correspondence
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
@@ -7,9 +7,9 @@ from core.maps.records import (
     Enrolment,
     History,
     Keep,
-    KeptFrame,
     MapRecord,
     MapSettings,
+    PicturedPlace,
     Precision,
     ReviewSetting,
     SameFrame,
@@ -30,10 +30,10 @@ __all__ = [
     "History",
     "IndexStatus",
     "Keep",
-    "KeptFrame",
     "Map",
     "MapRecord",
     "MapSettings",
+    "PicturedPlace",
     "PlaceFilter",
     "Precision",
     "Ranking",

@@ -22,13 +22,13 @@ class CameraRecord(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Camera
-    mask: Mask | None = Field(description="What to ignore in its frames; null: nothing.")
+    mask: Mask | None = Field(description="The areas to ignore in its frames; null: none.")
     intrinsics: Intrinsics | None = Field(default=None, description="Of its upright frames; null: not known.")
     updated_at: Timestamp
 
 
 class KnownCameras(ABC):
-    """The cameras of a map, to be asked about one."""
+    """The cameras of a map by name."""
 
     @abstractmethod
     def known(self, name: str) -> CameraRecord | None:
@@ -45,7 +45,7 @@ class KnownCameras(ABC):
         return found
 
     def mask(self, name: str | None) -> Mask | None:
-        """What to ignore in a frame of a camera; None without a name.
+        """The mask of a camera, the parts of its frames to ignore; None without a name.
 
         Raises:
             UnknownCamera: the map has none of this name.
@@ -62,7 +62,7 @@ class KnownCameras(ABC):
 
 
 class ReadCameras(KnownCameras):
-    """Cameras that were read, to be asked about without waiting.
+    """Cameras that are in memory, so that looking one up does not wait.
 
     Args:
         cameras: all of one map.

@@ -12,7 +12,7 @@ from core.places import NO_SEQUENCE, Place, Pose
 
 @dataclass(frozen=True)
 class Correspondence:
-    """What changes in a map with what an alignment found; everything is named by its row.
+    """The changes of a map that follow from an alignment; places are given by their rows.
 
     stations: the new track and station of places (``Whereabouts``).
     poses: for places that get a pose, the place whose pose it is; None for those that lose the pose that they got.
@@ -51,7 +51,7 @@ StoredT = TypeVar("StoredT", bound=Stored)
 def changes_by(
     change: Correspondence, found: Mapping[int, StoredT]
 ) -> Iterator[tuple[StoredT, int | None, int | None, Pose | None, str | None]]:
-    """What an alignment changes of stored places; rows whose place is gone are left out.
+    """The changes of stored places that follow from an alignment; rows without a place are left out.
 
     Args:
         found: the places of ``change.rows`` and ``change.givers`` by row.
@@ -88,7 +88,7 @@ class Counterparts(Protocol):
     def copy(self, other: Any, names: Mapping[str, str]) -> None:
         """Bring places that were copied from another map to the stations that they have there, in one write.
 
-        A station is told by the nearest frame of its track that both maps have.  If they have none, as where the
+        A station is derived from the nearest frame of its track that both maps have.  If they have none, as where the
         sequence is gone, the places on the track come to a new one, which no sequence has.
 
         Args:
@@ -116,7 +116,7 @@ class Standing:
 def brought_over(
     there: Mapping[str, Standing], here: Mapping[str, Standing], names: Mapping[str, str], new_track: Callable[[], int]
 ) -> Iterator[tuple[str, int | None, int | None, str | None]]:
-    """What changes for copied places so that they stand as in the map that they come from (``Counterparts.copy``).
+    """The changes that bring copied places to the stations of the map that they come from (``Counterparts.copy``).
 
     Args:
         there, here: the places of the other map and of this one, by id, in the order of their enrolment.

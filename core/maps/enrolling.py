@@ -1,4 +1,4 @@
-"""What every store asks of a frame before it is enrolled, and what it keeps of it."""
+"""The checks of every store before a frame is enrolled, and the picture of it that is stored."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
 
 
 def picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
-    """What is kept of a frame, and its bytes."""
+    """The kind of picture that is stored of a frame, and its bytes."""
     if keep == "image" and item.image is not None:
         return keep, item.image
     if keep != "none" and item.thumbnail is not None:

@@ -1,4 +1,4 @@
-"""Pages of listings, and the opaque cursors by which the next page is asked for.
+"""Pages of listings, and the opaque cursors by which the next page is requested.
 
 A cursor names its listing and the last entry of the page, so that entries that come or go between two requests shift
 nothing.
@@ -87,7 +87,7 @@ def _text_of(wanted: PlaceFilter) -> str | None:
 
 
 def one_more(limit: int) -> int:
-    """An entry more than the page has tells whether there is a next page."""
+    """One entry more than a page has, to see whether there is a next page."""
     if limit < 1:
         raise ValueError("a page has at least one entry")
     return limit + 1

@@ -23,7 +23,7 @@ Precision = Literal["half", "compressed"]
 TierSetting = Literal["auto", "exact", "compact"]
 
 COMPACT_FROM = 256
-"""From so many places on codes are used; with fewer all are compared in less than a millisecond."""
+"""From this number of places on codes are used; with fewer all are compared in less than a millisecond."""
 
 
 class ReviewSetting(BaseModel):
@@ -32,7 +32,7 @@ class ReviewSetting(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     verdicts: Annotated[tuple[Verdict, ...], Field(min_length=1, max_length=3)] = Field(
-        default=("ambiguous", "unknown"), description="Frames that are answered with one of these are kept."
+        default=("ambiguous", "unknown"), description="Frames that are answered with one of these are stored."
     )
     most_frames: int = Field(strict=True, default=500, ge=1, le=10_000, description="Most frames; the oldest go first.")
     most_bytes: int = Field(
@@ -44,34 +44,34 @@ class ReviewSetting(BaseModel):
     )
 
     def allows(self, count: int, size: int) -> bool:
-        """Whether so many frames of so many bytes together may be kept."""
+        """Whether ``count`` frames of ``size`` bytes together may be stored."""
         return count <= self.most_frames and size <= self.most_bytes
 
 
 class MapSettings(BaseModel):
-    """What the owner of a map may choose, when it is made and later."""
+    """The settings of a map that its owner may choose, when it is made and later."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     description: str = Field(default="", max_length=2000)
     keep: Keep = Field(
         default="thumbnail",
-        description="What is kept of each frame. A change applies to frames enrolled from then on.",
+        description="The picture that is stored of each frame. A change applies to frames enrolled from then on.",
     )
     same_place_radius: float = Field(
         strict=True,
         default=5.0,
         ge=0,
         allow_inf_nan=False,
-        description="Places within so many metres are the same place.",
+        description="Places within this distance in metres are the same place.",
     )
     same_place_frames: Annotated[int, Field(strict=True, ge=0, le=2**31)] = Field(
-        default=3, description="Without poses: places so many frames apart in their sequence are the same place."
+        default=3, description="Without poses: places this many frames apart in their sequence are the same place."
     )
     verification: bool = Field(
         default=True,
         strict=True,
-        description="Whether keypoints are kept of each frame, by which answers are verified. A change applies to "
+        description="Whether keypoints of each frame are stored, by which answers are verified. A change applies to "
         "frames enrolled from then on.",
     )
     index: TierSetting = Field(
@@ -80,19 +80,19 @@ class MapSettings(BaseModel):
         f"what suits its size (auto): compact from {COMPACT_FROM} places.",
     )
     review: ReviewSetting | None = Field(
-        default=None, description="Which frames are kept to be reviewed by people; null: none."
+        default=None, description="Which frames are stored to be reviewed by people; null: none."
     )
 
 
 class MapRecord(MapSettings):
-    """A map as it is listed: its settings, what it is bound to, and its history in brief."""
+    """A map as it is listed: its settings, its encoder, and its history in brief."""
 
     id: str
     encoder: str = Field(description="Identity of the one encoder whose descriptors the map holds.")
     dimension: int = Field(gt=0, description="Values of one descriptor.")
     local_cells: int = Field(default=0, ge=0, description="Local descriptors of one frame; 0: there are none.")
     local_values: int = Field(default=0, ge=0, description="Values of one local descriptor.")
-    precision: Precision = Field(description="How its descriptors are kept; chosen when it is made.")
+    precision: Precision = Field(description="How its descriptors are stored; chosen when it is made.")
     calibration: Calibration | None = Field(default=None, description="The map's own; none: that of its encoder.")
     revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
     created_at: Timestamp
@@ -151,12 +151,12 @@ class SameFrame:
 
 
 @dataclass(frozen=True)
-class KeptFrame:
-    """A place whose frame is kept, from which its keypoints can be found.
+class PicturedPlace:
+    """A place with a stored picture, from which its keypoints can be computed.
 
     number: grows in the order of enrolment.
     digest: SHA-256 of its image and of its camera's mask, 32 bytes.
-    picture: what is kept; keypoints found in a thumbnail are those of a smaller picture, as their width and height say.
+    picture: the kind that is stored; keypoints of a thumbnail are those of a smaller picture, as their size says.
     """
 
     number: int
@@ -168,9 +168,9 @@ class KeptFrame:
 
 @dataclass(frozen=True)
 class History:
-    """What is copied of a place from another map besides its frame and fields.
+    """The state of a place that is copied from another map besides its frame and fields.
 
-    picture: what is kept of its frame.
+    picture: the kind of its stored picture.
     ordinal: its position in its sequence in the new map; None puts it at the end.
     behind: frames that are enrolled into its sequence later are at this position or behind it; this keeps the positions
         before it for frames that are copied later.
@@ -190,7 +190,7 @@ class Outline:
     number: grows in the order of enrolment.
     row: of its descriptor.
     digest: SHA-256 of its image, 32 bytes.
-    picture: what is kept of its frame.
+    picture: the kind of its stored picture.
     ordinal: its position in its sequence.
     """
 
@@ -218,7 +218,7 @@ class Outline:
 
 
 class VerifyReport(BaseModel):
-    """What a full reading of a map found."""
+    """The result of a full reading of a map."""
 
     ok: bool = Field(description="Nothing of the map is damaged; a cache may still have to be rebuilt.")
     places: int = Field(ge=0)

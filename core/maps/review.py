@@ -1,4 +1,4 @@
-"""Frames that a map was told to keep because its answers were doubtful, and what people say that they show."""
+"""Frames that a map stores because its answers were doubtful, and people's labels of them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from core.maps.records import ReviewSetting
 
 @dataclass(frozen=True)
 class ReviewFrame:
-    """A kept frame, without its picture.
+    """A frame stored for review, without its picture.
 
     number: counts the frames of the map; a later frame has a larger number.
-    at: when it was asked, UTC.
+    at: the time of the query, UTC.
     digest: the SHA-256 of the file, 32 bytes.
     size: of the file, in bytes.
     answer: how the map answered it; a JSON object.
-    label: what it shows, and who said so and when; a JSON object.  None: nobody has said it.
+    label: the place that it shows, who said so, and when; a JSON object.  None: it has no label.
     """
 
     number: int
@@ -33,10 +33,10 @@ class ReviewFrame:
 
 @dataclass(frozen=True)
 class ReviewPage:
-    """Some kept frames, and what there was in all at that moment.
+    """Some stored frames, and the number and bytes of all at that moment.
 
     frames: newest first.
-    count, size: how many frames are kept in all, and their bytes.
+    count, size: how many frames are stored in all, and their bytes.
     """
 
     frames: list[ReviewFrame]
@@ -45,20 +45,21 @@ class ReviewPage:
 
 
 class Review(Protocol):
-    """The kept frames of one map.  Any thread may use it; every method may raise StorageFull and StorageFailure."""
+    """The frames of one map stored for review.  Any thread may use it; every method may raise StorageFull
+    and StorageFailure."""
 
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
         """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
 
         Returns:
-            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
+            Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.
         """
 
     def shrink(self, setting: ReviewSetting) -> None:
         """Drop the oldest frames beyond new limits, and give back the room."""
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
-        """The latest frames, newest first, and how many are kept in all, as of one moment.
+        """The latest frames, newest first, and how many are stored in all, as of one moment.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -72,42 +73,42 @@ class Review(Protocol):
         """One frame.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
 
     def picture(self, number: int) -> bytes:
         """The file of a frame.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
             StorageFailure: it is damaged.
         """
 
     def held(self, number: int) -> AbstractContextManager[None]:
-        """Have a frame, if it is kept, not dropped for newer ones until the block ends; one at a time may hold it.
+        """Protect a frame, if it is stored, from being dropped for newer ones until the block ends; one at a time.
 
         This waits for nothing.
         """
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Say what a frame shows, in place of what was said before.
+        """Label a frame; the label replaces an earlier one.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
 
     def discard(self, number: int) -> None:
         """Throw a frame away.
 
         Raises:
-            UnknownFrame: it is not kept.
+            UnknownFrame: it is not stored.
         """
 
 
 def frames_to_drop(
     frames: Iterable[tuple[int, int]], count: int, size: int, setting: ReviewSetting, held: Container[int]
 ) -> list[int]:
-    """The numbers of the frames that go until the limits are kept; those that are held stay.
+    """The numbers of the frames to drop so that the limits hold; held ones stay.
 
     Args:
         frames: number and size of each, in the order in which they go: without a label first, then the oldest.

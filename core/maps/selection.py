@@ -1,4 +1,4 @@
-"""What a caller knows of the place that a query shows: filters and priors.  A store says which places they leave."""
+"""A caller's knowledge of the place that a query shows: filters and priors.  A store says which places they leave."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class RecentFrames:
     """The robot's own last frames, which a query leaves out.
 
     sequence: the sequence to which the robot adds its frames.
-    frames: so many of the last places of the sequence are left out.
+    frames: the number of last places of the sequence that are left out.
     moment: the time of the query, microseconds since 1970 UTC.
-    seconds: places of the sequence less than so many seconds from ``moment`` are left out.
+    seconds: places of the sequence less than this time from ``moment`` are left out.
     """
 
     sequence: str
@@ -47,7 +47,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is known of the place that a query shows.
+    """The known facts about the place that a query shows.
 
     filters: conditions that have to hold; other places are not searched.
     prior: conditions that hold with the probability ``trust``; other places lose odds.

@@ -1,4 +1,4 @@
-"""What a map reports of itself: how it is searched, and what it takes."""
+"""The status of a map: how it is searched, and its size on disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from core.maps.records import TierSetting
 Tier = Literal["exact", "compact"]
 
 Progress = Callable[[int, int], None]
-"""Is called with the rows done and all rows; what it raises ends the work."""
+"""Called with the number of rows done and of all; its exceptions end the work."""
 
 
 def no_progress(done: int, total: int) -> None:
@@ -38,7 +38,7 @@ class IndexStatus(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    setting: TierSetting = Field(description="What its owner chose.")
+    setting: TierSetting = Field(description="The setting that its owner chose.")
     tier: Tier = Field(description="exact: every place compared; compact: codes first.")
     wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
     state: Literal["ready", "building", "unopened"] = Field(
@@ -59,19 +59,19 @@ class KeypointsStatus(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     places: int = Field(ge=0, description="How many places have keypoints.")
-    bytes: int = Field(ge=0, description="What they take in map.sqlite.")
+    bytes: int = Field(ge=0, description="Their size in map.sqlite.")
 
 
 class StorageStatus(BaseModel):
-    """What a map takes on disk."""
+    """The size of a map on disk."""
 
     model_config = ConfigDict(frozen=True)
 
-    precision: str = Field(description="How descriptors are kept.")
+    precision: str = Field(description="How descriptors are stored.")
     bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
     descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
     index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
     database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata, pictures, keypoints.")
     keypoints: KeypointsStatus | None = Field(
-        description="Of how many places keypoints are kept; null until the map is first used after a start."
+        description="The number of places with stored keypoints; null until the map is first used after a start."
     )

@@ -1,7 +1,7 @@
-"""What is asked of a store of maps, of one of its maps, and of that map at one moment.
+"""The interfaces of a store of maps, of one of its maps, and of that map at one moment.
 
 These are interfaces; :mod:`core.storage` implements them in a data directory.  Recognition knows nothing else of where
-maps are kept, and ``docs/explanation/stores.md`` says why the interfaces are as they are.
+maps are stored, and ``docs/explanation/stores.md`` says why the interfaces are as they are.
 
 Whatever stores it, a descriptor stands in a *row* of its map: a number that is given to one frame of one place and is
 never used again.  A search returns rows.
@@ -25,9 +25,9 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
     MapSettings,
+    PicturedPlace,
     Precision,
     SameFrame,
     SequenceSummary,
@@ -42,7 +42,7 @@ from core.places import Neighborhood, Place, PlaceFields, Whereabouts
 Rows = NDArray[np.int64]
 
 HANDED_OVER, HAS_PICTURE = 1, 2
-"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is kept."""
+"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is stored."""
 
 Ranking = tuple[Rows, NDArray[np.float32]]
 """Rows, best first, and their inner products."""
@@ -57,7 +57,7 @@ def merged(a: Ranking, b: Ranking) -> Ranking:
 
 
 class Scope(Protocol):
-    """The places that a query may find, at one moment, and what speaks for them before the frame is compared."""
+    """The places that a query may find, at one moment, and their prior before the frame is compared."""
 
     @property
     def snapshot(self) -> Snapshot:
@@ -81,7 +81,7 @@ class Scope(Protocol):
 
         Args:
             descriptor: of the query, float32 [D].
-            ranking: what :meth:`search` returned for it.
+            ranking: the result of :meth:`search` for it.
             neighborhood: which places are the same place; None: also the best places that are, unless the ranking has
                 them.
 
@@ -111,14 +111,14 @@ class Snapshot(Protocol):
         """The descriptors of rows: float32 [k, D].
 
         Raises:
-            UnknownPlace: the place of a row was deleted since, and what was stored of it as well.
+            UnknownPlace: the place of a row was deleted since, together with its data.
         """
 
     def locals_at(self, rows: Rows) -> NDArray[np.int8]:
         """The local descriptors of rows: int8 [k, C, L].
 
         Raises:
-            UnknownPlace: the place of a row was deleted since, and what was stored of it as well.
+            UnknownPlace: the place of a row was deleted since, together with its data.
         """
 
     # For work on all places of a map, such as its calibration; a query needs none of these.
@@ -169,7 +169,7 @@ class Plan(Protocol):
         place has one.
 
         Args:
-            step: about every so many places are listed.
+            step: about one place in every ``step`` is listed.
         """
 
 
@@ -198,7 +198,7 @@ class Map(Protocol):
 
     @property
     def review(self) -> Review:
-        """The frames that are kept to be reviewed."""
+        """The frames that are stored to be reviewed."""
 
     @property
     def plan(self) -> Plan:
@@ -235,7 +235,7 @@ class Map(Protocol):
         """The places of rows that a search returned; None where a place was deleted or got another frame since."""
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
-        """The keypoints of those places; None also where none are kept."""
+        """The keypoints of those places; None also where none are stored."""
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
@@ -281,7 +281,7 @@ class Map(Protocol):
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
         """Those of the names that no sequence has."""
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
 
         Args:
@@ -290,10 +290,10 @@ class Map(Protocol):
         """
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
 
         Raises:
-            StorageFailure: the picture is damaged.
+            StorageFailure: the picture is missing or damaged.
         """
 
     def thumbnail(self, place_id: str) -> bytes:
@@ -302,20 +302,20 @@ class Map(Protocol):
         Raises:
             UnknownPlace: there is no such place.
             NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
-            StorageFailure: the picture is damaged.
+            StorageFailure: the picture is missing or damaged.
             MemoryError: its pixels do not fit into memory.
         """
 
-    # How it is kept
+    # How it is stored
 
     def index_status(self) -> IndexStatus:
         """How the map is searched; this does not wait."""
 
     def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
-        """Build what makes searches fast again from the descriptors; searches use the present one meanwhile.
+        """Build the index again from the descriptors; searches use the present one meanwhile.
 
         Args:
-            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+            progress: called with the number of rows that are done and of all; if it raises, nothing changes.
         """
 
     def storage_status(self) -> StorageStatus:
@@ -358,7 +358,7 @@ class Map(Protocol):
             UnknownPlace, InvalidField.
         """
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that :meth:`without_keypoints` listed, in one write.
 
         A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
@@ -437,10 +437,10 @@ class Store(Protocol):
 
         Args:
             map_id: of the new map; it may differ from that in the file.
-            advance: is called with the number of places done and of all; what it raises ends the work.
+            advance: called with the number of places done and of all; its exceptions end the work.
             check_picture: raises InvalidImage for bytes that must not be shown as a picture.
             most_picture_bytes: a larger picture is refused before it is read.
-            before_listing: is called when the map is complete; what it raises ends the work.
+            before_listing: called when the map is complete; its exceptions end the work.
 
         Raises:
             InvalidArchive: the file is damaged, or its content is not valid for a map.
@@ -470,7 +470,7 @@ class Store(Protocol):
     def abandoned(self) -> list[str]:
         """The ids of the unlisted maps that nobody builds unless a job of this service does.
 
-        None of a store that several services use, which removes by itself what nobody has built on for long.
+        None of a store that several services use, which removes abandoned maps by itself.
         """
 
     def publish(self, map_id: str) -> Map:

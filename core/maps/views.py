@@ -9,7 +9,7 @@ is there again.
 Poses decide before looks do: a frame whose pose is far from that of the first frame of a view does not show this view,
 however alike the two are.  So equal doors of a long corridor are several views.
 
-How alike two frames are is told by the cells of the second stage at the same spots of both: freed of what all cells of
+Cells of the second stage at the same spots of two frames give their similarity: freed of what all cells of
 their frame have in common, the mean of their cosines.  Noise, compression and exposure change it hardly, a step of the
 robot does at once.  Somebody who passes changes some of the cells and leaves the others as they were, so that two
 frames show nearly the same, too, if many of their cells do.  Encoders without a second stage have descriptors only,
@@ -45,12 +45,12 @@ consecutive frames of corridor have 0.73 at most."""
 
 
 MOST_HIDDEN = 8
-"""A view may be hidden for so many positions at most, and for no more than a map's ``same_place_frames``."""
+"""A view may be hidden for this number of positions at most, and for no more than a map's ``same_place_frames``."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What one frame shows, and where: its descriptor, float32 [D], local descriptors, int8 [C, L], and pose."""
+    """One frame's content and where it was taken: descriptor, float32 [D], local descriptors, int8 [C, L], and pose."""
 
     descriptor: NDArray[np.float32]
     local: NDArray[np.int8]
@@ -58,7 +58,7 @@ class Look:
 
 
 def reach_of(radius: float) -> float:
-    """So many metres may a further look at a view be from the first one, in a map with a ``same_place_radius``."""
+    """The largest distance in metres from a view's first look, in a map with a ``same_place_radius``."""
     return SAME_VIEW * radius
 
 
@@ -114,10 +114,10 @@ class LatestViews:
     """The end of a sequence: its last frame, and the first frame of each of its last positions.
 
     Args:
-        last: the position of the last frame, and what it shows; None: the sequence has no frames.
-        first: what the first frame at each of the last positions shows.
-        positions: so many positions may lie between two frames of one view.
-        reach: so many metres may lie between the poses of a frame and of the first frame of its view.
+        last: the position and the look of the last frame; None: the sequence has no frames.
+        first: the look of the first frame at each of the last positions.
+        positions: the number of positions that may lie between two frames of one view.
+        reach: the distance in metres that may lie between the poses of a frame and of the first frame of its view.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ def latest_views(
         last: position and row of the last frame; None: the sequence has no frames.
         first: the row of the first frame at each of the last positions.
         positions, reach: as of :class:`LatestViews`.
-        looks: reads what the frames in some rows show.
+        looks: reads the looks of the frames in some rows.
     """
     if last is None:
         return LatestViews(None, {}, positions, reach)
@@ -176,7 +176,7 @@ def leaves_view(pose: Pose | None, look: Look | None, first: Look, beside: Seque
 
     Args:
         pose: its pose now.
-        look: what it shows now; None: its picture stays.
+        look: its new look; None: its picture stays.
         first: the first frame there, which is before this one.
         beside: the last frame before it there that has got another picture since this one had its last, and the frames
             next before and after it there; empty if there is no such frame.

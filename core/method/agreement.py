@@ -9,9 +9,9 @@ corresponding cells, C cells in all, a candidate's score grows by
     share · 1/C Σ c²,
 
 which :func:`agreement` computes for many candidates at once with a compiled loop.  More places than can be compared so
-may be screened first: :func:`promise` tells from a sample of their cells which are worth it.
+may be screened first: :func:`promise` selects these from a sample of their cells.
 
-What all cells of a frame have in common, as its light and weather, may be taken from them before they are compared
+The common part of all cells of a frame, as its light and weather, may be taken from them before they are compared
 (:func:`standardized`).
 """
 
@@ -42,7 +42,7 @@ differ within a frame do not become its largest."""
 class AgreementDefinition(BaseModel):
     """The second stage of an encoder.
 
-    ``layers`` share one grid; ``values`` of each are kept, and its cosine counts by its ``weights``.
+    ``layers`` share one grid; ``values`` of each are retained, and its cosine counts by its ``weights``.
     ``reach`` is how far a cell may have moved, in rows and columns.  ``candidates`` are examined; the mean squared
     cosine over all cells makes up ``share`` of their score, the first stage's score the rest.  They are the first of
     the ranking or, if more places are ``screened``, the most promising of these.  ``centred`` is the share of its mean
@@ -152,7 +152,7 @@ def correspondences(query: Cells, reference: Cells, columns: int, reach: tuple[i
 
 
 def agreement(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> Array:
-    """What each candidate's score gains: ``share`` times the mean over all cells of the squared cosines.
+    """The gain of each candidate's score: ``share`` times the mean over all cells of the squared cosines.
 
     Args:
         query: int8 [C, L].
@@ -165,8 +165,8 @@ def agreement(query: Cells, candidates: Cells, columns: int, definition: Agreeme
     Raises:
         ValueError: the query's cells and the candidates' have different shapes, or do not fill such a grid.
     """
-    asked, shown = _comparable(query, candidates, columns)
-    sums: Array = squared_sums(asked, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))
+    queried, shown = _comparable(query, candidates, columns)
+    sums: Array = squared_sums(queried, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))
     return sums * np.float32(definition.share / len(query))
 
 
@@ -187,8 +187,8 @@ def promise(query: Cells, candidates: Cells, columns: int, definition: Agreement
     Raises:
         ValueError: the query's cells and the candidates' have different shapes, or do not fill such a grid.
     """
-    asked, shown = _comparable(query, candidates, columns)
-    means: Array = sampled_squares(asked, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))
+    queried, shown = _comparable(query, candidates, columns)
+    means: Array = sampled_squares(queried, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))
     return means * np.float32(definition.share)
 
 
@@ -198,5 +198,5 @@ def _comparable(query: Cells, candidates: Cells, columns: int) -> tuple[Cells, C
     if query.shape != candidates.shape[1:] or len(query) % columns:
         shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
         raise ValueError(f"cells of {shapes} in {columns} columns cannot be compared")
-    asked, shown = (np.require(cells, np.int8, ["C", "W"]) for cells in (query, candidates))
-    return asked, shown
+    queried, shown = (np.require(cells, np.int8, ["C", "W"]) for cells in (query, candidates))
+    return queried, shown

@@ -296,7 +296,7 @@ class EncoderCatalogue:
             return files[name]
         raise UnknownEncoder(
             f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
-            "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."
+            "changed. Re-encode the map from its stored images, or enrol its traverses again into a new map."
         )
 
     def get(self, name_or_identity: str) -> Encoder:

@@ -166,7 +166,7 @@ class Encoder:
         return promise(query, candidates, self.grid[1], stage)
 
     def agreement(self, query: Cells, candidates: Cells) -> Array:
-        """What the second stage adds to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
+        """The gain of the candidates' scores by the second stage; int8 [C, L] and [k, C, L] to float32 [k]."""
         stage = self.definition.agreement
         if stage is None:
             return np.zeros(len(candidates), np.float32)
@@ -261,7 +261,7 @@ class Encoder:
 
         Raises:
             InvalidModel: this machine lacks the precision or the device.
-            GoldenMismatch: a lower precision was asked for, and it changes the descriptors too much.
+            GoldenMismatch: a lower precision was requested, and it changes the descriptors too much.
         """
         self.extractor.compute("float32", device)
         lower = self._lower_precision(device) if precision == "auto" else precision

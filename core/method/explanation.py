@@ -95,7 +95,7 @@ def _cells(encoder: Encoder, a: Cells, b: Cells) -> Correspondences:
 
 
 def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
-    """What the score would lose without each region of ``frame``; float32 [T]."""
+    """The loss of the score without each region of ``frame``; float32 [T]."""
     if frame.regions is None:
         return None
     features, centers, definition = frame.regions.features, encoder.centers, encoder.definition
@@ -123,7 +123,7 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
 
 
 def _whitened_losses(encoder: Encoder, whitening: Whitening, frame: Shown, other: Shown) -> Array:
-    """What the inner product would lose without each region of a frame that has regions; float32 [T]."""
+    """The loss of the inner product without each region of a frame that has regions; float32 [T]."""
     assert frame.regions is not None
     features, definition = frame.regions.features, encoder.definition
     without = [

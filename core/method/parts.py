@@ -14,7 +14,7 @@ import numpy as np
 from core.method.regions import Activations, Regions
 
 SMALLEST = 1e-6
-"""What the generalized mean takes for values below it, as in its published form."""
+"""The least value of the generalized mean: smaller ones are raised to it, as in its published form."""
 
 
 def cells(layers: Sequence[Activations], count: int) -> Regions:

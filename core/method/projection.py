@@ -2,7 +2,7 @@
 
 This is Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
 The differences between a cell's feature and that of the same cell under other conditions show which directions do not
-matter.  Features are whitened by the covariance of these differences, and the directions of largest variance are kept.
+matter.  Features are whitened by the covariance of these differences, and the directions of largest variance stay.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def pool_features(
     Args:
         frames: for each frame its regional features, float32 [T_i, K]; T_i may be 0.
         seed: of the draw.
-        per_frame: at most this many features of a frame are kept.
+        per_frame: the largest number of features taken from a frame.
 
     Returns:
         float32 [T, K].

@@ -34,7 +34,7 @@ def open_store(
     They are connected to when they are first used, and again after an outage.
 
     Raises:
-        MissingExtra: what speaks to them is not installed.
+        MissingExtra: their clients are not installed.
     """
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what it would write beside the log is in the errors
     try:

@@ -44,13 +44,13 @@ _PATIENCE_SECONDS = 10.0
 _CONNECTING_SECONDS = 3.0
 _PROBING_SECONDS = 1.0
 _SEARCH = "Milvus's search"
-# A Milvus that was gone is asked again within two seconds; by default gRPC would wait for up to two minutes.
+# A Milvus that was gone is called again within two seconds; by default gRPC would wait for up to two minutes.
 _AGAIN_SOON = {"grpc.initial_reconnect_backoff_ms": 200, "grpc.max_reconnect_backoff_ms": 2000}
 
 
 @dataclass(frozen=True)
 class Entity:
-    """What Milvus has of a place.
+    """The entity of a place in Milvus.
 
     descriptor: float32 [D].
     where: of this place alone.
@@ -72,17 +72,17 @@ def collection_name(encoder: str, dimension: int) -> str:
 
 @contextmanager
 def milvus_errors(action: str) -> Iterator[None]:
-    """Turn what Milvus refuses into an Unreachable that says why in plain words."""
+    """Turn an error of Milvus into an Unreachable that says why in plain words."""
     try:
         yield
     except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through
         raise Unreachable("Milvus", _reason(error, action)) from error
     except OSError as error:  # it reads the certificate's file at every connection
-        raise Unreachable("Milvus", f"cannot be asked: {error}") from error
+        raise Unreachable("Milvus", f"cannot be reached: {error}") from error
 
 
 def _reason(error: MilvusException | grpc.RpcError, action: str) -> str:
-    """What follows the name of Milvus."""
+    """The text that follows the name of Milvus in an error."""
     said = error if isinstance(error, grpc.RpcError) else error.__cause__
     if not isinstance(said, grpc.RpcError):
         return f"refuses to {action}: {_in_one_line(str(getattr(error, 'message', error)))}"
@@ -125,7 +125,7 @@ class MilvusConnection:
         """The name of the connection, by which pymilvus knows it.
 
         Args:
-            searching: whether it is asked for what is loaded.
+            searching: whether the call needs a loaded collection.
 
         Raises:
             StoreUnavailable: Milvus cannot be reached, or refuses.
@@ -136,7 +136,7 @@ class MilvusConnection:
             yield self._name
 
     def _probe(self) -> None:
-        """Raise Unreachable unless Milvus answers soon; whatever else it is asked, pymilvus repeats for long."""
+        """Raise Unreachable unless Milvus answers soon; pymilvus repeats every other call for long."""
         with milvus_errors("answer"):
             if self._made:
                 utility.get_server_version(using=self._name, timeout=_PROBING_SECONDS)
@@ -280,8 +280,8 @@ class Collection:
     def _vector(self, value: Any) -> NDArray[np.float32]:
         """A descriptor as Milvus returns it: a list, or the bytes of halves."""
         halves = value[0] if isinstance(value, list) and value and isinstance(value[0], bytes) else value
-        kept = np.frombuffer(halves, np.float16) if isinstance(halves, bytes) else np.asarray(halves)
-        return kept.astype(np.float32)
+        stored = np.frombuffer(halves, np.float16) if isinstance(halves, bytes) else np.asarray(halves)
+        return stored.astype(np.float32)
 
     def search(
         self, descriptors: NDArray[np.float32], expression: str, limit: int, seen_from: int

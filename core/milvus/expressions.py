@@ -1,6 +1,6 @@
 """Conditions on places as boolean expressions of Milvus.
 
-An expression may hold of more places than its condition does (a disc is asked for by the square around it), never of
+An expression may hold of more places than its condition does (the square around a disc stands for it), never of
 fewer: whoever searches compares what was found with the condition itself.
 """
 
@@ -14,7 +14,7 @@ from core.judgement.priors import TOLERANCE, Constraint, Disc, Facing, Geographi
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_TIME
 
 NO_HEADING = -1.0
-"""What stands in Milvus for the heading of a place without one."""
+"""The value in Milvus for the heading of a place without one."""
 
 _MARGIN = 1e-3  # metres and degrees by which bounds are widened, because positions were rounded
 

@@ -1,6 +1,6 @@
 """Making a map of an export file in PostgreSQL and Milvus.
 
-The map is kept unlisted, under a name that no map can have, until all of it is there; what a crash leaves of it is
+The map is stored unlisted, under a name that no map can have, until all of it is there; what a crash leaves of it is
 removed a while later.
 """
 
@@ -34,7 +34,7 @@ class Importing(Unpacking):
 
         Raises:
             InvalidArchive: the file is damaged, or its content is not valid for a map.
-            StorageFull, StorageFailure: what was stored until then has to be removed.
+            StorageFull, StorageFailure: the part stored until then has to be removed.
         """
         self._map, self._database, self._number = map_, database, map_.number
         self._form = Form(map_.record)
@@ -61,9 +61,9 @@ class Importing(Unpacking):
 
     def put_places(self, lines: Sequence[PlaceLine], frames: NDArray[np.void], contents: Iterator[Content]) -> None:
         with self._map.writing() as write:
-            for line, kept, content in zip(lines, frames, contents, strict=True):
-                descriptor, local = self._form.divided(kept.tobytes())
-                picture = write.kept(None if content.picture is None else content.picture[0])
+            for line, frame, content in zip(lines, frames, contents, strict=True):
+                descriptor, local = self._form.divided(frame.tobytes())
+                picture = write.stored_picture(None if content.picture is None else content.picture[0])
                 try:
                     write.put_new(self._entry(write, line), Frame(descriptor, local, content.keypoints, picture))
                 except refusals.UniqueViolation:
@@ -102,7 +102,7 @@ class Importing(Unpacking):
         return self._lost[line.track]
 
     def _check(self) -> None:
-        """Check what concerns several places; each place was checked by itself."""
+        """Check conditions across places; each place was checked by itself."""
         with self._database.reading() as connection:
             wrong = ledger.wrong_sequence(connection, self._number)
         if wrong is not None:

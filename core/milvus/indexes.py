@@ -1,6 +1,6 @@
-"""How descriptors are kept and searched in a Milvus, by what its version can.
+"""How descriptors are stored and searched in a Milvus, by what its version can.
 
-Tried on real servers: version 2.3 alone.  What newer ones get follows their documentation.
+Tried on real servers: version 2.3 alone.  The choice for newer ones follows their documentation.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _AMONG = 2  # times as many as are wanted are compared, at least
 
 @dataclass(frozen=True)
 class Indexing:
-    """What a new collection gets.
+    """The fields and the index of a new collection.
 
     half: descriptors are float16, else float32.
-    index: what Milvus is asked to make of them.
+    index: the parameters of the index.
     """
 
     half: bool
@@ -30,7 +30,7 @@ class Indexing:
 
 
 def indexing_for(version: str) -> Indexing:
-    """What a server of a version can do: ``v2.6.4`` as it calls itself, or any other text.
+    """The abilities of a server of a version: ``v2.6.4`` as it calls itself, or any other text.
 
     From 2.6 on binary codes and a second look at halves (IVF_RABITQ), from 2.4 on a graph over halves (HNSW), before
     it, and where the version says nothing, exact search over float32.
@@ -49,7 +49,7 @@ def _index(kind: str, **params: object) -> dict[str, Any]:
 
 
 def search_settings(index_type: str, limit: int) -> dict[str, Any]:
-    """What a search for so many descriptors tells an index of this type."""
+    """The parameters of a search of an index of this type for ``count`` descriptors."""
     params: dict[str, Any] = {}
     if index_type == "IVF_RABITQ":
         params = {"nprobe": _LISTS_SEARCHED if limit <= _FEW else _LISTS, "rbq_query_bits": 8, "refine_k": _AMONG}

@@ -20,8 +20,8 @@ from psycopg import Connection
 from core.errors import MapExists, UnknownMap
 from core.maps.counterparts import Standing
 from core.maps.place_filter import PlaceFilter
-from core.maps.records import KeptFrame, MapRecord, Outline, SequenceSummary
-from core.milvus.pictures.kept import Kept, StoredObject
+from core.maps.records import MapRecord, Outline, PicturedPlace, SequenceSummary
+from core.milvus.pictures.stored import StoredObject, StoredPicture
 from core.milvus.tokens import tokens_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
 
@@ -31,7 +31,7 @@ VERSION = 2
 """Of the tables; it grows when a placerec that knows only the former ones could not use them."""
 
 WAIT_SECONDS = 10
-"""A write that waits for others to the same map is refused after so long."""
+"""A write that waits for others to the same map is refused after this time."""
 
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
@@ -40,14 +40,14 @@ EXPORTING = 7063
 """The kind of the lock of the database that exports share, and that who deletes objects has alone."""
 
 LEFT_SECONDS = 60
-"""What no place names any more is deleted after so many seconds; a query that still needs it has ended by then."""
+"""Orphans, which no place names any more, are deleted after this time; queries that need them have ended by then."""
 
-LEAVINGS_AT_ONCE = 1000
+ORPHANS_AT_ONCE = 1000
 
 
 @dataclass(frozen=True)
 class MapState:
-    """What PostgreSQL has of a map itself.
+    """The state of a map in PostgreSQL, without its places.
 
     number: never used for another map, also of the same id.
     places, rows: how many places there are; all their rows are below ``rows``.
@@ -103,12 +103,12 @@ class PlaceEntry:
 
 @dataclass(frozen=True)
 class Frame:
-    """What is kept of a frame beside its place: descriptor float16 [D], local descriptors int8 [C, L], in bytes."""
+    """The stored data of a frame beside its place: descriptor float16 [D], local descriptors int8 [C, L], in bytes."""
 
     descriptor: bytes
     local: bytes
     keypoints: bytes | None
-    picture: Kept
+    picture: StoredPicture
 
 
 def whereabouts_of(entries: Sequence[PlaceEntry]) -> Whereabouts:
@@ -144,7 +144,7 @@ def create(connection: Connection[Any], record: MapRecord, name: str | None = No
     """Insert a map without places; returns its number.
 
     Args:
-        name: under which it is kept until it is published; None: its id.
+        name: the id that it has until it is published; None: its own.
 
     Raises:
         MapExists: the id is taken.
@@ -181,10 +181,10 @@ def is_taken(connection: Connection[Any], map_id: str) -> bool:
 
 
 def unlisted(connection: Connection[Any], untouched_seconds: float = 0) -> dict[str, int]:
-    """The numbers of the maps that are being built, by the ids under which they are kept.
+    """The numbers of the maps that are being built, by the ids that they have meanwhile.
 
     Args:
-        untouched_seconds: only those that nobody has written to for so long.
+        untouched_seconds: only those without a write for this time.
     """
     query = "SELECT id, number FROM maps WHERE NOT listed AND touched <= now() - make_interval(secs => %s)"
     return dict(connection.execute(query, (untouched_seconds,)).fetchall())
@@ -238,13 +238,13 @@ def delete(connection: Connection[Any], map_id: str, number: int | None = None) 
 
 
 def update(connection: Connection[Any], state: MapState) -> None:
-    """Store what a write has changed of the map itself."""
+    """Store the changes by a write of the map itself."""
     query = (
         "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s, collection = %s,"
         " touched = now() WHERE number = %s"
     )
-    kept = state.record.model_dump_json(), state.places, state.rows, state.writes, state.inserted, state.collection
-    connection.execute(query, (*kept, state.number))
+    values = state.record.model_dump_json(), state.places, state.rows, state.writes, state.inserted, state.collection
+    connection.execute(query, (*values, state.number))
 
 
 def used_collections(connection: Connection[Any]) -> dict[int, list[str]]:
@@ -305,7 +305,7 @@ def entries_after(
 
 
 def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
-    """Store a place, in the place of what is stored under its number."""
+    """Store a place, in the place of one stored under its number."""
     place = entry.place
     columns = {
         "map": map_number, "number": entry.number, "id": place.id, "row": entry.row, "key": entry.key,
@@ -322,7 +322,7 @@ def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None
 
 
 def remove(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
-    """Remove a place; what belongs to it is left for a while."""
+    """Remove a place; its data is left for a while."""
     connection.execute("DELETE FROM places WHERE map = %s AND number = %s", (map_number, entry.number))
 
 
@@ -403,7 +403,7 @@ def latest_in_sequence(
     """The end of a sequence: ordinal and row of its last place, and the row of the first place at each last ordinal.
 
     Args:
-        positions: so many ordinals before the last one are looked at, too.
+        positions: the number of ordinals before the last one that are looked at, too.
     """
     query = "SELECT code, next_ordinal FROM sequences WHERE map = %s AND name = %s"
     found = connection.execute(query, (map_number, name)).fetchone()
@@ -520,7 +520,7 @@ def put_keypoints(connection: Connection[Any], map_number: int, row: int, keypoi
     return connection.execute(query, (keypoints, map_number, row)).rowcount > 0
 
 
-def without_keypoints(connection: Connection[Any], map_number: int, after: int, limit: int) -> list[KeptFrame]:
+def without_keypoints(connection: Connection[Any], map_number: int, after: int, limit: int) -> list[PicturedPlace]:
     """Up to ``limit`` places behind number ``after`` that keep a picture and no keypoints."""
     query = (
         "SELECT p.number, p.id, p.digest, p.camera, p.picture FROM places p"
@@ -528,7 +528,7 @@ def without_keypoints(connection: Connection[Any], map_number: int, after: int, 
         " WHERE p.map = %s AND p.number > %s AND (f.picture IS NOT NULL OR f.object IS NOT NULL)"
         " AND f.keypoints IS NULL ORDER BY p.number LIMIT %s"
     )
-    return [KeptFrame(*values) for values in connection.execute(query, (map_number, after, limit))]
+    return [PicturedPlace(*values) for values in connection.execute(query, (map_number, after, limit))]
 
 
 def count_without_image(connection: Connection[Any], map_number: int) -> int:
@@ -557,19 +557,21 @@ def of_frames(connection: Connection[Any], map_number: int, column: str, rows: S
     return dict(connection.execute(query, (map_number, list(rows))).fetchall())
 
 
-def pictures_of(connection: Connection[Any], map_number: int, rows: Sequence[int]) -> dict[int, Kept]:
-    """What is kept of frames to be looked at, by row; rows that are gone are left out."""
+def pictures_of(connection: Connection[Any], map_number: int, rows: Sequence[int]) -> dict[int, StoredPicture]:
+    """The stored pictures of frames by row; rows that are gone are left out."""
     query = "SELECT row, picture, object, object_size, object_digest FROM frames WHERE map = %s AND row = ANY(%s)"
     found = connection.execute(query, (map_number, list(rows)))
-    return {row: kept_of(*picture) for row, *picture in found}
+    return {row: stored_picture(*picture) for row, *picture in found}
 
 
-def columns_of(kept: Kept) -> tuple[bytes | None, str | None, int | None, bytes | None]:
+def columns_of(picture: StoredPicture) -> tuple[bytes | None, str | None, int | None, bytes | None]:
     """The columns of a picture."""
-    return (None, kept.name, kept.size, kept.digest) if isinstance(kept, StoredObject) else (kept, None, None, None)
+    if isinstance(picture, StoredObject):
+        return None, picture.name, picture.size, picture.digest
+    return picture, None, None, None
 
 
-def kept_of(picture: bytes | None, name: str | None, size: int | None, digest: bytes | None) -> Kept:
+def stored_picture(picture: bytes | None, name: str | None, size: int | None, digest: bytes | None) -> StoredPicture:
     """A picture from its columns."""
     return picture if name is None or size is None or digest is None else StoredObject(name, size, digest)
 
@@ -593,7 +595,7 @@ def dead_objects(connection: Connection[Any]) -> list[str]:
     """The names of some objects whose row is deleted; none while a map is exported, which may still see the row."""
     if connection.execute("SELECT pg_try_advisory_xact_lock(%s::int, 0)", (EXPORTING,)).fetchone() != (True,):
         return []
-    return [name for (name,) in connection.execute("SELECT name FROM dead_objects LIMIT %s", (LEAVINGS_AT_ONCE,))]
+    return [name for (name,) in connection.execute("SELECT name FROM dead_objects LIMIT %s", (ORPHANS_AT_ONCE,))]
 
 
 def clear_objects(connection: Connection[Any], names: Sequence[str]) -> None:
@@ -609,7 +611,7 @@ def known_objects(connection: Connection[Any], names: Sequence[str]) -> set[str]
 
 
 def swept_objects(connection: Connection[Any], whole_seconds: float) -> int:
-    """The key from which on objects may be litter; 0 if all were not listed for so long."""
+    """The key from which on objects may be litter; 0 if the last full listing is older than ``whole_seconds``."""
     query = "SELECT swept FROM placerec WHERE listed > now() - make_interval(secs => %s)"
     found = connection.execute(query, (whole_seconds,)).fetchone()
     return 0 if found is None else int(found[0])
@@ -621,7 +623,7 @@ def note_swept_objects(connection: Connection[Any], key: int, whole: bool) -> No
     connection.execute(query, (key, whole))
 
 
-# What is left over
+# Orphans
 
 
 def leave(connection: Connection[Any], map_number: int, key: int, row: int | None) -> None:
@@ -629,23 +631,23 @@ def leave(connection: Connection[Any], map_number: int, key: int, row: int | Non
     connection.execute("INSERT INTO leavings (map, key, row) VALUES (%s, %s, %s)", (map_number, key, row))
 
 
-def leavings(connection: Connection[Any], map_number: int) -> list[int]:
+def orphans(connection: Connection[Any], map_number: int) -> list[int]:
     """The keys of the entities that are no place's any more."""
     query = "SELECT key FROM leavings WHERE map = %s ORDER BY since DESC LIMIT %s"
-    return [key for (key,) in connection.execute(query, (map_number, LEAVINGS_AT_ONCE))]
+    return [key for (key,) in connection.execute(query, (map_number, ORPHANS_AT_ONCE))]
 
 
-def old_leavings(connection: Connection[Any], map_number: int) -> list[int]:
+def old_orphans(connection: Connection[Any], map_number: int) -> list[int]:
     """The keys of some that can be deleted; others, who delete too, get other ones."""
     query = (
         "SELECT key FROM leavings WHERE map = %s AND since < now() - make_interval(secs => %s)"
         " ORDER BY since LIMIT %s FOR UPDATE SKIP LOCKED"
     )
-    return [key for (key,) in connection.execute(query, (map_number, LEFT_SECONDS, LEAVINGS_AT_ONCE))]
+    return [key for (key,) in connection.execute(query, (map_number, LEFT_SECONDS, ORPHANS_AT_ONCE))]
 
 
 def clear(connection: Connection[Any], map_number: int, keys: Sequence[int]) -> None:
-    """Delete the frames of leavings, whose entities are deleted, and forget these."""
+    """Delete the frames of orphans with deleted entities, and the record of these orphans."""
     query = "DELETE FROM leavings WHERE map = %s AND key = ANY(%s) RETURNING row"
     rows = [row for (row,) in connection.execute(query, (map_number, list(keys))) if row is not None]
     connection.execute("DELETE FROM frames WHERE map = %s AND row = ANY(%s)", (map_number, rows))

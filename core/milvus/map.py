@@ -28,8 +28,8 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
+    PicturedPlace,
     SameFrame,
     SequenceSummary,
     patched_fields,
@@ -47,7 +47,7 @@ from core.milvus.parts.exporter import MilvusExporter
 from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
-from core.milvus.pictures.kept import read_pictures
+from core.milvus.pictures.stored import read_pictures
 from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
@@ -63,7 +63,7 @@ REBUILT_AT_ONCE = 256
 
 
 class MilvusMap:
-    """The places of one environment.  Any thread of any process may call any method.
+    """The places of one environment (:class:`core.maps.store.Map`).  Any thread of any process may call any method.
 
     One transaction writes to a map at a time.  Any method may raise StorageFailure (PostgreSQL or Milvus refuses, or
     cannot be reached) and UnknownMap; methods that write may also raise StorageFull.
@@ -101,12 +101,11 @@ class MilvusMap:
 
     @property
     def held(self) -> bool:
-        """False: other processes are asked for everything."""
+        """False: everything comes from other processes."""
         return False
 
     @property
     def state(self) -> object:
-        """A value that is the same until the map is written to."""
         with self.viewing() as (_, state):
             return state.number, state.writes
 
@@ -150,30 +149,27 @@ class MilvusMap:
         last = self._last
         if last is not None and last.state == state:
             return last
-        leavings = tuple(ledger.leavings(connection, self.number))
-        return MilvusSnapshot(self._database, self.collection, state, leavings)
+        orphans = tuple(ledger.orphans(connection, self.number))
+        return MilvusSnapshot(self._database, self.collection, state, orphans)
 
     def scope(self, selection: Selection | None = None) -> MilvusScope:
-        """The places that a query may find at this moment; None: all."""
         with self.viewing() as (connection, state):
             return scope_of(connection, self._snapshot(connection, state), selection)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         with self._reading() as connection:
             entries = ledger.entries_by(connection, self.number, "row", [int(row) for row in rows])
         found = {entry.row: entry.place for entry in entries}
         return [found.get(int(row)) for row in rows]
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
-        """The keypoints of those places; None also where none are kept, and where they are damaged, which is logged."""
+        """The keypoints of those places; None also without any, and where they are damaged, which is logged."""
         with self._reading() as connection:
             entries = ledger.entries_by(connection, self.number, "row", [int(row) for row in rows])
-            kept = ledger.of_frames(connection, self.number, "keypoints", [entry.row for entry in entries])
-        return [None if (record := kept.get(int(row))) is None else _keypoints(int(row), record) for row in rows]
+            records = ledger.of_frames(connection, self.number, "keypoints", [entry.row for entry in entries])
+        return [None if (record := records.get(int(row))) is None else _keypoints(int(row), record) for row in rows]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
-        """The rows of places; None where there is no such place."""
         with self._reading() as connection:
             entries = ledger.entries_by(connection, self.number, "id", place_ids)
         found = {entry.place.id: entry.row for entry in entries}
@@ -182,27 +178,16 @@ class MilvusMap:
     # Reading
 
     def count_places(self) -> int:
-        """How many places the map has."""
         with self.viewing() as (_, state):
             return state.places
 
     def place(self, place_id: str) -> Place:
-        """One place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self._reading() as connection:
             return expect_place(connection, self.number, place_id).place
 
     def places(
         self, cursor: str | None, limit: int, wanted: PlaceFilter = EVERY_PLACE
     ) -> tuple[list[Place], str | None]:
-        """A page of places in the order of their enrolment, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         most = one_more(limit)
         listing = listing_of_places(self.record.id, wanted)
         after = decode_number(listing, cursor)
@@ -212,27 +197,16 @@ class MilvusMap:
         return [entry.place for entry in page], more
 
     def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
-        """The ids of the places that fulfil some conditions, in the order of their enrolment.
-
-        Raises:
-            TooManyToDelete: there are more than ``most``.
-        """
         with self._reading() as connection:
             found = ledger.entries_after(connection, self.number, -1, most + 1, wanted)
         return [entry.place.id for entry in _not_more(found, most)]
 
     def digest(self, place_id: str) -> bytes | None:
-        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             entry = ledger.find(connection, self.number, place_id)
         return None if entry is None else entry.digest
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
-        """A page of sequences by name, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         listing: Listing = ["sequences", self.record.id]
         after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
         with self._reading() as connection:
@@ -240,37 +214,28 @@ class MilvusMap:
         return page_of(listing, found, limit, lambda sequence: sequence.name)
 
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
-        """Those of the names that no sequence has."""
         with self._reading() as connection:
             return set(names) - set(ledger.sequence_codes(connection, self.number, names))
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         """Places that keep their image or a thumbnail, and no keypoints, behind the number ``after``."""
         with self._reading() as connection:
             return ledger.without_keypoints(connection, self.number, after, limit)
 
     def thumbnail(self, place_id: str) -> bytes:
-        """A small JPEG of a place.
-
-        Raises:
-            UnknownPlace: there is no such place.
-            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
-            StorageFailure: the picture is missing or damaged.
-            MemoryError: its pixels do not fit into memory.
-        """
-        entry, kept = self._picture_of(place_id)
+        entry, picture = self._picture_of(place_id)
         if entry is None:
             raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
-        if kept is None:
+        if picture is None:
             raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
         if entry.place.picture == "thumbnail":
-            return kept
+            return picture
         try:
-            return encode_thumbnail(decode(kept, ANY_SIZE))
+            return encode_thumbnail(decode(picture, ANY_SIZE))
         except InvalidImage as error:
-            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
+            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
 
-    # How it is kept
+    # How it is stored
 
     def index_status(self) -> IndexStatus:
         """How the map is searched: by Milvus, which compares every place if its collection has no other index."""
@@ -290,7 +255,7 @@ class MilvusMap:
         """Give Milvus all descriptors again, some at a time; searches use those that it has meanwhile.
 
         Args:
-            progress: is told how many places of how many are done; what it raises ends the work, and what was done
+            progress: called with the number of places done and of all; its exceptions end the work, and the part done
                 until then stays.
         """
         done, after, total = 0, -1, self.count_places()
@@ -324,11 +289,6 @@ class MilvusMap:
             return self._room[1]
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
-
-        Raises:
-            StorageFailure: the picture is missing or damaged.
-        """
         return self._picture_of(place_id)[1]
 
     def _picture_of(self, place_id: str) -> tuple[PlaceEntry | None, bytes | None]:
@@ -339,9 +299,9 @@ class MilvusMap:
                 entry = ledger.find(connection, self.number, place_id)
                 if entry is None:
                     return None, None
-                kept = ledger.pictures_of(connection, self.number, [entry.row])
-            found = read_pictures(self.objects, kept)
-            if entry.row in found or entry.row not in kept:
+                pictures = ledger.pictures_of(connection, self.number, [entry.row])
+            found = read_pictures(self.objects, pictures)
+            if entry.row in found or entry.row not in pictures:
                 return entry, found.get(entry.row)
             if entry.row == before:
                 raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
@@ -397,22 +357,16 @@ class MilvusMap:
         self._tidy()
 
     def _tidy(self) -> None:
-        """Delete what was left over a while ago; what cannot be deleted now is deleted after another write."""
+        """Delete old orphans; those that cannot be deleted now are deleted after another write."""
         try:
-            with self._database.transaction("delete what is left over") as connection:
-                if keys := ledger.old_leavings(connection, self.number):
+            with self._database.transaction("delete orphans") as connection:
+                if keys := ledger.old_orphans(connection, self.number):
                     self.collection.delete(keys)
                     ledger.clear(connection, self.number, keys)
         except StorageFailure as error:
             log.warning("Map %s: %s", self.record.id, error)
 
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
-        """Change settings or the calibration; the revision grows by one if anything changes.
-
-        Raises:
-            InvalidField: a field is unknown or fixed, or its value is not allowed.
-            RevisionMismatch: the record is not at ``expected_revision``.
-        """
         with self.writing() as write:
             record = write.state.record
             if expected_revision is not None and expected_revision != record.revision:
@@ -445,25 +399,15 @@ class MilvusMap:
             return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
-        """Replace all fields of a place; its frame stays.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self.writing() as write:
             return write.set_fields(write.expect(place_id), fields)
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
-        """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self.writing() as write:
             entry = write.expect(place_id)
             return write.set_fields(entry, patched_fields(entry.place, changes))[0]
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that have none (:meth:`core.maps.store.Map.add_keypoints`)."""
         if not found:
             return 0
@@ -471,20 +415,10 @@ class MilvusMap:
             return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
 
     def forget(self, place_id: str) -> None:
-        """Delete a place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self.writing() as write:
             write.forget(write.expect(place_id))
 
     def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
-        """Delete the places that fulfil some conditions, all or none; returns their ids.
-
-        Raises:
-            TooManyToDelete: there are more than ``most``.
-        """
         with self.writing() as write:
             found = _not_more(write.all_of(wanted, most + 1), most)
             for entry in found:
@@ -492,11 +426,6 @@ class MilvusMap:
         return [entry.place.id for entry in found]
 
     def forget_sequence(self, name: str) -> int:
-        """Delete all places of a sequence; returns how many.
-
-        Raises:
-            UnknownSequence: there is none.
-        """
         with self.writing() as write:
             found = write.all_of(PlaceFilter(sequence=name), None)
             if not found:

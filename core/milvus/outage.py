@@ -10,8 +10,8 @@ from contextlib import contextmanager
 
 from core.errors import StoreUnavailable
 
-ASKED_AGAIN_SECONDS = 0.5
-"""A server that could not be reached is asked again after so long, by one request at a time."""
+PROBED_AGAIN_SECONDS = 0.5
+"""A server that could not be reached is probed again after this time, by one request at a time."""
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,8 @@ class Outage:
 
     Args:
         name: of the server, as its :class:`Unreachable` names it.
-        thing: what it is about, as the log shall name it; by default the server.
-        probe: asks a server that was gone in little time whether it is back, before it is asked for more; raises
+        thing: the name in the log; by default that of the server.
+        probe: finds out quickly whether a server that was gone is back, before any other request; raises
             Unreachable if it is not.
     """
 
@@ -51,9 +51,9 @@ class Outage:
         Raises:
             Unreachable: it could not be reached a moment ago, and the block is not run; or the block raises it.
         """
-        asked_again = self._expect_up()
+        must_probe = self._expect_up()
         try:
-            if asked_again:
+            if must_probe:
                 self._probe()
             yield
         except BaseException as error:
@@ -63,7 +63,7 @@ class Outage:
         self._note(None)
 
     def _expect_up(self) -> bool:
-        """Whether it is asked again after an outage."""
+        """Whether it must be probed, as after an outage."""
         if self._reason is None:
             return False
         with self._lock:
@@ -79,7 +79,7 @@ class Outage:
             return
         with self._lock:
             before, self._reason = self._reason, reason
-            self._ask_at = time.monotonic() + ASKED_AGAIN_SECONDS
+            self._ask_at = time.monotonic() + PROBED_AGAIN_SECONDS
         if reason is not None and before is None:
             log.error("%s is unavailable: %s", self._thing, reason)
         elif reason is None and before is not None:

@@ -31,14 +31,14 @@ SETTINGS: Mapping[str, Any] = {
     "tcp_user_timeout": 10_000,
 }
 
-# The pool waits twice as long between two attempts each time, up to minutes; after so long it gives up instead, and the
+# The pool waits twice as long between two attempts each time, up to minutes; after this time it gives up, and the
 # next request begins anew.
 _RECONNECTING_SECONDS = 1.0
 
 
 @contextmanager
 def postgres_errors(action: str) -> Iterator[None]:
-    """Turn what PostgreSQL refuses into our errors."""
+    """Turn the errors of PostgreSQL into our own."""
     try:
         yield
     except psycopg.errors.DiskFull as error:
@@ -143,7 +143,7 @@ class Postgres:
         """A connection of the pool; what the block does not commit is undone if it raises, else committed.
 
         Args:
-            action: what the block does, for the message of an error.
+            action: the work of the block, for the message of an error.
         """
         with self._outage.noticed():
             pool = self._opened()

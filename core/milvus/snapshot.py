@@ -32,7 +32,7 @@ SHORTLIST = 100
 MOST_KNOWN = 10_000
 """Places that a snapshot remembers, so that what was read of a place stays as it was."""
 
-_SPARE = 1.25  # that more entities are asked for, because some are no place's any more or beyond an edge
+_SPARE = 1.25  # the factor of entities requested, for some are no place's any more or beyond an edge
 _MORE = 4  # by this factor, if these were too few
 
 Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
@@ -43,17 +43,17 @@ Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
 class MilvusSnapshot:
     """The places of a map at one moment (:class:`core.maps.store.Snapshot`).
 
-    What was written to the map since may show in what is read by row for the first time: a row belongs to the same
+    Later writes to the map may show in rows that are read for the first time: a row belongs to the same
     frame for ever, but its place may have got another pose.
 
     state: of the map at that moment.
-    leavings: the keys of entities that were no place's any more.
+    orphans: the keys of entities that were no place's any more.
     """
 
     database: Database
     collection: Collection
     state: MapState
-    leavings: tuple[int, ...] = ()
+    orphans: tuple[int, ...] = ()
     _known: dict[int, PlaceEntry] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -61,14 +61,13 @@ class MilvusSnapshot:
 
     @property
     def rows(self) -> int:
-        """All rows are below this number."""
         return self.state.rows
 
     def entries_at(self, rows: Rows) -> list[PlaceEntry]:
         """The places of rows that a search found, as it found them, and else as they are now.
 
         Raises:
-            UnknownPlace: the place of a row was deleted, or got another frame, before it was asked for.
+            UnknownPlace: the place of a row was deleted, or got another frame, before it was requested.
         """
         found = {row: entry for row in rows.tolist() if (entry := self._known.get(row)) is not None}
         if missing := [row for row in rows.tolist() if row not in found]:
@@ -89,7 +88,6 @@ class MilvusSnapshot:
             self._known.setdefault(entry.row, entry)
 
     def whereabouts_at(self, rows: Rows) -> Whereabouts:
-        """Where and when the frames of some rows were taken."""
         return whereabouts_of(self.entries_at(rows))
 
     def descriptors_at(self, rows: Rows) -> NDArray[np.float32]:
@@ -119,7 +117,6 @@ class MilvusSnapshot:
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:
-        """Whether each row belongs to a place: bool [rows]."""
         alive = np.zeros(self.rows, np.bool_)
         alive[[entry.row for entry in self.all_entries]] = True
         return alive
@@ -136,7 +133,6 @@ class MilvusSnapshot:
         return Whereabouts(**columns)
 
     def among(self, allowed: NDArray[np.bool_]) -> MilvusScope:
-        """The places of some rows, bool [rows], as a scope without a prior."""
         inside, outside = np.flatnonzero(allowed & self.alive), np.flatnonzero(~allowed & self.alive)
         few = any_row(inside.tolist()) if len(inside) <= len(outside) else f"not ({any_row(outside.tolist())})"
         return MilvusScope(self, (few,), lambda entries: allowed[[entry.row for entry in entries]])
@@ -144,7 +140,7 @@ class MilvusSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of a place with some probability.
+    """The known facts about a place that hold with some probability.
 
     constraints: on pose, time and sequence.
     tokens: of values that its metadata has.
@@ -192,10 +188,10 @@ class MilvusScope:
         listed = set(ranking[0].tolist())
 
         def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
-            kept = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
+            matching = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
             if neighborhood is None:
-                return kept
-            return kept & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
+                return matching
+            return matching & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
 
         expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
         where = there.whereabouts()
@@ -209,10 +205,9 @@ class MilvusScope:
         return self._ranked(descriptor[np.newaxis], expressions, keep)[0]
 
     def living_rows(self) -> Rows:
-        """The rows of the places of the scope, int64 [n], ascending."""
         entries = self.snapshot.all_entries
-        kept = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
-        return np.array(sorted(kept), np.int64)
+        matching = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
+        return np.array(sorted(matching), np.int64)
 
     def weights_at(self, rows: Rows) -> Values | None:
         """The log prior of rows, float64 [n]; None if there is no prior."""
@@ -237,7 +232,7 @@ class MilvusScope:
         if not len(queries) or not len(snapshot):
             return [nothing] * len(queries)
         wanted = len(snapshot) if len(snapshot) < COMPACT_FROM else SHORTLIST
-        unused = (f"not (key in {list(snapshot.leavings)})",) if snapshot.leavings else ()
+        unused = (f"not (key in {list(snapshot.orphans)})",) if snapshot.orphans else ()
         bounds = f"row < {snapshot.rows}"
         expression = all_of((f"map == {snapshot.state.number}", bounds, *unused, *expressions))
         limit = min(MOST_FOUND, int(_SPARE * wanted) + 10)
@@ -259,9 +254,9 @@ class MilvusScope:
         keys = np.unique(np.concatenate([found for found, _ in hits])).tolist()
         with snapshot.database.reading() as connection:
             entries = ledger.entries_by(connection, snapshot.state.number, "key", keys)
-        kept = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
-        snapshot.note(kept)
-        rows = {entry.key: entry.row for entry in kept}
+        matching = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
+        snapshot.note(matching)
+        rows = {entry.key: entry.row for entry in matching}
         rankings = []
         for found, products in hits:
             there = np.array([key in rows for key in found.tolist()], np.bool_)

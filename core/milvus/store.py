@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects
 
 MOST_MAPS = 1000
-"""Maps of which an object is kept, so that whoever asks for a map twice gets the same one."""
+"""The largest number of maps with a cached object; a second call for a map returns the same one."""
 
 IMPORTED = ".import-"
 """How the names begin under which imports keep their maps; no map id begins like this."""
 
 ABANDONED_SECONDS = 3600
-"""An unlisted map that nobody has written to for so long is not being built any more."""
+"""An unlisted map without a write for this time is abandoned."""
 
 SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 """Between two sweeps, and after one that the servers refused."""
@@ -46,7 +46,10 @@ log = logging.getLogger(__name__)
 
 
 class MilvusStore:
-    """Maps by id.  Any thread may call any method, and any number of processes may use the same maps."""
+    """Maps by id (:class:`core.maps.store.Store`).
+
+    Any thread may call any method, and any number of processes may use the same maps.
+    """
 
     def __init__(
         self,
@@ -92,7 +95,7 @@ class MilvusStore:
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
             unlisted: only :meth:`unlisted` finds the map until it is published.
-            precision: how its descriptors are kept in PostgreSQL, and so what Milvus compares.
+            precision: how its descriptors are stored in PostgreSQL, and so what Milvus compares.
 
         Raises:
             InvalidIdentifier: the id is malformed.
@@ -180,7 +183,6 @@ class MilvusStore:
         return found
 
     def unlisted(self) -> dict[str, MilvusMap]:
-        """The maps that are being built by jobs, by id."""
         self._expect_open()
         with self._database.reading() as connection:
             found = ledger.unlisted(connection)
@@ -196,12 +198,6 @@ class MilvusStore:
         return []
 
     def publish(self, map_id: str) -> MilvusMap:
-        """List a map that was being built and is now complete; durable when this returns.
-
-        Raises:
-            UnknownMap: no map of this id is being built.
-            StorageFull, StorageFailure.
-        """
         with self._database.transaction(f"publish map {map_id!r}") as connection:
             number = ledger.unlisted(connection).get(map_id)
             if number is None:
@@ -210,11 +206,6 @@ class MilvusStore:
         return self._map(map_id, number)
 
     def abandon(self, map_id: str) -> None:
-        """Delete a map that was being built; nothing happens if there is none.
-
-        Raises:
-            StorageFull, StorageFailure: the map is still there.
-        """
         self._expect_open()
         with self._database.reading() as connection:
             number = ledger.unlisted(connection).get(map_id)
@@ -257,11 +248,6 @@ class MilvusStore:
             )
 
     def check_pictures(self) -> None:
-        """Raise unless pictures could be stored now, if they are stored elsewhere than the rest.
-
-        Raises:
-            StoreUnavailable, StorageFull.
-        """
         self._expect_open()
         if self._objects is not None:
             self._objects.check()
@@ -276,7 +262,7 @@ class MilvusStore:
         return 0 if self._objects is None else sweep_objects(self._database, self._objects)
 
     def sweep(self) -> int:
-        """Delete what writes that came to no end have left; returns how many descriptors that were.
+        """Delete the orphans of writes that did not end; returns the number of descriptors.
 
         Raises:
             StoreUnavailable, StorageFailure.
@@ -289,7 +275,7 @@ class MilvusStore:
             with suppress(UnknownMap):  # it was published, or removed
                 log.warning("The unfinished map %s is removed: nobody has written to it for a while", name)
                 self._remove(name, number)
-        # What is in a collection that no map is in may be another database's.
+        # A collection without a map of this database may be another database's.
         ours = [self._collection_of(*encoder) for encoder in encoders]
         return sweep(self._database, [collection for collection in ours if collection.id in used])
 
@@ -300,10 +286,10 @@ class MilvusStore:
             try:
                 sweep()
             except StorageFailure as error:
-                log.debug("what is left over stays for now: %s", error)
+                log.debug("orphans stay for now: %s", error)
                 return AGAIN_SECONDS
             except Exception:  # a defect, which must not end the thread
-                log.exception("what is left over stays for now")
+                log.exception("orphans stay for now")
             return SWEEP_SECONDS
 
         def run() -> None:
@@ -326,11 +312,6 @@ class MilvusStore:
             return self._collections[encoder]
 
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
-        """A page of the maps' records by id, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         wanted = one_more(limit)
         listing: Listing = ["maps"]
         after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
@@ -340,11 +321,6 @@ class MilvusStore:
         return page_of(listing, found, limit, lambda record: record.id)
 
     def delete(self, map_id: str) -> None:
-        """Delete a map; the deletion is durable when this returns.
-
-        Raises:
-            UnknownMap, StorageFull, StorageFailure.
-        """
         self._remove(map_id, None)
 
     def _remove(self, map_id: str, number: int | None) -> None:
@@ -356,8 +332,8 @@ class MilvusStore:
             self._maps.pop(found.number, None)
         # The number of a deleted map is never used again, so what stays in Milvus is never found.
         try:
-            for start in range(0, len(keys), ledger.LEAVINGS_AT_ONCE):
-                collection.delete(keys[start : start + ledger.LEAVINGS_AT_ONCE])
+            for start in range(0, len(keys), ledger.ORPHANS_AT_ONCE):
+                collection.delete(keys[start : start + ledger.ORPHANS_AT_ONCE])
         except StorageFailure as error:
             log.warning("Map %s is deleted; its descriptors stay in Milvus: %s", map_id, error)
 
@@ -375,6 +351,6 @@ class MilvusStore:
 
 
 def _objects_of(bucket: Bucket) -> Objects:
-    from core.milvus.pictures.objects import Objects  # with it comes what speaks S3
+    from core.milvus.pictures.objects import Objects  # it imports the client of S3
 
     return Objects(bucket)

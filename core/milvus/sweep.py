@@ -1,4 +1,4 @@
-"""Deleting what no place names: what a service left that died after it gave it to Milvus, or to the object store.
+"""Deleting orphans, which no place names: left by a service that died after it gave them to Milvus or the object store.
 
 A key is drawn, and its entity inserted or its object written, by a write that holds a lock on its map's row until it
 has ended.  So once that lock was had of every map, all keys up to the last one drawn before belong to writes that have
@@ -14,7 +14,7 @@ from core.errors import UnknownMap
 from core.milvus import ledger
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.database import Database
-from core.milvus.pictures.kept import before_key, key_of
+from core.milvus.pictures.stored import before_key, key_of
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects
@@ -26,7 +26,7 @@ SWEEPING_OBJECTS = 7064
 """The same for objects."""
 
 LISTED_SECONDS = 24 * 3600
-"""All objects are listed when they have not been for so long: a write whose service was thought dead may leave one."""
+"""Time between two full listings of the objects: a write whose service was thought dead may leave one."""
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +51,8 @@ def sweep(database: Database, collections: list[Collection]) -> int:
                     continue
                 with database.reading() as connection:
                     orphans = sorted(set(found) - ledger.known_keys(connection, found))
-                for start in range(0, len(orphans), ledger.LEAVINGS_AT_ONCE):
-                    collection.delete(orphans[start : start + ledger.LEAVINGS_AT_ONCE])
+                for start in range(0, len(orphans), ledger.ORPHANS_AT_ONCE):
+                    collection.delete(orphans[start : start + ledger.ORPHANS_AT_ONCE])
                 count += len(orphans)
     if count:
         log.warning("%d descriptors of writes that came to no end are deleted from Milvus", count)

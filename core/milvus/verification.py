@@ -1,4 +1,4 @@
-"""Comparing what PostgreSQL has of a map with what Milvus searches."""
+"""Comparing a map in PostgreSQL with its entities in Milvus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from core.milvus import ledger
 from core.milvus.forms import Form
 from core.milvus.ledger import PlaceEntry
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.kept import read_pictures
+from core.milvus.pictures.stored import read_pictures
 
 AT_ONCE = 128
 """Places that are read together; Milvus waits up to 0.2 s for the next tick of its clock each time."""
@@ -40,20 +40,20 @@ def inspect(map_: MilvusMap, progress: Progress) -> VerifyReport:
         with map_.viewing() as (connection, state):
             entries = ledger.entries_after(connection, map_.number, after, AT_ONCE, EVERY_PLACE)
             rows = [entry.row for entry in entries]
-            kept = {name: ledger.of_frames(connection, map_.number, name, rows) for name in _COLUMNS}
+            stored = {name: ledger.of_frames(connection, map_.number, name, rows) for name in _COLUMNS}
             pictures = ledger.pictures_of(connection, map_.number, rows)
         if not entries:
             break
-        kept["picture"] = read_pictures(map_.objects, pictures)
+        stored["picture"] = read_pictures(map_.objects, pictures)
         there = map_.collection.descriptors_of([entry.key for entry in entries])
-        damaged = [(entry, why) for entry in entries if (why := _damage(entry, kept, there, Form(state.record)))]
+        damaged = [(entry, why) for entry in entries if (why := _damage(entry, stored, there, Form(state.record)))]
         if damaged:
             with map_.viewing() as (connection, _):
                 now = ledger.entries_by(connection, map_.number, "key", [entry.key for entry, _ in damaged])
             unchanged = {entry.key for entry in now}
             report.problems += [why for entry, why in damaged if entry.key in unchanged]
         report.places += len(entries)
-        report.bytes += sum(len(value or b"") for column in kept.values() for value in column.values())
+        report.bytes += sum(len(value or b"") for column in stored.values() for value in column.values())
         after = entries[-1].number
         progress(min(report.places, total), total)
     listed, more = report.problems[:MOST_LISTED], len(report.problems) - MOST_LISTED
@@ -77,17 +77,16 @@ class _Report:
 
 
 def _damage(
-    entry: PlaceEntry, kept: dict[str, dict[int, bytes]], there: dict[int, NDArray[np.float32]], form: Form
+    entry: PlaceEntry, stored: dict[str, dict[int, bytes]], there: dict[int, NDArray[np.float32]], form: Form
 ) -> str | None:
-    """What is wrong with a place; None if nothing is."""
     name, row = repr(entry.place.id), entry.row
-    if row not in kept["descriptor"]:
+    if row not in stored["descriptor"]:
         return f"PostgreSQL: place {name} has no frame"
-    if len(kept["descriptor"][row]) + len(kept["local"][row]) != form.frame_bytes:
+    if len(stored["descriptor"][row]) + len(stored["local"][row]) != form.frame_bytes:
         return f"PostgreSQL: the descriptors of place {name} have another length than they must have"
-    if row not in kept["picture"]:
+    if row not in stored["picture"]:
         return f"object store: the picture of place {name} is missing, or is not the one that was stored"
-    picture, keypoints = kept["picture"][row], kept["keypoints"][row]
+    picture, keypoints = stored["picture"][row], stored["keypoints"][row]
     if (picture is None) != (entry.place.picture == "none"):
         return f"PostgreSQL: place {name} is recorded to keep {entry.place.picture}, which is not true"
     # The digest of a place with a camera covers its image and the camera's mask.
@@ -101,6 +100,6 @@ def _damage(
             return f"PostgreSQL: the keypoints of place {name} are damaged"
     if entry.key not in there:
         return f"Milvus: place {name} is missing; rebuild the index"
-    if not np.array_equal(there[entry.key], form.descriptors([kept["descriptor"][row]])[0]):
+    if not np.array_equal(there[entry.key], form.descriptors([stored["descriptor"][row]])[0]):
         return f"Milvus: the descriptor of place {name} is not the one in PostgreSQL; rebuild the index"
     return None

@@ -1,4 +1,4 @@
-"""One write to a map: what a transaction of PostgreSQL changes, and the entities that Milvus gets before its COMMIT."""
+"""One write to a map: the changes of a transaction in PostgreSQL, and the entities for Milvus before its COMMIT."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from core.errors import UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.maps.enrolling import picture_of
 from core.maps.place_filter import PlaceFilter
-from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
+from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import metadata_text, same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
 from core.milvus import ledger
 from core.milvus.collection import Collection, Entity
 from core.milvus.forms import Form
 from core.milvus.ledger import Frame, MapState, PlaceEntry
-from core.milvus.pictures.kept import Kept, new_object
+from core.milvus.pictures.stored import StoredPicture, new_object
 from core.milvus.tokens import tokens_of
 from core.places import Place, PlaceFields, Pose
 
@@ -73,7 +73,7 @@ class Write:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
-            keep: what to keep of the frame; by default what the map's settings say.
+            keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, self.state.number, item.id)
@@ -83,13 +83,13 @@ class Write:
                 ledger.put_keypoints(self.connection, self.state.number, stored.row, keypoints)
             return self.set_fields(stored, item.fields)
         metadata_text(item.fields.metadata)  # raises InvalidField
-        row, kept = self.state.rows, picture_of(item, self.state.record.keep if keep is None else keep)
+        row, (kind, picture) = self.state.rows, picture_of(item, self.state.record.keep if keep is None else keep)
         descriptor, local = self._form.packed(item.descriptor, item.local)
-        frame = Frame(descriptor, local, keypoints, self.kept(kept[1]))
+        frame = Frame(descriptor, local, keypoints, self.stored_picture(picture))
         ledger.put_frame(self.connection, self.state.number, row, frame)
         self.state = replace(self.state, rows=row + 1)
         place = Place(
-            **dict(item.fields), id=item.id, regions=item.regions, picture=kept[0],
+            **dict(item.fields), id=item.id, regions=item.regions, picture=kind,
             created_at=self._now if stored is None else stored.place.created_at, updated_at=self._now,
         )  # fmt: skip
         look = Look(item.descriptor, item.local, item.fields.pose)
@@ -118,7 +118,7 @@ class Write:
         return self._latest[sequence].position_of(look)
 
     def _looks(self, rows: list[int]) -> list[Look]:
-        """What the frames in some rows show."""
+        """The content of the frames in some rows."""
         number = self.state.number
         descriptors = ledger.of_frames(self.connection, number, "descriptor", rows)
         local = ledger.of_frames(self.connection, number, "local", rows)
@@ -141,18 +141,18 @@ class Write:
         if fields.pose != stored.place.pose:
             changed["pose_of"] = None
         place = stored.place.model_copy(update={**changed, "updated_at": self._now})
-        self._put(self._placed(stored, place), self._kept_descriptor(stored))
+        self._put(self._placed(stored, place), self._stored_descriptor(stored))
         self._let_go(stored, None)
         return place, "updated"
 
-    def _kept_descriptor(self, stored: PlaceEntry) -> bytes:
-        kept: bytes = ledger.of_frames(self.connection, self.state.number, "descriptor", [stored.row])[stored.row]
-        return kept
+    def _stored_descriptor(self, stored: PlaceEntry) -> bytes:
+        descriptor: bytes = ledger.of_frames(self.connection, self.state.number, "descriptor", [stored.row])[stored.row]
+        return descriptor
 
     def renew_entity(self, stored: PlaceEntry) -> None:
         """Give Milvus the entity of a place again."""
         if stored.number not in self._entities:
-            self._put(replace(stored, key=self.new_key()), self._kept_descriptor(stored))
+            self._put(replace(stored, key=self.new_key()), self._stored_descriptor(stored))
             self._let_go(stored, None)
 
     def adopt(self, item: Enrolment, history: History) -> None:
@@ -164,12 +164,12 @@ class Write:
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
         changed = replace(stored, place=stored.place.model_copy(update=moments), ordinal=ordinal)
         if stored.number in self._entities:  # Milvus does not have it yet
-            self._put(changed, self._kept_descriptor(stored))
+            self._put(changed, self._stored_descriptor(stored))
         elif ordinal == stored.ordinal:
             ledger.put(self.connection, self.state.number, changed)
             self._changed = True
         else:
-            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._put(replace(changed, key=self.new_key()), self._stored_descriptor(stored))
             self._let_go(stored, None)
         ledger.put_ordinal(self.connection, self.state.number, stored.sequence, max(ordinal, history.behind - 1))
 
@@ -188,10 +188,10 @@ class Write:
             ledger.put(self.connection, self.state.number, changed)
             self._changed = True
         else:
-            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._put(replace(changed, key=self.new_key()), self._stored_descriptor(stored))
             self._let_go(stored, None)
 
-    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+    def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
         stored = ledger.find(self.connection, self.state.number, frame.id)
         if stored is None or stored.digest != frame.digest or not self.state.record.verification:
@@ -203,7 +203,7 @@ class Write:
         """A place with other fields, under a new key; its position in its sequence changes only with the sequence.
 
         Args:
-            look: what its new frame shows; None: its frame stays.
+            look: the look of its new frame; None: its frame stays.
         """
         code, ordinal = stored.sequence, stored.ordinal
         if place.sequence != stored.place.sequence or self._leaves(stored, place, look):
@@ -262,8 +262,8 @@ class Write:
         self.state = replace(self.state, rows=entry.row + 1, places=self.state.places + 1)
         self._put(entry, frame.descriptor)
 
-    def kept(self, picture: bytes | None) -> Kept:
-        """A picture as its row has it; what is to be an object is stored at the end of the write."""
+    def stored_picture(self, picture: bytes | None) -> StoredPicture:
+        """A picture as its row has it; an object is stored at the end of the write."""
         if picture is None or self._objects is None:
             return picture
         if self._object_key is None:

@@ -43,7 +43,10 @@ _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"
 
 
 class Atlas:
-    """All maps of a data directory.  Any thread may call any method; one process uses the directory at a time."""
+    """All maps of a data directory (:class:`core.maps.store.Store`).
+
+    Any thread may call any method; one process uses the directory at a time.
+    """
 
     def __init__(self, directory: Path, rows_per_segment: int = ROWS_PER_SEGMENT) -> None:
         """Lock the directory, make it if it is missing, and read the record of every map.
@@ -138,18 +141,6 @@ class Atlas:
         unlisted: bool = False,
         precision: Precision = HALF,
     ) -> Map:
-        """Make an empty map for the descriptors of one encoder; it is durable when this returns.
-
-        Args:
-            dimension, local_shape: of the encoder's descriptors, D and (C, L).
-            unlisted: only :meth:`unlisted` finds the map, also after a restart, until it is published.
-            precision: how its descriptors are stored; this cannot be changed later.
-
-        Raises:
-            InvalidIdentifier: the id is malformed.
-            MapExists: the id is taken, possibly by a damaged map.
-            StorageFull, StorageFailure.
-        """
         check_map_id(map_id)
         # Raises ValueError for values that no segment file can hold.
         Layout(dimension, encoder_identity, self._rows_per_segment, local_shape, precision)
@@ -250,7 +241,6 @@ class Atlas:
             raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
 
     def unlisted(self) -> dict[str, Map]:
-        """The maps that are being built, by id."""
         return self._unlisted.copy()
 
     def abandoned(self) -> list[str]:
@@ -258,12 +248,6 @@ class Atlas:
         return list(self._unlisted)
 
     def publish(self, map_id: str) -> Map:
-        """List a map that was being built and is now complete; durable when this returns.
-
-        Raises:
-            UnknownMap: no map of this id is being built.
-            StorageFull, StorageFailure.
-        """
         with self._making, disk_errors(f"publish map {map_id!r}"):
             self._expect_open()
             made = self._unlisted.get(map_id)
@@ -283,11 +267,6 @@ class Atlas:
         return listed
 
     def abandon(self, map_id: str) -> None:
-        """Delete a map that was being built; nothing happens if there is none.
-
-        Raises:
-            StorageFull, StorageFailure: the map is still there.
-        """
         with self._making, disk_errors(f"remove map {map_id!r}"):
             made = self._unlisted.get(map_id)
             if made is None:
@@ -367,17 +346,11 @@ class Atlas:
         return [maps[map_id].record for map_id in page], more
 
     def quarantined(self) -> dict[str, str]:
-        """Why maps are out of service, by id."""
         in_use = {map_id: found.damage for map_id, found in self._maps.copy().items()}
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
         return {**self._damaged, **self._refused, **found_later}
 
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
-        """Read all files of a map again, whether it is in service or quarantined, and report what is damaged.
-
-        Raises:
-            UnknownMap, StorageFailure.
-        """
         with suppress(MapQuarantined):
             return self.get(map_id).verify(progress)
         report = inspect_folder(self._folder / map_id, progress)
@@ -398,7 +371,7 @@ class Atlas:
             removed = self._rename_removed(found, self._folder / map_id, self._maps)
             self._damaged.pop(map_id, None)
             self._refused.pop(map_id, None)
-        # What cannot be deleted now is deleted at the next start.
+        # Files that cannot be deleted now are deleted at the next start.
         shutil.rmtree(removed, ignore_errors=True)
 
     def check_writable(self) -> None:

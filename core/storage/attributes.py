@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.maps.place_filter import Scalar
 
 FEW = 5000
-"""Up to so many rows are looked up one by one, which is faster than reading all rows with a value."""
+"""Up to this number, rows are looked up one by one, which is faster than reading all rows with a value."""
 
 # A value "f" that is looked for, and a value "v" of a place that is equal.
 WANTED = (

@@ -1,4 +1,4 @@
-"""The cameras of a map: what is ignored in their frames, and the intrinsics by which a pose is measured in them."""
+"""The cameras of a map: the masks of their frames, and the intrinsics by which a pose is measured in them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ Access = Callable[[], AbstractContextManager[Connected]]
 
 
 class Cameras(AnyCameras):
-    """All cameras of one map, which are few and needed by every frame, so they stay in memory.  Any thread may use it.
+    """All cameras of one map (:class:`core.maps.cameras.Cameras`).
 
+    They are few and needed by every frame, so they stay in memory.  Any thread may use it.
     Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
@@ -38,7 +39,7 @@ class Cameras(AnyCameras):
     def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
         self._reading, self._writing = reading, writing
         self._known: dict[str, CameraRecord] | None = None
-        self._changes = 0  # counts changes, so that a reading that began before a change is not kept
+        self._changes = 0  # counts changes, so that a reading that began before a change is not cached
         self._lock = threading.Lock()  # of both; never held while reading or writing, which take other locks
 
     def all(self) -> list[CameraRecord]:
@@ -46,7 +47,6 @@ class Cameras(AnyCameras):
         return sorted(self._records().values(), key=lambda camera: camera.name)
 
     def known(self, name: str) -> CameraRecord | None:
-        """One camera; None if the map has none of this name."""
         return self._records().get(name)
 
     def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:

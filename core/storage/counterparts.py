@@ -12,9 +12,9 @@ from core.storage.writing import Write
 
 
 class Counterparts:
-    """Reads and writes where the places of one map have counterparts.  Any thread may use it.
+    """Reads and writes where the places of one map have counterparts (:class:`core.maps.counterparts.Counterparts`).
 
-    Every method may raise what ``reading`` and ``writing`` raise.
+    Any thread may use it.  Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
         reading, writing: open a connection to the map's database, and begin a write to the map.
@@ -24,16 +24,10 @@ class Counterparts:
         self._reading, self._writing = reading, writing
 
     def handed_over(self) -> dict[int, str]:
-        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
         with self._reading() as connection:
             return dict(connection.execute("SELECT row, pose_of FROM places WHERE pose_of IS NOT NULL").fetchall())
 
     def store(self, change: Correspondence) -> None:
-        """Store stations and poses, all of them in one COMMIT or, if this raises, none.
-
-        Rows whose place is gone are left out.  Hold the map's writes (``Transfer.paused_writes``) from the decision
-        on if none may be.
-        """
         if not change.rows:
             return
         with self._writing() as write:
@@ -42,15 +36,6 @@ class Counterparts:
                 write.set_counterpart(stored, track, station, pose, pose_of)
 
     def copy(self, other: Counterparts, names: Mapping[str, str]) -> None:
-        """Bring places that were copied from another map to the stations that they have there, in one COMMIT.
-
-        A station is told by the nearest frame of its track that both maps have.  If they have none, as where the
-        sequence is gone, the places on the track come to a new one, which no sequence has.
-
-        Args:
-            other: of the map from which they were copied.
-            names: the ids of the copied places in this map, by their ids in the other.
-        """
         with other._reading() as connection:
             there = _standings(connection)
         with self._writing() as write:

@@ -30,8 +30,8 @@ from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
     Enrolment,
-    KeptFrame,
     MapRecord,
+    PicturedPlace,
     SameFrame,
     SequenceSummary,
     VerifyReport,
@@ -78,11 +78,11 @@ class RecentPlaces:
     """
 
     def __init__(self) -> None:
-        self._kept: tuple[object, dict[int, Place]] = (object(), {})
+        self._cached: tuple[object, dict[int, Place]] = (object(), {})
 
     def places(self, state: object, rows: Iterable[int]) -> dict[int, Place]:
         """The places of ``rows`` that were read in this state of the map (``Database.state``)."""
-        of, places = self._kept
+        of, places = self._cached
         if of is not state:
             return {}
         found = ((row, places.get(row)) for row in rows)
@@ -91,15 +91,15 @@ class RecentPlaces:
     def keep(self, state: object, places: Mapping[int, Place]) -> None:
         """Remember places that were read after the map was found in this state."""
         small = {row: place for row, place in places.items() if len(str(place.metadata)) <= LONGEST_METADATA}
-        of, kept = self._kept
-        if of is not state or len(kept) + len(small) > MOST_RECENT:
-            self._kept = (state, dict(list(small.items())[:MOST_RECENT]))
+        of, cached = self._cached
+        if of is not state or len(cached) + len(small) > MOST_RECENT:
+            self._cached = (state, dict(list(small.items())[:MOST_RECENT]))
         else:
-            kept.update(small)
+            cached.update(small)
 
 
 class Map:
-    """The places of one environment.  Any thread may call any method.
+    """The places of one environment (:class:`core.maps.store.Map`).  Any thread may call any method.
 
     One thread writes at a time.  A write returns when it is synced, and every later snapshot contains it; reads and
     searches never wait for a write.
@@ -135,7 +135,6 @@ class Map:
 
     @property
     def record(self) -> MapRecord:
-        """The map's record as of its last edit."""
         return self._record
 
     @property
@@ -238,7 +237,7 @@ class Map:
             yield
 
     def _indexed(self, opened: OpenMap) -> IndexedMap:
-        """What the indexer needs of the map."""
+        """The part of the map that the indexer uses."""
 
         def publish(change: Callable[[Snapshot], Snapshot]) -> Snapshot:
             with self._lock:
@@ -265,7 +264,7 @@ class Map:
         A map that is searched exactly has none, so nothing is done.
 
         Args:
-            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+            progress: called with the number of rows that are done and of all; if it raises, nothing changes.
 
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
@@ -278,7 +277,6 @@ class Map:
         return self.index_status()
 
     def storage_status(self) -> StorageStatus:
-        """How much room the map takes on disk."""
         with self._guarded("read"):
             return storage_of(self._folder, self._record.precision, self.count_places(), self._keypoints_status())
 
@@ -334,7 +332,7 @@ class Map:
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
         """Change settings (the fields of MapSettings) or ``calibration`` (None: use that of the encoder).
 
-        ``keep`` applies to frames enrolled later; pictures that are kept already stay.  The revision grows by one if
+        ``keep`` applies to frames enrolled later; pictures that are stored already stay.  The revision grows by one if
         anything changes.
 
         Raises:
@@ -384,25 +382,15 @@ class Map:
         return found
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
-        """Replace all fields of a place; its frame stays.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self._writing() as write:
             return write.set_fields(ledger.expect(write.connection, place_id), fields)
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
-        """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
-
-        Raises:
-            UnknownPlace, InvalidField.
-        """
         with self._writing() as write:
             stored = ledger.expect(write.connection, place_id)
             return write.set_fields(stored, patched_fields(stored.place, changes))[0]
 
-    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
         """Store the keypoints of places that :meth:`without_keypoints` listed, with one COMMIT.
 
         A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
@@ -417,11 +405,6 @@ class Map:
             return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
 
     def forget(self, place_id: str) -> None:
-        """Delete a place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self._writing() as write:
             write.forget(ledger.expect(write.connection, place_id))
 
@@ -438,11 +421,6 @@ class Map:
         return found
 
     def forget_sequence(self, name: str) -> int:
-        """Delete all places of a sequence; returns how many.
-
-        Raises:
-            UnknownSequence: there is none.
-        """
         with self._writing() as write:
             count = write.forget_sequence(name)
             if not count:
@@ -458,7 +436,6 @@ class Map:
         return snapshot
 
     def scope(self, selection: Selection | None = None) -> SearchScope:
-        """The places that a query may find at this moment; None: all."""
         snapshot = self.snapshot()
         return Chooser(snapshot, self.attributes, self.rows_of).scope(selection) if selection else SearchScope(snapshot)
 
@@ -468,17 +445,11 @@ class Map:
         return self._places if snapshot is None else len(snapshot)
 
     def digest(self, place_id: str) -> bytes | None:
-        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
         return None if stored is None else stored.digest
 
     def place(self, place_id: str) -> Place:
-        """One place.
-
-        Raises:
-            UnknownPlace.
-        """
         with self._reading() as connection:
             return ledger.expect(connection, place_id).place
 
@@ -497,25 +468,14 @@ class Map:
             return page_of_places(connection, self._folder.name, cursor, limit, wanted)
 
     def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
-        """The ids of the places that fulfil some conditions, in the order of their enrolment.
-
-        Raises:
-            TooManyToDelete: there are more than ``most``.
-        """
         with self._reading() as connection:
             return _not_more(ledger.ids_of(connection, wanted, most + 1), most)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
-        """A page of sequences by name, and the cursor of the next page.
-
-        Raises:
-            InvalidCursor.
-        """
         with self._reading() as connection:
             return page_of_sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
         found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
@@ -526,7 +486,6 @@ class Map:
         return [found.get(row) for row in wanted]
 
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
-        """Those of the names that no sequence has."""
         return set(names) - set(self.attributes.sequence_codes(names))
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
@@ -539,54 +498,35 @@ class Map:
         """The keypoints of the places of rows that a search returned, read from disk.
 
         Returns:
-            In the order of ``rows``; None where a place was deleted or got another frame since, where none are kept,
-            and where those that are kept are damaged, which is logged.
+            In the order of ``rows``; None where a place was deleted or got another frame since, where none are stored,
+            and where the stored ones are damaged, which is logged.
         """
         wanted = [int(row) for row in rows]
         with self._reading() as connection:
             found = keypoints.at_rows(connection, wanted)
         return [found.get(row) for row in wanted]
 
-    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
-        """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
-
-        Args:
-            after: the number of the last place of the page before; 0 for the first page.
-            limit: how many places are listed at most; fewer if there are no further ones.
-        """
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         with self._reading() as connection:
             return keypoints.frames_without(connection, after, limit)
 
     def picture(self, place_id: str) -> bytes | None:
-        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
-
-        Raises:
-            StorageFailure: the picture is damaged.
-        """
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
             return None if stored is None else ledger.picture(connection, stored.number, place_id)
 
     def thumbnail(self, place_id: str) -> bytes:
-        """A small JPEG of a place.
-
-        Raises:
-            UnknownPlace: there is no such place.
-            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
-            StorageFailure: the picture is damaged.
-            MemoryError: its pixels do not fit into memory.
-        """
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
-            kept = ledger.picture(connection, stored.number, place_id)
-        if kept is None:
+            picture = ledger.picture(connection, stored.number, place_id)
+        if picture is None:
             raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
         if stored.place.picture == "thumbnail":
-            return kept
+            return picture
         try:
-            return encode_thumbnail(decode(kept, ANY_SIZE))
+            return encode_thumbnail(decode(picture, ANY_SIZE))
         except InvalidImage as error:
-            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
+            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
 
     def verify(self, progress: Progress = no_progress) -> VerifyReport:
         """Read all files of the map again and check them; writes and searches go on meanwhile.

@@ -1,6 +1,6 @@
 """Opening a map: from its folder to a snapshot in memory; and making the folder of a new map.
 
-What SQLite says is checked against the segment files, and a map of which anything fails its checksum is not served.
+SQLite's records are checked against the segment files, and a map is not served if any part fails its checksum.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ UNLISTED = ".unlisted-"
 
 @dataclass(frozen=True, eq=False)
 class OpenMap:
-    """A map that was read from disk, and what is needed to read and write it."""
+    """A map that was read from disk, and the objects to read and write it."""
 
     record: MapRecord
     layout: Layout
@@ -206,7 +206,7 @@ def read_snapshot(
         getattr(whereabouts, name)[columns.rows] = column
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
-    # What a map was searched by before is not known, but by the number of its places it may be as it was.
+    # The index that a map had before is not known, but the number of its places allows it to be as it was.
     table = _load_codes(files, entries)
     present: Tier = "compact" if len(table) else "exact"
     tier = tier_for(record.index, len(columns.rows), present)
@@ -240,13 +240,13 @@ def read_snapshot(
 
 
 def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
-    """Open a map for use, and delete what a crash left unfinished.
+    """Open a map for use, and delete the unfinished work of a crash.
 
     The snapshot is returned apart from the rest, so that its memory can be freed when a later one takes its place.
 
     Raises:
         DataDirectoryTooNew, DataDirectoryTooOld: its database is of a version that is not read.
-        Damage: what is on disk is not what was written.
+        Damage: the content on disk is not the one that was written.
         OSError, sqlite3.Error: the disk refuses.
     """
     _check_files(folder)

@@ -34,7 +34,7 @@ _COLUMNS = (
 
 
 class Plan:
-    """Reads the plan of one map.  Any thread may use it.
+    """Reads the plan of one map (:class:`core.maps.store.Plan`).  Any thread may use it.
 
     Args:
         reading: opens a connection to the map's database; the method may raise what it raises.
@@ -44,16 +44,6 @@ class Plan:
         self._reading = reading
 
     def columns(self, step: int = 1) -> str:
-        """The places in the order of their enrolment as the members of a JSON object, without its braces.
-
-        The members: ``sequences``, the names of the traverses; arrays with a value for each place: ``ids``,
-        ``sequence`` (index into ``sequences``, -1 without one) and ``flags``; and ``x``, ``y``, ``z`` (metres),
-        ``latitude``, ``longitude``, ``heading`` (degrees) and ``timestamp`` (milliseconds since 1970 UTC), each an
-        array with null where a place has no value, or null if no place has one.
-
-        Args:
-            step: about every so many places are listed.
-        """
         with self._reading() as connection:
             connection.execute("BEGIN")  # both queries see the same moment
             try:

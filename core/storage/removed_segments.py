@@ -32,7 +32,7 @@ class RemovedSegments:
     """
 
     def __init__(self, folder: Path, layout: Layout) -> None:
-        """For the map in ``folder``, of which no segment waits."""
+        """For the map in ``folder``, without waiting segments."""
         self._folder, self._layout = folder, layout
         self._waiting: dict[int, weakref.ref[object]] = {}
         self._suspects: set[int] | None = None  # segments that may have no living row; None: any of them
@@ -67,7 +67,7 @@ class RemovedSegments:
             query = "SELECT count(*) FROM places WHERE row >= ? AND row < ?"
             (places,) = connection.execute(query, (number * size, (number + 1) * size)).fetchone()
             if places:
-                log.error("%s is kept: it has %s places that are not searched.", segment_name(number), places)
+                log.error("%s is not removed: it has %s places that are not searched.", segment_name(number), places)
                 continue
             connection.execute("UPDATE segments SET removed = 1 WHERE number = ?", (number,))
             self._waiting[number] = weakref.ref(segment.reading)

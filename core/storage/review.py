@@ -1,4 +1,4 @@
-"""Frames that a map was told to keep because its answers were doubtful, and what people say that they show.
+"""Frames that a map stores because its answers were doubtful, and people's labels of them.
 
 They are in a small SQLite file of their own in the map's folder, ``review.sqlite``, and go with the map.  A frame is
 stored whole or not at all.  The file is bounded by the map's setting: the oldest frame without a label goes first, then
@@ -55,9 +55,10 @@ log = logging.getLogger(__name__)
 
 
 class ReviewFrames:
-    """The kept frames of one map.  Any thread may use it; the file is made with the first frame.
+    """The frames of one map that are stored for review (:class:`core.maps.review.Review`).
 
-    Every method may raise StorageFull and StorageFailure.
+    Any thread may use it; the file is made with the first frame.  Every method may raise StorageFull and
+    StorageFailure.
 
     Args:
         path: of the file.
@@ -81,11 +82,6 @@ class ReviewFrames:
                 self._connection = None
 
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
-        """Keep a frame, and drop the oldest ones beyond the limits; it is synced when this returns.
-
-        Returns:
-            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
-        """
         if len(data) > setting.most_bytes:
             return False
         digest = hashlib.sha256(data).digest()
@@ -104,19 +100,12 @@ class ReviewFrames:
         return True
 
     def shrink(self, setting: ReviewSetting) -> None:
-        """Drop the oldest frames beyond new limits, and give back the room."""
         with self._using() as connection:
             with transaction(connection):
                 _drop_oldest(connection, setting, self._held)
             connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
-        """The latest frames, newest first, and how many are kept in all, as of one moment.
-
-        Args:
-            before: only frames with a smaller number; None: all.
-            labelled: only frames with a label, or without one; None: all.
-        """
         conditions = ["number < ?1"] + ([] if labelled is None else [f"label IS {'NOT ' * labelled}NULL"])
         query = f"SELECT {_COLUMNS} FROM frames WHERE {' AND '.join(conditions)} ORDER BY number DESC LIMIT ?2"
         with self._using() as connection:  # nobody writes meanwhile
@@ -125,27 +114,15 @@ class ReviewFrames:
         return ReviewPage([_frame(row) for row in rows], count, size)
 
     def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
         query = f"SELECT {_COLUMNS} FROM frames WHERE label IS NOT NULL ORDER BY number"
         with self._using() as connection:
             return [_frame(row) for row in connection.execute(query).fetchall()]
 
     def find(self, number: int) -> ReviewFrame:
-        """One frame.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._using() as connection:
             return _frame(_expect(connection, number))
 
     def picture(self, number: int) -> bytes:
-        """The file of a frame.
-
-        Raises:
-            UnknownFrame: it is not kept.
-            StorageFailure: it is damaged.
-        """
         with self._using() as connection:
             frame = _frame(_expect(connection, number))
             found = connection.execute("SELECT bytes FROM pictures WHERE frame = ?", (number,)).fetchone()
@@ -156,10 +133,6 @@ class ReviewFrames:
 
     @contextmanager
     def held(self, number: int) -> Iterator[None]:
-        """Have a frame, if it is kept, not dropped for newer ones until the block ends; one at a time may hold it.
-
-        It does not wait for the disk.
-        """
         self._held.add(number)
         try:
             yield
@@ -167,11 +140,6 @@ class ReviewFrames:
             self._held.discard(number)
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Say what a frame shows, in place of what was said before.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._using() as connection, transaction(connection):
             frame = _frame(_expect(connection, number))
             connection.execute("UPDATE frames SET label = ? WHERE number = ?", (json.dumps(label), number))
@@ -179,11 +147,6 @@ class ReviewFrames:
         return replace(frame, label=label)
 
     def discard(self, number: int) -> None:
-        """Throw a frame away.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._using() as connection, transaction(connection):
             _expect(connection, number)
             connection.execute("DELETE FROM frames WHERE number = ?", (number,))
@@ -241,7 +204,7 @@ def _drop_unsound(connection: sqlite3.Connection) -> None:
 
 
 def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: Container[int]) -> None:
-    """Drop frames, those without a label first and the oldest of these first, until the limits are kept.
+    """Drop frames, those without a label first and the oldest of these first, until the limits hold.
 
     Those that are held stay.
     """
@@ -254,7 +217,7 @@ def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: C
 
 
 def _size(connection: sqlite3.Connection) -> tuple[int, int]:
-    """How many frames are kept, and their bytes."""
+    """How many frames are stored, and their bytes."""
     count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
     return int(count), int(size)
 

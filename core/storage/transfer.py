@@ -20,9 +20,9 @@ _OUTLINE = (
 
 
 class Transfer:
-    """Reads, copies and deletes many places of one map at once.  Any thread may use it.
+    """Reads, copies and deletes many places of one map at once (:class:`core.maps.transfer.Transfer`).
 
-    Every method may raise what ``reading`` and ``writing`` raise.
+    Any thread may use it.  Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
         reading, writing: open a connection to the map's database, and begin a write to the map.
@@ -33,34 +33,24 @@ class Transfer:
         self._reading, self._writing, self._lock = reading, writing, lock
 
     def outline(self) -> list[Outline]:
-        """All places in the order of their enrolment."""
         with self._reading() as connection:
             return [Outline(*values) for values in connection.execute(_OUTLINE).fetchall()]
 
     def count_without_image(self) -> int:
-        """How many places keep no original image."""
         with self._reading() as connection:
             (count,) = connection.execute("SELECT count(*) FROM places WHERE picture != 'image'").fetchone()
         return int(count)
 
     def sequence_ends(self) -> dict[str | None, int]:
-        """The ordinal that the next place of each sequence will get; the key None is for places without a sequence."""
         with self._reading() as connection:
             return dict(connection.execute("SELECT name, next_ordinal FROM sequences").fetchall())
 
     def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
-        """Places by id, each with its descriptor row; ids that do not exist are left out."""
         with self._reading() as connection:
             found = [ledger.find(connection, place_id) for place_id in place_ids]
         return {stored.place.id: (stored.place, stored.row) for stored in found if stored is not None}
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
-        """Store places of another map with their history, all of them or, if this raises, none.
-
-        Raises:
-            ValueError: a descriptor is of the wrong kind.
-            InvalidField, StorageFull, StorageFailure.
-        """
         if items:
             with self._writing() as write:
                 write.expect(len(items))
@@ -68,14 +58,6 @@ class Transfer:
                     write.adopt(item, history)
 
     def forget(self, frames: Mapping[str, bytes]) -> int:
-        """Delete places in one COMMIT, except those that show another frame by now.
-
-        Args:
-            frames: by the id of each place, the SHA-256 of its image.
-
-        Returns:
-            How many were deleted.
-        """
         if not frames:
             return 0
         count = 0
@@ -89,6 +71,5 @@ class Transfer:
 
     @contextmanager
     def paused_writes(self) -> Iterator[None]:
-        """No other thread writes to the map during the block."""
         with self._lock:
             yield

@@ -1,4 +1,4 @@
-"""Reading all files of a map again to see whether the disk still holds what was written."""
+"""Reading all files of a map again to see whether the disk still holds the written data."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, primary_code
 from core.geometry.keypoints import Keypoints
-from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
+from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, microseconds
@@ -101,7 +101,7 @@ class Write:
         self._now = datetime.now(UTC)
 
     def expect(self, frames: int) -> None:
-        """Allocate room for so many more frames at once, so that none has to be copied later."""
+        """Allocate room for more frames at once, so that none has to be copied later."""
         if (needed := self._appended + frames) > len(self._records):
             records = np.zeros(needed, self._layout.record)
             records[: self._appended] = self._records[: self._appended]
@@ -111,7 +111,7 @@ class Write:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
         Args:
-            keep: what to keep of the frame; by default what the map's settings say.
+            keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         stored = ledger.find(self.connection, item.id)
@@ -156,14 +156,14 @@ class Write:
             views.note(stored.ordinal, look)
 
     def _looks(self, rows: list[int]) -> list[Look]:
-        """What the frames in some rows show, those of this write included."""
+        """The content of the frames in some rows, those of this write included."""
         poses = {row: stored.place.pose for row, stored in ledger.stored_at(self.connection, rows).items()}
         before = self._snapshot.rows
         old = np.array([row for row in rows if row < before], np.int64)
         new = self._records[[row - before for row in rows if row >= before]]
-        kept = zip(self._snapshot.descriptors_at(old), self._snapshot.locals_at(old), strict=True)
+        stored = zip(self._snapshot.descriptors_at(old), self._snapshot.locals_at(old), strict=True)
         pending = zip(self._layout.descriptors_of(new), self._layout.locals_of(new), strict=True)
-        shown = dict(zip(old.tolist(), kept, strict=True))
+        shown = dict(zip(old.tolist(), stored, strict=True))
         shown |= dict(zip([row for row in rows if row >= before], pending, strict=True))
         return [Look(shown[row][0], shown[row][1], poses[row]) for row in rows]
 
@@ -171,7 +171,7 @@ class Write:
         """Change the fields of a place.
 
         Args:
-            look: what its new frame shows; None: its frame stays.
+            look: the look of its new frame; None: its frame stays.
         """
         moves = fields.sequence != stored.place.sequence
         leaves = not moves and self._leaves(stored, fields, look)
@@ -201,7 +201,7 @@ class Write:
         if self.record.verification:
             keypoints.put(self.connection, stored.number, stored.digest, found.record())
 
-    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+    def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
         stored = ledger.find(self.connection, frame.id)
         if stored is None or stored.digest != frame.digest or keypoints.are_kept(self.connection, stored.number):
@@ -297,13 +297,13 @@ class Write:
 
 
 class FailedWrites:
-    """Remembers what a failed write may have left in the files of a map, and removes it before the next write.
+    """Remembers rows that a failed write may have left in the files of a map, and removes them before the next one.
 
     Only the thread that writes may use this.
     """
 
     def __init__(self, folder: Path) -> None:
-        """For the map in ``folder``, of which no write has failed."""
+        """For the map in ``folder``, whose writes have not failed."""
         self._folder = folder
         self._rows = False
         self._log = False

@@ -1,1 +1,1 @@
-"""The upkeep of a map: what its own descriptors and its answers say about its weak points.  No storage, no HTTP."""
+"""The upkeep of a map: its weak points, by its own descriptors and answers.  No storage, no HTTP."""

@@ -1,4 +1,4 @@
-"""What follows from pairs of frames that show the same place: at which station of which track each place is.
+"""Tracks from pairs of frames that show the same place: the track and station of each place.
 
 A place is at a station of a track: at its own ordinal of its own sequence, until alignment finds that it shows what a
 frame of another traverse shows.  Then both are at one station, that of the older track, and so is whatever else was at

@@ -30,7 +30,7 @@ class Gap:
     """An unusual step between two consecutive frames.
 
     before: the position of the first of the two in its sequence.
-    measure: what is unusual: the distance in metres, the time in seconds, or the similarity of the two (their score).
+    measure: the quantity: the distance in metres, the time in seconds, or the similarity of the two (their score).
     value, median: of this step, and of all steps of the sequence.
     """
 
@@ -65,7 +65,7 @@ def long_steps(steps: NDArray[np.float64], measure: Measure) -> list[Gap]:
 
     Args:
         steps: float64 [n], not negative; NaN where not known.
-        measure: what the steps are.
+        measure: the quantity of the steps.
     """
     known = steps[~np.isnan(steps)]
     if len(known) < FEWEST_STEPS:

@@ -1,4 +1,4 @@
-"""Redundant places, which look like a neighbour, and what removing them costs in recall."""
+"""Redundant places, which look like a neighbour, and the recall that removing them costs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_NEIGHBOURS = 32
 _STEPS = MOST_NEIGHBOURS // 2
 
 FEWEST_STANDING = 10
-"""So many frames of one view are a stop: fewer are those of a slow robot or a fast camera."""
+"""From this number on, frames of one view are a stop: fewer are those of a slow robot or a fast camera."""
 
 
 def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
@@ -82,7 +82,7 @@ def _along(
 
     Args:
         sequence, ordinal: of the places, or their tracks and stations.
-        steps: a place is compared with so many places behind it.
+        steps: the number of places behind it with which a place is compared.
     """
     pairs = []
     order = np.lexsort((ordinal, sequence))
@@ -172,7 +172,7 @@ class RemovalTrial:
 
 @dataclass(frozen=True)
 class Thinning:
-    """A map with some of its places removed, and what that changes.
+    """A map with some of its places removed, and the effect.
 
     least: the score from which one place replaces another.
     kept: bool [places].

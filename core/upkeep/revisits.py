@@ -50,7 +50,7 @@ class Stretch:
 
 
 def silent_runs(matched: Iterable[bool]) -> list[Sign]:
-    """Find runs of frames that never matched, in a sequence of which other frames did."""
+    """Find runs of frames that never matched, in a sequence with other frames that did."""
     flags = list(matched)
     signs, position = [], 0
     for was_matched, run in groupby(flags):

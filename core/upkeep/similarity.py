@@ -1,4 +1,4 @@
-"""How alike the frames of two traverses are: the scores of all pairs, the way through them, and what is known of it."""
+"""How alike the frames of two traverses are: the scores of all pairs, the way through them, and its figures."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from core.threads import compute_alone, in_turns
 Rows = NDArray[np.int64]
 
 BLOCK, TILE = 2048, 512
-"""So many descriptors of the shorter traverse are in memory at a time, and of the longer one for each thread."""
+"""Number of descriptors of the shorter traverse in memory at a time, and of the longer one for each thread."""
 
 ROWS = 128
-"""So many rows of a matrix are worked on at a time where what lies between would take a multiple of its memory."""
+"""Number of rows of a matrix processed at a time where intermediate results would take a multiple of its memory."""
 
 NONE = -1
 """The column of a frame that has none."""
@@ -93,7 +93,7 @@ class GreyScale:
 def stretches_of(scores: NDArray[np.float32]) -> list[SharedStretch]:
     """The stretches that two traverses share by their scores, best first, with rows as ``first``.
 
-    If the second traverse has so many more frames that a path could not keep up with it, its frames are matched with
+    If the second traverse has too many frames for a path to keep up with it, its frames are matched with
     those of the first.
 
     Args:

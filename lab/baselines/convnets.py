@@ -157,8 +157,8 @@ class Differences:
     vectors: Array
 
     def score(self, queries: Sequence[Description]) -> Array:
-        asked, known = torch.from_numpy(stack(queries)), torch.from_numpy(self.vectors)
-        return np.asarray(1 - torch.cdist(asked, known, p=1).numpy() / SCALE, np.float32)
+        queried, known = torch.from_numpy(stack(queries)), torch.from_numpy(self.vectors)
+        return np.asarray(1 - torch.cdist(queried, known, p=1).numpy() / SCALE, np.float32)
 
 
 class Pyramid(MapsSystem):

@@ -2,7 +2,7 @@
 
 Chen, Maffra, Sa, Chli: Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place
 Recognition, IROS 2017.  A landmark is a group of connected cells of one late map whose activation is not
-zero, whatever its value; the N of highest mean are kept.  Cross-Region-BoW matches the landmarks of two frames
+zero, whatever its value; the N of highest mean are retained.  Cross-Region-BoW matches the landmarks of two frames
 and weighs each pair by how rare its words are; Cross-Region-VLAD is the thesis's variant that
 aggregates them as this project does (section 3.4.1).  The thesis matches the regions of R-MAC in the same way.
 """

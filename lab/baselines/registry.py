@@ -41,7 +41,7 @@ from lab.baselines.system import About, Resources, System
 
 @dataclass(frozen=True)
 class Baseline:
-    """One row: what a system is, known without reading a weight, and how it is built, once per evaluation."""
+    """One row: the description of a system, known without reading a weight, and its making, once per evaluation."""
 
     about: About
     build: Callable[[About, Resources], System]
@@ -109,7 +109,7 @@ def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None, v
             ``.verified`` the third always verifies.
         weights: the file that the system needs; for a system that runs on the packaged network,
             another network file to run on.
-        verify: when the third stage of an encoder that is asked as the service asks it verifies.
+        verify: when the third stage of an encoder verifies, if it is queried as by the service.
 
     Raises:
         MissingWeights: it needs a file and none was given, or there is no such file.
@@ -128,18 +128,18 @@ def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None, v
 
 def _encoder(name: str, models: EncoderCatalogue, weights: Path | None, verify: Verify) -> System:
     summaries = {summary.name: summary for summary in models.describe()}
-    asked, stages = name, ""
+    requested, stages = name, ""
     for ending in (FIRST_STAGE, TWO_STAGES, VERIFIED):
         whole = summaries.get(name.removesuffix(ending))
         if name not in summaries and whole is not None and has_second_stage(whole):
-            asked, stages = whole.name, ending
-    summary = summaries.get(asked.partition("@")[0])
+            requested, stages = whole.name, ending
+    summary = summaries.get(requested.partition("@")[0])
     if summary is None:
         known = [about.name for about in systems(models)]
         raise UnknownEncoder(f"no system {name[:80]!r} is known; there are {', '.join(known)}.")
     if weights is not None:
         raise InvalidModel(f"{summary.name} is an installed encoder and takes no file of weights.")
-    encoder, about = models.get(asked), about_encoder(summary)
+    encoder, about = models.get(requested), about_encoder(summary)
     if stages == FIRST_STAGE:
         network = open_network(models.network_file(summary.network), encoder.definition.layers)
         return EncoderSystem(first_stage(encoder, network), about_first_stage(about))

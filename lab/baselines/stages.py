@@ -39,10 +39,10 @@ NOTHING = Calibration(source="encoder-default", threshold=0, margin=0, backgroun
 
 
 def about_first_stage(about: About) -> About:
-    """The first stage of a two-stage encoder, of which ``about`` tells."""
-    kept = {name: value for name, value in about.configuration.items() if not name.startswith("agreement.")}
+    """The first stage of the two-stage encoder that ``about`` describes."""
+    configuration = {name: value for name, value in about.configuration.items() if not name.startswith("agreement.")}
     title = f"{about.title.removesuffix(LOCAL_AGREEMENT)}, first stage alone"
-    return replace(about, name=about.name + FIRST_STAGE, title=title, configuration=kept)
+    return replace(about, name=about.name + FIRST_STAGE, title=title, configuration=configuration)
 
 
 def first_stage(encoder: Encoder, network: Backbone) -> Encoder:
@@ -105,7 +105,7 @@ class VerifiedSystem(EncoderSystem):
 
 @dataclass(frozen=True)
 class ThreeStages:
-    """The references as the places of one map, which is asked as the service asks it.
+    """The references as the places of one map, which is queried as by the service.
 
     The score of a place is the value by which the service orders it (``core.judgement.geometry``): of two stages and,
     where it was verified, with ``WEIGHT`` times the share of its keypoints that are inliers.
@@ -152,7 +152,7 @@ class ThreeStages:
 
 
 def verified_gains(query: Keypoints, places: Sequence[Keypoints]) -> NDArray[np.float32]:
-    """What verification adds to the scores of k places, float32 [k]: ``WEIGHT`` times the share of the keypoints that
+    """The gain of the scores of k places by verification, float32 [k]: ``WEIGHT`` times the share of the keypoints that
     are inliers, of the picture that has fewer."""
     return WEIGHT * np.array([one.inlier_share for one in verify(query, places)], np.float32)
 

@@ -30,7 +30,7 @@ Constants = Mapping[str, str | int | float | bool | tuple[int | float | str, ...
 
 @dataclass(frozen=True)
 class About:
-    """What a system is, as ``placerec evaluate --list`` shows it.
+    """The description of a system, as ``placerec evaluate --list`` shows it.
 
     name: the name that selects it on the command line, such as ``seqslam``.
     paper: authors, title, venue and year.
@@ -113,8 +113,8 @@ class InnerProducts:
     """Turns inner products into the scores that users see; it must not change their order."""
 
     def score(self, queries: Sequence[Description]) -> Array:
-        asked = np.stack([query.arrays[self.name] for query in queries])  # Q x D
-        products = np.asarray(asked @ self.vectors.T, np.float32)  # Q x R
+        queried = np.stack([query.arrays[self.name] for query in queries])  # Q x D
+        products = np.asarray(queried @ self.vectors.T, np.float32)  # Q x R
         return products if self.finish is None else self.finish(products)
 
 
@@ -145,7 +145,7 @@ class VectorSystem(ABC):
 
 @dataclass(frozen=True)
 class Resources:
-    """What systems are built from.
+    """The inputs from which systems are built.
 
     models: the installed encoders and networks.
     weights: the file that the user gave for this system.  Where ``About.weights`` asks for a file, the registry

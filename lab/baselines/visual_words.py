@@ -16,7 +16,7 @@ from lab.baselines.system import Array
 
 ITERATIONS = 10
 POINTS_PER_WORD = 32
-"""At most so many features per word are clustered; of more, a random choice is taken."""
+"""The largest number of features per word that are clustered; of more, a random choice is taken."""
 
 BLOCK = 4096
 """Features assigned at a time, so that memory stays bounded."""

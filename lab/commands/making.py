@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from core.method.encoder import Encoder
 
 HELD_OUT = 5
-"""One image in so many is held out of training and calibrates the verdict."""
+"""One image in this number is held out of training and calibrates the verdict."""
 
 MOST_IMAGES = 3000
 
@@ -37,8 +37,8 @@ def split(paths: list[Path], limit: int, seed: int) -> Split:
         drawn = np.random.default_rng(seed).choice(len(paths), limit, replace=False)
         paths = [paths[index] for index in sorted(drawn)]
     held_out = paths[HELD_OUT - 1 :: HELD_OUT][:MOST_HELD_OUT]
-    kept = set(held_out)
-    return Split([path for path in paths if path not in kept], held_out)
+    calibrating = set(held_out)
+    return Split([path for path in paths if path not in calibrating], held_out)
 
 
 def install_described(

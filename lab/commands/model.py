@@ -60,7 +60,7 @@ def import_model(
     ] = False,
     models_dir: ModelsDir = None,
 ) -> None:
-    """Install a network that was trained elsewhere; its weights are kept as they are.
+    """Install a network that was trained elsewhere; its weights stay as they are.
 
     A .caffemodel becomes a network that vocabularies can be trained for.  An .onnx file with a preset or a description
     becomes an encoder as well; at once if nothing has to be learned for it, else with --images.

@@ -126,7 +126,7 @@ def _network_name(model: Path) -> str:
     return re.sub(r"[^a-z0-9._-]", "-", model.stem.lower()).lstrip("._-")[:64] or "caffe"
 
 
-# What goes in
+# Inputs
 
 
 def _input_size(network: CaffeNetwork) -> tuple[int, int]:

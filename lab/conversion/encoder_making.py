@@ -25,11 +25,11 @@ from core.recognition.encoder_calibration import UNMEASURED
 MOST_CELLS = 10_000
 FRAMES_OF_PROJECTION = 200
 CELLS_OF_PROJECTION = 50
-"""So many pictures, and so many cells of each, teach the projection of a second stage."""
+"""The number of pictures, and of cells of each, from which the projection of a second stage is learned."""
 
 
 def encoder_definition(description: NetworkDescription) -> EncoderDefinition:
-    """What a description says of the encoder.
+    """The metadata in the description of the encoder.
 
     A global descriptor is a feature of the whole frame, and one word of zeros leaves it as it is.
     """
@@ -58,7 +58,7 @@ def make_encoder(
     """An encoder of a network, not calibrated; its vocabulary, whitening and projection are fitted to frames.
 
     Args:
-        frames: gives them anew at each call; they are not asked for if nothing is learned of them.
+        frames: gives them anew at each call; it is not called if nothing is learned of them.
 
     Raises:
         InvalidModel: there are too few frames, or the network sees nothing in them.

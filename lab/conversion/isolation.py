@@ -54,7 +54,7 @@ class Contents(Mapping[str, Any]):
 
     @property
     def tree(self) -> Tree:
-        """What a child process wrote beside the arrays."""
+        """The output of a child process beside the arrays."""
         return json.loads(self._file.metadata()["tree"])
 
     def __iter__(self) -> Iterator[str]:
@@ -72,11 +72,11 @@ class Contents(Mapping[str, Any]):
 def read_in_child(
     module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"], room: int = 0
 ) -> Contents:
-    """What a module of this room finds in a file when it is run in a child process.
+    """The result of a module of this room for a file, run in a child process.
 
     Args:
         module: calls :func:`serve` when it is run.
-        arguments: what the module's reader takes besides the path.
+        arguments: of the module's reader, besides the path.
         room: bytes that it may take beside those of any reader.
 
     Raises:

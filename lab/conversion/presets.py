@@ -1,4 +1,4 @@
-"""What ``presets.toml`` knows of published networks: input, output, aggregation and citation."""
+"""The published networks in ``presets.toml``: input, output, aggregation and citation."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Verdicts and probabilities of an encoder in maps of any size, by the calibration that it ships.
 
-A map is a run of neighbouring references.  It is asked queries whose place it holds, and strangers: queries whose true
+A map is a run of neighbouring references.  It gets queries whose place it holds, and strangers: queries whose true
 references are all more than ``APART`` frames from any that it holds.  Both kinds count alike in the calibration error,
 as they did when the calibration was measured.  All of it is measured by two stages, and again with the best candidates
 verified geometrically.
@@ -43,7 +43,7 @@ MAPS = 6
 """Maps of each size, but one of all references."""
 
 ASKED = 20
-"""Queries of either kind that a map is asked at most; they are drawn at random."""
+"""The largest number of queries of either kind on a map; they are drawn at random."""
 
 CANDIDATES = 10
 """Places that are verified."""
@@ -89,7 +89,7 @@ class _Maps:
         self.products = stack(queries) @ stack(references).T
         cells = bool(encoder.candidates)
         empty = np.zeros((len(references), 0, 0), np.int8), np.zeros((len(queries), 0, 0), np.int8)
-        self.local, self.asked = (local_of(references), local_of(queries)) if cells else empty
+        self.local, self.queried = (local_of(references), local_of(queries)) if cells else empty
         self.pairs = _pairs(subject) if encoder.calibration.geometry is not None else None
         settings = MapSettings()
         self.neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
@@ -139,7 +139,7 @@ class _Maps:
         rows = part[order]
         places = Whereabouts.along_sequence(self.kept[rows])
 
-        stage = second_stage(encoder, self.asked[query], lambda at: self.local[rows[at]])
+        stage = second_stage(encoder, self.queried[query], lambda at: self.local[rows[at]])
         seen = examine(scores[order], places, self.neighborhood, *stage)
         ranked, places = rows[seen.order], places.take(seen.order)
         judged = judge(seen.scores, places, encoder.calibration, self.neighborhood, seen.examined)

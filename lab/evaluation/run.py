@@ -43,7 +43,7 @@ class Watch(Protocol):
 
 @dataclass(frozen=True)
 class Extras:
-    """What is measured besides the figures, and the seed of disturbances and of maps."""
+    """The measurements besides the figures, and the seed of disturbances and of maps."""
 
     scalability: bool = False
     severity: bool = False
@@ -64,7 +64,7 @@ def compare_systems(
     """Evaluate each system in turn; each result is cached as soon as it exists.
 
     Args:
-        load: decodes an image; what it raises ends the run.
+        load: decodes an image; its exceptions end the run.
         others: runs whose scores were computed elsewhere.
 
     Raises:
@@ -139,7 +139,7 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is measured before anything is judged.
+    """The measurements before any judgement.
 
     identity: of the system, after training.
     scores: float32 [Q, R'].

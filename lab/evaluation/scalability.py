@@ -37,17 +37,17 @@ def scalability(subject: Subject, cache: EvaluationCache) -> list[ScalePoint]:
     entry = cache.load(key)
     if entry is not None:
         return [ScalePoint(**point) for point in entry.values["points"]]
-    points = [_point(subject, size) for size in sizes if _asked(subject.pair, size)]
+    points = [_point(subject, size) for size in sizes if _answerable(subject.pair, size)]
     cache.store(key, CacheEntry({"points": [asdict(point) for point in points]}))
     return points
 
 
 def scale_steps(subject: Subject) -> int:
     """How many queries are scored for the points."""
-    return sum(len(_asked(subject.pair, size)) for size in scale_sizes(len(subject.pair.kept)))
+    return sum(len(_answerable(subject.pair, size)) for size in scale_sizes(len(subject.pair.kept)))
 
 
-def _asked(pair: TraversePair, size: int) -> list[int]:
+def _answerable(pair: TraversePair, size: int) -> list[int]:
     """The queries with a true reference among the first ``size`` that are kept."""
     kept = pair.kept[:size]
     return [number for number, true in enumerate(pair.truth) if np.isin(true, kept).any()]
@@ -55,16 +55,16 @@ def _asked(pair: TraversePair, size: int) -> list[int]:
 
 def _point(subject: Subject, size: int) -> ScalePoint:
     """The point of the first ``size`` kept references."""
-    kept, asked = subject.pair.kept[:size], _asked(subject.pair, size)
+    kept, answerable = subject.pair.kept[:size], _answerable(subject.pair, size)
     index = subject.system.index(subject.references.descriptions[:size])
-    scored = subject.score(index, [subject.queries.descriptions[number] for number in asked])
+    scored = subject.score(index, [subject.queries.descriptions[number] for number in answerable])
     truth, excluded = subject.pair.truth, subject.pair.excluded
-    left_out = None if excluded is None else [excluded[number] for number in asked]
-    outcomes = judge(scored.scores, kept, [truth[number] for number in asked], left_out)
+    left_out = None if excluded is None else [excluded[number] for number in answerable]
+    outcomes = judge(scored.scores, kept, [truth[number] for number in answerable], left_out)
     return ScalePoint(
         system=subject.about.name,
         references=size,
-        queries=len(asked),
+        queries=len(answerable),
         auc_pr=auc_pr(best_scores(outcomes), best_matched(outcomes)),
         recall_at_1=recall_at_k(outcomes, 1),
         milliseconds=float(np.median(scored.milliseconds)),

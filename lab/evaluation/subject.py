@@ -57,7 +57,7 @@ class Subject:
     Nothing is computed before it is needed; training comes first where a system learns.
 
     Args:
-        load: decodes an image; what it raises ends the run.
+        load: decodes an image; its exceptions end the run.
         advance: called after each image that is learned from or described, and after each query that is scored.
     """
 
@@ -78,7 +78,7 @@ class Subject:
 
     @property
     def trained_on(self) -> str | None:
-        """What the system was trained on, in words; None for a system that does not learn."""
+        """The training data of the system, in words; None for a system that does not learn."""
         return self.training.source if self._learns else None
 
     @property
@@ -115,7 +115,7 @@ class Subject:
 
     @property
     def judged_by(self) -> dict[str, str]:
-        """What a judgement depends on, as parts of a cache key: the truth, and the references that are left out."""
+        """The inputs of a judgement, as parts of a cache key: the truth, and the references that are left out."""
         excluded = {} if self.pair.excluded is None else {"excluded": arrays_digest(self.pair.excluded)}
         return {"truth": arrays_digest(self.pair.truth), **excluded}
 

@@ -48,7 +48,7 @@ assert DEFAULT.agreement is not None
 STAGE = DEFAULT.agreement
 OUTPUTS = DEFAULT.outputs
 WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
-"""Directions fitted of each layer; every configuration takes the first so many."""
+"""The number of directions fitted for each layer; every configuration takes the first of them."""
 THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
 COARSE = {**THESIS, "steps": DEFAULT.steps}
 PLAIN: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The curve, threshold and margin that an encoder ships with, measured on frames kept out of training.
+"""The curve, threshold and margin that an encoder ships with, measured on frames held out of training.
 
 Each trial is one query against a map that holds its place, or from which its place was taken out.
 Three kinds of maps (validation.py) count alike: a street traverse with either half of its references
@@ -95,12 +95,12 @@ def camera_trials(
     first = {c: int(np.flatnonzero((task.camera == c) & task.reference)[0]) for c in cameras}
     parts = []
     for camera in cameras:
-        asked = np.flatnonzero((task.camera == camera) & task.query & (np.arange(len(scores)) != first[camera]))
+        queried = np.flatnonzero((task.camera == camera) & task.query & (np.arange(len(scores)) != first[camera]))
         others = [first[c] for c in cameras if c != camera]
-        without = np.hstack([distractors[asked], scores[np.ix_(asked, np.array(others))]])
+        without = np.hstack([distractors[queried], scores[np.ix_(queried, np.array(others))]])
         nothing = np.zeros(without.shape, np.bool_)
-        whole = np.hstack([without, scores[asked, first[camera]][:, None]])
-        truth = np.hstack([nothing, np.ones((len(asked), 1), np.bool_)])
+        whole = np.hstack([without, scores[queried, first[camera]][:, None]])
+        truth = np.hstack([nothing, np.ones((len(queried), 1), np.bool_)])
         pair = [(without, nothing), (whole, truth)]
         parts.append(joined([judged_trials(*one, calibration, examined) for one in pair], same_frames=True))
     return joined(parts)

@@ -23,7 +23,7 @@ RATIO = 0.8
 """Lowe's ratio of the distances to the nearest and to the second nearest feature."""
 TOLERANCE = 2
 SMOOTHNESS = 0.05
-"""What a change of shift by one frame costs, as a share of a query's best number of matches."""
+"""The cost of a change of shift by one frame, as a share of a query's best number of matches."""
 
 
 def local_features(pixels: Pixels) -> NDArray[np.float32]:
@@ -40,7 +40,7 @@ def match_count(a: NDArray[np.float32], b: NDArray[np.float32]) -> int:
         return 0
     products = a @ b.T
     squared = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2 * products
-    nearest = np.partition(np.maximum(squared, 1e-3), 1, axis=1)[:, :2]  # equal features are not told apart by rounding
+    nearest = np.partition(np.maximum(squared, 1e-3), 1, axis=1)[:, :2]  # equal features are not separated by rounding
     return int((nearest[:, 0] < RATIO**2 * nearest[:, 1]).sum())
 
 
@@ -71,7 +71,7 @@ def corrected_truth(
         stated: bool [Q, R]; each query's true references form one run of indices or several, of which each is
             followed as a pass of its own.
     """
-    asked = [local_features(frame) for frame in queries]
+    queried = [local_features(frame) for frame in queries]
     known = [local_features(frame) for frame in references]
     truth = np.zeros_like(stated)
     for first, centres in passes(stated):
@@ -80,7 +80,7 @@ def corrected_truth(
             for column in range(2 * REACH + 1):
                 reference = centre + column - REACH
                 if 0 <= reference < len(references):
-                    support[row, column] = match_count(asked[first + row], known[reference])
+                    support[row, column] = match_count(queried[first + row], known[reference])
         support /= np.maximum(support.max(axis=1, keepdims=True), 1)
         for row, shift in enumerate(smooth_path(support) - REACH):
             centre = int(centres[row] + shift)

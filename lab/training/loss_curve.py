@@ -1,4 +1,4 @@
-"""Draws the losses of a distillation, on fresh crops and on photographs kept out of training, over the crops seen."""
+"""Draws the losses of a distillation, on fresh crops and on photographs held out of training, over the crops seen."""
 
 from __future__ import annotations
 

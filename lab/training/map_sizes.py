@@ -1,6 +1,6 @@
-"""Maps of any size, cut from real traverses: what the verdicts are on frames whose place is there, and on strangers.
+"""Maps of any size, cut from real traverses: the verdicts on frames whose place is there, and on strangers.
 
-A map holds so many of a traverse's references, a run of neighbours or frames drawn at random.  It is asked frames whose
+A map holds some of a traverse's references, a run of neighbours or frames drawn at random.  Queries are frames whose
 place it holds, and strangers: frames whose true references are all more than ``APART`` frames from any that it holds.
 The environment's prior (``core.judgement.background``) and what a curve loses in small maps are fitted here to the
 traverses of train/ and to nordland_tiny; corridor and lip6 judge the result (``benchmarks.maps.map_sizes``).  The prior
@@ -51,14 +51,15 @@ Cut = Literal["run", "spread"]
 Verify = Literal["never", "auto", "always"]
 
 APART = 8
-"""A stranger's true references are more than so many frames from every place of the map."""
+"""A stranger's true references are more than this number of frames from every place of the map."""
 
 SMALL = (1, 2, 5, 10, 30)
 """Sizes of maps for which something is imagined."""
 
 STRANGERS = 0.045
-"""At most so many strangers of small maps are recognized, on average over the kinds of traverses.  The default encoder
-of 0.1.0 recognized 0.042 with a prior by moments alone; with more, strangers of corridor are recognized too often."""
+"""The largest share of strangers of small maps that may be recognized, on average over the kinds of
+traverses.  The default encoder of 0.1.0 recognized 0.042 with a prior by moments alone; with more, strangers of
+corridor are recognized too often."""
 
 NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
 """The default of maps."""
@@ -67,14 +68,14 @@ STRETCHES = ((300, 700), (2200, 2600))
 """Frames of nordland_tiny that are two environments."""
 
 MOST_ASKED = 60
-"""Frames of either kind that a map is asked at most."""
+"""The largest number of frames of either kind that query a map."""
 
 
 CANDIDATES = 10
 """Places that are verified at most."""
 
 SUPPORT = 0.5
-"""Weight of the log odds of two stages beside evidence.  Camvid cannot tell it: evidence alone is nearly always
+"""Weight of the log odds of two stages beside evidence.  Camvid does not determine it: evidence alone is nearly always
 right there, and the two stages would have 0.13.  Hallways at 160 x 120 pixels would give them 0.4, nordland_tiny 0.9.
 With 0.25 to 0.75 the verdicts on corridor and lip6 stay within their bars."""
 
@@ -230,8 +231,8 @@ def trials_of_size(
         kept = cut(traverse, size, how, generator)
         sequence = np.zeros(size, np.int64)
         known = np.flatnonzero(traverse.truth[:, kept].any(axis=1))
-        for asked, there in ((known, True), (traverse.strangers(kept), False)):
-            chosen = generator.choice(asked, MOST_ASKED, replace=False) if len(asked) > MOST_ASKED else asked
+        for queried, there in ((known, True), (traverse.strangers(kept), False)):
+            chosen = generator.choice(queried, MOST_ASKED, replace=False) if len(queried) > MOST_ASKED else queried
             for query in chosen.tolist():
                 found = traverse.judged(query, kept, calibration, sequence, verify)
                 right = there and bool(traverse.truth[query, found.best])
@@ -279,12 +280,12 @@ def _drive(encoder: Encoder, frames: Sequence[Pixels], keypoints: Sequence[Keypo
     Every third frame is a reference, and the others are queries that show the place of the reference beside them.
     """
     described = describe(encoder, frames)
-    asked = np.flatnonzero(np.arange(len(frames)) % 3)
+    queried = np.flatnonzero(np.arange(len(frames)) % 3)
     kept = np.arange(0, len(frames), 3)
     pairs = None
     if keypoints is not None:
-        pairs = Pairs([keypoints[one] for one in asked.tolist()], [keypoints[one] for one in kept.tolist()])
-    return scored(encoder, described.at(asked), described.at(kept), np.abs(asked[:, None] - kept) <= 2, pairs)
+        pairs = Pairs([keypoints[one] for one in queried.tolist()], [keypoints[one] for one in kept.tolist()])
+    return scored(encoder, described.at(queried), described.at(kept), np.abs(queried[:, None] - kept) <= 2, pairs)
 
 
 def verifiable_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, Traverse]]:
@@ -378,7 +379,7 @@ def _in_small_maps(
 
 
 def _within(truth: NDArray[np.bool_], frames: int) -> NDArray[np.bool_]:
-    """Which references are within so many frames of a true one; bool [Q, R]."""
+    """Which references are within ``frames`` of a true one; bool [Q, R]."""
     wide = truth.copy()
     for shift in range(1, frames + 1):
         wide[:, shift:] |= truth[:, :-shift]
@@ -395,7 +396,7 @@ def _moments(values: Sequence[float], shares: Sequence[float]) -> tuple[float, f
 def fit_small_maps(calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int = 10) -> Curve:
     """The calibration's curve with what changes where the background is imagined.
 
-    Slope and intercept for full maps are kept.  The two other parameters are fitted by maximum likelihood to maps of
+    Slope and intercept for full maps stay.  The two other parameters are fitted by maximum likelihood to maps of
     SMALL sizes, runs and drawn ones, in which frames of known and of unknown places count alike, as do the kinds of
     traverses.
     """
@@ -420,7 +421,7 @@ def fit_geometry(
 ) -> GeometryTerms:
     """The terms of evidence, by maximum likelihood with SUPPORT given.
 
-    Every query is asked of maps of SMALL sizes and of 100, runs and drawn ones, and of halves of the references.  Each
+    Every query runs on maps of SMALL sizes and of 100, runs and drawn ones, and of halves of the references.  Each
     kind and size of map counts alike, and in it frames of known and of unknown places.
     """
     assert calibration.curve is not None

@@ -26,7 +26,7 @@ REAL_NIGHTS = 0.75
 
 @dataclass(frozen=True)
 class Split:
-    """Photographs to train on and photographs kept out, as paths."""
+    """Photographs to train on and held-out photographs, as paths."""
 
     train: tuple[Path, ...]
     held_out: tuple[Path, ...]

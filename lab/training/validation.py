@@ -1,10 +1,10 @@
-"""The three tasks that encoders are chosen by, on photographs kept out of training.
+"""The three tasks that encoders are chosen by, on photographs held out of training.
 
 * ``lip6``: two traverses of a street (eval/lip6_outdoor), recall@1 and AUC-PR by the truth as stated and, since that
   drifts from what the pictures show, by the truth corrected with local features (ground_truth.py).
 * ``webcams``: fixed cameras over months (eval/webcams).  Each daytime picture in turn is its
   camera's one reference among 500 frames of lip6; every other picture of the cameras is a query.
-* ``night``: cameras of train/day_night kept out of training.  One day picture of each camera and
+* ``night``: cameras of train/day_night held out of training.  One day picture of each camera and
   the 500 distractors are references; queries are the night pictures, shifted sideways by 10–20 %.
 
 The corridor is reported beside them, and nothing is chosen by it.
@@ -119,7 +119,7 @@ def load_tasks(datasets: Path) -> ValidationTasks:
 
 @dataclass(frozen=True)
 class Encodings:
-    """What an encoder makes of n pictures: descriptors float32 [n, D] and local ones int8 [n, C, L]."""
+    """The descriptions of n pictures by an encoder: descriptors float32 [n, D] and local ones int8 [n, C, L]."""
 
     descriptors: Array
     local: Cells
@@ -190,8 +190,8 @@ def camera_recall(task: CameraTask, among: Array, far: Array) -> float:
     means = []
     for c in cameras:
         for rank, reference in enumerate(ranks[c]):
-            asked = np.flatnonzero((task.camera == c) & task.query & (np.arange(len(among)) != reference))
+            queried = np.flatnonzero((task.camera == c) & task.query & (np.arange(len(among)) != reference))
             rivals = [ranks[o][rank % len(ranks[o])] for o in cameras if o != c and len(ranks[o])]
-            beaten = np.maximum(best_distractor[asked], among[np.ix_(asked, rivals)].max(axis=1, initial=-np.inf))
-            means.append(float((among[asked, reference] > beaten).mean()))
+            beaten = np.maximum(best_distractor[queried], among[np.ix_(queried, rivals)].max(axis=1, initial=-np.inf))
+            means.append(float((among[queried, reference] > beaten).mean()))
     return float(np.mean(means))

@@ -66,7 +66,7 @@ COLUMNS = ("corridor recall@1", "corridor AUC-PR", "lip6 recall@1", "lip6 AUC-PR
 
 
 class Geometry:
-    """What verification adds to the scores of pairs of pictures of two sets; a pair is verified once."""
+    """The gain by verification of the scores of pairs of pictures of two sets; a pair is verified once."""
 
     def __init__(self, queries: list[Keypoints], references: list[Keypoints], store: Path) -> None:
         self.queries, self.references, self.store = queries, references, store

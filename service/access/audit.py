@@ -26,20 +26,20 @@ REPEAT_SECONDS = 60.0
 """A repeated refusal is logged once in this time, with the number of repetitions."""
 
 KEPT_LINES = 1000
-"""Lines that are kept in memory while there is no file."""
+"""Lines that are held in memory while there is no file."""
 
 MOST_REFUSALS = 1024
 """Most kinds of refusals that are counted apart."""
 
 PARTS = {"map": "map", "place": "place", "sequence": "sequence", "camera": "camera", "job": "job"}
-"""Parameters of a path that tell what was changed."""
+"""Parameters of a path that identify the changed object."""
 
 log = logging.getLogger(LOGGER)
 
 
 @dataclass(frozen=True)
 class Asker:
-    """Who asked for a change, and with which request; a job keeps it, so that its end can be logged with it."""
+    """The caller of a change, and the request; a job stores it, so that its end can be logged with it."""
 
     principal: str
     key: str | None = None
@@ -50,7 +50,7 @@ class Asker:
 
 
 ASKER: ContextVar[Asker] = ContextVar("asker", default=Asker("owner"))  # noqa: B039 - frozen
-"""Who asked for what is being done now; threads that a request starts inherit it."""
+"""The caller of the present work; threads that a request starts inherit it."""
 
 
 def asker_of(principal: Principal, operation: str, state: Mapping[str, Any], client: str | None) -> Asker:
@@ -64,12 +64,12 @@ def asker_of(principal: Principal, operation: str, state: Mapping[str, Any], cli
 
 
 def asker_fields(asker: Asker) -> dict[str, Any]:
-    """The fields of a line that tell who asked; unknown ones are left out."""
+    """The fields of a line that identify the caller; unknown ones are left out."""
     return {name: value for name, value in asdict(asker).items() if value is not None}
 
 
 def asker_of_fields(fields: Mapping[str, Any]) -> Asker:
-    """Who asked, from what :func:`asker_fields` gave; nobody if there are none."""
+    """The caller from the fields of :func:`asker_fields`; nobody without fields."""
     known = Asker.__dataclass_fields__
     return Asker(**{"principal": "", **{name: value for name, value in fields.items() if name in known}})
 
@@ -79,7 +79,7 @@ def note_change(asker: Asker, path: Mapping[str, str], noted: Mapping[str, Any],
 
     Args:
         path: the parameters of its path.
-        noted: what its operation noted, such as the map's id or a count; ``"change": None`` says that nothing was
+        noted: the notes of its operation, such as the map's id or a count; ``"change": None`` says that nothing was
             changed.
         status: the status of the answer; 0 if there was none, which leaves open whether the change was made.
     """
@@ -100,10 +100,10 @@ def note_job(
 
     Args:
         event: "running", or the state in which the job has ended.
-        job: the fields that tell which job it is, such as its id and its map.
-        arguments: what the job was asked to do; the line names other maps and ``dry_run`` if they are among them.
+        job: the fields that identify the job, such as its id and its map.
+        arguments: the arguments of the job; the line names other maps and ``dry_run`` if they are among them.
         problem: the problem object of a job that has failed.
-        asker: who asked for the job, as :func:`now_asking` gave it.
+        asker: the caller who started the job, from :func:`now_asking`.
     """
     line = dict(job)
     for name in ("from", "to"):
@@ -117,7 +117,7 @@ def note_job(
 
 
 def now_asking() -> dict[str, Any]:
-    """Who asked for what is being done now, for a job to keep."""
+    """The fields of the caller of the present work, for a job to store."""
     return asker_fields(ASKER.get())
 
 
@@ -144,7 +144,7 @@ class LatestLines(logging.Handler):
 def audit_file(path: Path | None) -> Iterator[LatestLines | None]:
     """Also append the trail to a file, one JSON object a line; if the file is moved away, a new one is created.
 
-    Without a file the latest lines are kept in memory, and the context gives them.
+    Without a file the latest lines are held in memory, and the context gives them.
 
     Raises:
         StorageFailure: the file cannot be opened.
@@ -178,20 +178,20 @@ class Refusals:
     """Logs requests that were refused; repeated ones only now and then, so that they do not fill the disk."""
 
     def __init__(self) -> None:
-        self._told: OrderedDict[tuple[str | None, ...], tuple[float, int]] = OrderedDict()
+        self._logged: OrderedDict[tuple[str | None, ...], tuple[float, int]] = OrderedDict()
 
     def note(self, asker: Asker, path: Mapping[str, str], status: int, problem: str) -> None:
         """Note that a request was refused."""
         kind = (asker.client, asker.key, asker.operation, problem)
         now = time.monotonic()
-        told_at, silent = self._told.get(kind, (-REPEAT_SECONDS, 0))
-        if now - told_at < REPEAT_SECONDS:
-            self._told[kind] = (told_at, silent + 1)
+        logged_at, silent = self._logged.get(kind, (-REPEAT_SECONDS, 0))
+        if now - logged_at < REPEAT_SECONDS:
+            self._logged[kind] = (logged_at, silent + 1)
             return
-        self._told[kind] = (now, 0)
-        self._told.move_to_end(kind)
-        if len(self._told) > MOST_REFUSALS:
-            self._told.popitem(last=False)
+        self._logged[kind] = (now, 0)
+        self._logged.move_to_end(kind)
+        if len(self._logged) > MOST_REFUSALS:
+            self._logged.popitem(last=False)
         named = {name: path[name] for name in PARTS if name in path}
         repeated = {"before": silent} if silent else {}
         log.info("refused", extra={**named, **asker_fields(asker), "status": status, "problem": problem, **repeated})

@@ -37,7 +37,7 @@ from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
 
 MOST_CALLERS = 4096
-"""Buckets that are kept; the least recently used one makes room for another."""
+"""The largest number of buckets; the least recently used one makes room for another."""
 
 FAILURES_PER_SECOND, FAILURE_BURST = 1.0, 10
 """How many wrong keys one address may try."""

@@ -59,7 +59,7 @@ class HeldKeys:
 
 @dataclass
 class _Known:
-    """What is known of the keys; it is replaced as a whole.
+    """The keys as they were read; replaced as a whole.
 
     Args:
         demanded: whether a request needs a key.
@@ -76,7 +76,7 @@ class Keyring:
     """The keys of a service.  It may be used from any thread.
 
     Args:
-        store: what keeps the keys.
+        store: the stored keys.
         wall, monotonic: the clocks, in seconds.
         may_open: whether everybody may be let in while there are no keys; else nobody is, if that is learnt only after
             the start.

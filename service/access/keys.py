@@ -77,7 +77,7 @@ class Key:
     Args:
         id: 12 hexadecimal digits, which are part of the key.
         name: whose it is; unique among the keys in force.
-        role: what it may do.
+        role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
         digest: SHA-256 of the whole key, as its holder sends it.
         created_at: when it was created.
@@ -121,7 +121,7 @@ def digest_of(token: bytes) -> bytes:
 
 
 class KeyNarrowing(Protocol):
-    """All keys, while nobody else changes them; what is put is kept when the change ends without an error."""
+    """All keys, while nobody else changes them; changes are committed when the block ends without an error."""
 
     def read(self) -> list[Key]: ...
     def put(self, key: Key) -> None: ...
@@ -145,7 +145,7 @@ class KeyWatch(Protocol):
 
 
 class KeyRecords(ABC):
-    """What keeps keys; any number of processes may use them.
+    """The stored keys; any number of processes may use them.
 
     All methods may raise KeysUnreadable: the keys are damaged, of a later version or writable by others, or the disk or
     server failed.
@@ -169,7 +169,7 @@ class KeyRecords(ABC):
 
     @abstractmethod
     def watch(self) -> KeyWatch:
-        """What a running service learns of changes by."""
+        """The watch by which a running service learns of changes."""
 
     @abstractmethod
     def changing(self) -> AbstractContextManager[KeyNarrowing]:

@@ -13,7 +13,7 @@ from typing import Literal
 from service.errors.faults import MapForbidden
 
 Role = Literal["open", "query", "enrol", "admin"]
-"""What an operation needs: no key at all ("open"), or a key of this role or a higher one."""
+"""The lowest role that an operation needs; "open": no key at all."""
 
 LEVELS: dict[Role, int] = {"open": 0, "query": 1, "enrol": 2, "admin": 3}
 
@@ -34,7 +34,7 @@ class Principal:
     Args:
         name: of its key; it appears in logs and in the audit trail.
         key_id: None without a key.
-        role: what it may do.
+        role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
     """
 
@@ -82,7 +82,7 @@ all: the operation shows all maps together, so it needs a key without a limit.
 
 @dataclass(frozen=True)
 class Rule:
-    """What one operation needs.
+    """The requirements of one operation.
 
     Args:
         role: the lowest role that may call it.
@@ -109,7 +109,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_console": Rule("open", "none"),
     "find_console": Rule("open", "none"),
     "read_console_file": Rule("open", "none"),
-    # Keys and the audit trail: they tell of all maps, and of everybody
+    # Keys and the audit trail: they show all maps and all callers
     "read_own_key": Rule("query", "none"),
     "list_keys": Rule("admin", "all"),
     "create_key": Rule("admin", "all", changes=True),
@@ -123,9 +123,9 @@ OPERATIONS: dict[str, Rule] = {
     "create_map": Rule("admin", "named", changes=True),
     "edit_map": Rule("admin", "path", changes=True),
     "delete_map": Rule("admin", "path", changes=True),
-    "follow_map": Rule("query", "path"),  # pictures need the role enrol, which also sees who asked
+    "follow_map": Rule("query", "path"),  # pictures need the role enrol, which also sees the callers
     "verify_map": Rule("admin", "path"),  # it reads all that is stored, which keeps the disk busy
-    # Places, traverses, cameras: what an enrolment creates, replaces and deletes
+    # Places, traverses, cameras: the objects that an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
@@ -200,6 +200,6 @@ _LIMITS: dict[MapScope, str] = {
 
 
 def needs(rule: Rule) -> str:
-    """A sentence that tells which key an operation needs."""
+    """A sentence about the key that an operation needs."""
     role = "any role" if rule.role == "query" else f"the role `{rule.role}`"
     return f"If the service has keys, this needs a key of {role}{_LIMITS[rule.maps]}."

@@ -1,1 +1,1 @@
-"""What an administrator manages besides maps: the keys and the audit trail."""
+"""Administration besides maps: the keys and the audit trail."""

@@ -119,7 +119,7 @@ def _files(path: Path) -> list[tuple[Path, int]]:
 def _backwards(file: BinaryIO, end: int | None) -> Iterator[tuple[int, bytes]]:
     """The whole lines of a file from the last to the first, each with the position of its first byte.
 
-    What follows the last newline is being written, or torn, and left out.  Of a line that is too long only pieces are
+    The text after the last newline is being written, or torn, and left out.  Of a line that is too long only pieces are
     given, so that the caller can count what was read.
 
     Args:
@@ -161,7 +161,7 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 
 def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[AuditLine]:
-    """The lines that are kept in memory from the latest to the oldest.
+    """The lines that are held in memory from the latest to the oldest.
 
     Args:
         before: only lines before this one; None: all.

@@ -50,10 +50,10 @@ class AuditEntry(BaseModel):
 
     time: str = Field(description="When the line was written (ISO 8601 in UTC).")
     event: str = Field(description="`change`, `refused`, or `job` with the state that it has reached.")
-    operation: str | None = Field(description="The operation that was asked for.")
+    operation: str | None = Field(description="The operation that was called.")
     status: int | None = Field(description="Of the answer; 0: none was sent. Null for the line of a job.")
-    principal: str | None = Field(description="The name of the key that asked.")
-    key: str | None = Field(description="The id of the key that asked; null if there are no keys.")
+    principal: str | None = Field(description="The name of the caller's key.")
+    key: str | None = Field(description="The id of the caller's key; null if there are no keys.")
     client: str | None = Field(description="The address that the request came from.")
     request_id: str | None
     map: str | None
@@ -75,7 +75,7 @@ class AuditParameters(PageParameters):
     """Which lines of the audit trail."""
 
     map: str | None = Field(default=None, max_length=64, description="Only lines about this map.")
-    key: str | None = Field(default=None, max_length=64, description="Only what the key of this id or name asked for.")
+    key: str | None = Field(default=None, max_length=64, description="Only calls with the key of this id or name.")
     operation: str | None = Field(
         default=None, max_length=64, description="Only this operation.", examples=["delete_map"]
     )
@@ -83,7 +83,7 @@ class AuditParameters(PageParameters):
     before: Timestamp | None = Field(default=None, description="Only lines of this time or earlier.")
 
     def listing(self) -> Listing:
-        """What a cursor belongs to."""
+        """The listing that a cursor belongs to."""
         moments = (None if moment is None else moment.isoformat() for moment in (self.after, self.before))
         return ["audit", self.map, self.key, self.operation, *moments]
 

@@ -1,4 +1,4 @@
-"""Routes of keys: create, list, read, narrow and delete them; and who asks.
+"""Routes of keys: create, list, read, narrow and delete them; and identify the caller.
 
 A change is on disk when it is answered, and counts for every later request.  The command line changes the same file
 (``placerec keys``), so a service that nobody may manage any more can be opened again on its own machine.
@@ -63,7 +63,7 @@ LockOut = Annotated[
 
 @own.get("")
 def read_own_key(gate: GateDep, store: StoreDep, principal: PrincipalDep) -> OwnKey:
-    """Read who asks, and what the key of the request allows."""
+    """Read the caller, and the rights of the request's key."""
     expires_at = None if principal.key_id is None else store.find(principal.key_id).expires_at
     return OwnKey(
         id=principal.key_id,
@@ -182,7 +182,7 @@ def _take_effect(gate: Gate) -> None:
 
 
 def _noted(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """What the audit trail says of a change of a key, under names that do not hide who asked for it."""
+    """The fields of a changed key in the audit trail, under names that do not hide the caller's."""
     names = {"key": "changed_key", "name": "changed_key_name"}
     shown = {names.get(name, name): value for name, value in changes.items()}
     if shown.get("expires_at") is not None:

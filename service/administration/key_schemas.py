@@ -115,7 +115,7 @@ class KeyChanges(BaseModel):
 
 
 class OwnKey(BaseModel):
-    """Who asks, and what the asker may do."""
+    """The caller, and the caller's rights."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -79,7 +79,7 @@ TAGS = [
     {"name": "sessions", "description": "A session is a robot's run: a belief over places that every frame updates."},
     {
         "name": "review",
-        "description": "Frames that a map has kept because its answers were doubtful, with labels.",
+        "description": "Frames that a map has stored because its answers were doubtful, with labels.",
     },
     {"name": "frames", "description": "The encoder applied to frames, without a map."},
     {
@@ -89,7 +89,7 @@ TAGS = [
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
-    {"name": "keys", "description": "A key says who asks, what its holder may do, and with which maps."},
+    {"name": "keys", "description": "A key identifies the caller, and sets its holder's rights and maps."},
     {"name": "audit", "description": "The audit trail says who changed what, and who was refused."},
     {"name": "service", "description": "Health, metrics and version of the service."},
 ]
@@ -143,7 +143,7 @@ class Application(FastAPI):
 
 
 class RootPath:
-    """ASGI middleware that tells the application under which path a proxy publishes it.
+    """ASGI middleware that sets the path under which a proxy publishes the application.
 
     Args:
         root_path: for example /placerec; requests may come with it or, if the proxy removes it, without it.

@@ -45,7 +45,7 @@ class RuntimeCollector(Collector):
         listeners = runtime.engine.events.listeners
         yield _gauge("placerec_event_listeners", "Clients that listen to the events of maps.", listeners)
         dropped = runtime.engine.review_keeper.dropped
-        yield _gauge("placerec_review_frames_dropped", "Frames to keep for review that were not kept.", dropped)
+        yield _gauge("placerec_review_frames_dropped", "Frames for review that were not stored.", dropped)
         yield self._jobs()
         yield from self._maps()
         with suppress(OSError):

@@ -54,7 +54,7 @@ class Runtime:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
 
     Args:
-        database: what services share; None: this one keeps its state in its data directory.
+        database: the one that services share; None: this one keeps its state in its data directory.
     """
 
     def __init__(self, settings: Settings, metrics: Metrics, database: SharedDatabase | None = None) -> None:
@@ -219,7 +219,6 @@ def _outcome(check: Callable[[], None]) -> str:
 
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
-    """The jobs of a data directory."""
     return Jobs(
         settings.data_dir,
         settings.job_workers,

@@ -1,4 +1,4 @@
-"""The route of the service's own state: what an operator wants to see at a glance."""
+"""The route of the service's own state, for an operator's glance."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class QueueState(BaseModel):
     """The queue in front of the encoder."""
 
     waiting: int = Field(description="Requests that wait for the encoder or are in it.")
-    limit: int = Field(description="With so many, the next one is answered with 503.")
+    limit: int = Field(description="At this number the next one is answered with 503.")
 
 
 class ThreadsState(BaseModel):
@@ -91,7 +91,7 @@ class JobsState(BaseModel):
 class MemoryState(BaseModel):
     """Memory in bytes."""
 
-    resident: int | None = Field(description="Of the process; null where the system does not tell.")
+    resident: int | None = Field(description="Of the process; null where the system does not report it.")
     uploads: int = Field(description="Held by bodies of requests.")
     upload_limit: int
 
@@ -161,7 +161,7 @@ class ServiceState(BaseModel):
     sessions: int
     listeners: int = Field(description="Clients that listen to the events of maps.")
     maps: int = Field(description="Maps in service that the key may use.")
-    limits: dict[str, int | float] = Field(description="What callers have to keep to, by the names of the settings.")
+    limits: dict[str, int | float] = Field(description="The limits for callers, by the names of the settings.")
     memory: MemoryState | None = Field(
         description="Null unless the key is an admin's for all maps; so are the next two."
     )

@@ -32,7 +32,7 @@ def calibrate(
     recording: Annotated[
         Path | None,
         typer.Option(
-            help="With --frames: a bag or a video. The column file then has ids of its frames, as query --json tells."
+            help="With --frames: a bag or a video. The column file then has ids of its frames, as query --json shows."
         ),
     ] = None,
     topic: Topic = None,
@@ -174,7 +174,7 @@ def _of_recording(path: Path, topic: str | None, ids: list[str]) -> Iterator[byt
         frames = {frame.id: frame for frame in recording.frames}
         for name in ids:
             if name not in frames:
-                raise Failure(f"{path} has no frame {name!r}; placerec query --json tells the ids of its frames.")
+                raise Failure(f"{path} has no frame {name!r}; placerec query --json shows the ids of its frames.")
             try:
                 yield frames[name].load()
             except (InvalidImage, InvalidRecording) as error:

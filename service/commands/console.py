@@ -1,4 +1,4 @@
-"""What all commands share: output, errors, progress bars, tables."""
+"""The output of all commands: output, errors, progress bars, tables."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("
 
 
 class Failure(Exception):
-    """A command failed for a foreseen reason, which its text tells the user."""
+    """A command failed for a foreseen reason; its text explains it to the user."""
 
 
 class Commands(TyperGroup):

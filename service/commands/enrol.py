@@ -167,9 +167,10 @@ def _show_aligned(job: dict[str, Any]) -> None:
         show_outcome(job, as_json=False)
         return
     found = job["result"]
-    told = ", ".join(f"{one['sequence']}: {one['paired']}" for one in found["traverses"] if one["paired"])
+    paired = ", ".join(f"{one['sequence']}: {one['paired']}" for one in found["traverses"] if one["paired"])
     output.print(
-        f"{found['paired']} of {found['frames']} frames show places of other traverses{f' ({told})' if told else ''}; "
+        f"{found['paired']} of {found['frames']} frames show places of other traverses"
+        f"{f' ({paired})' if paired else ''}; "
         f"{found['poses_handed_over']} poses were handed over.",
         soft_wrap=True,
         markup=False,
@@ -188,7 +189,7 @@ async def _enrol(
     """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
 
     Returns:
-        What became of them, and how many they are.
+        The outcome, and the number of frames.
     """
     report = Report()
     async with open_service(target) as service:
@@ -200,12 +201,12 @@ async def _enrol(
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
 
-            def tell(outcome: SendingOutcome) -> None:
+            def report_frame(outcome: SendingOutcome) -> None:
                 report.add(outcome)
                 bar.advance(task)
 
             try:
-                await enrol_frames(service, map_id, frames, known, wanted["encoder"], tell)
+                await enrol_frames(service, map_id, frames, known, wanted["encoder"], report_frame)
             except Failure as failure:
                 done = sum(report.changes.values())
                 raise Failure(
@@ -229,7 +230,7 @@ async def _ready_map(service: Service, map_id: str, create: bool, settings: dict
 
 
 async def _mask(service: Service, map_id: str, camera: str) -> Mask | None:
-    """What to ignore in a camera's frames; a camera that the map does not have is refused, as each frame would be."""
+    """The mask of a camera's frames; a camera that the map does not have is refused, as each frame would be."""
     from core.frames.masks import Mask  # here because it takes a moment
 
     found = (await service.get(path_of("maps", map_id, "cameras", camera)))["mask"]

@@ -47,8 +47,8 @@ def list_jobs(
     as_json: AsJson = False,
 ) -> None:
     """List jobs, the newest first."""
-    asked = {"map": map_id, "state": state}
-    found = list_items(CommandTarget(url, data_dir), path_of("jobs"), {n: v for n, v in asked.items() if v is not None})
+    given = {"map": map_id, "state": state}
+    found = list_items(CommandTarget(url, data_dir), path_of("jobs"), {n: v for n, v in given.items() if v is not None})
     if as_json:
         show_json(found)
         return

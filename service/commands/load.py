@@ -67,7 +67,7 @@ async def robot(
 
 
 def measure(url: str, path: str, frames: Path, robots: int, seconds: float, key: str | None = None) -> dict[str, Any]:
-    """The measurement of :func:`drive` with so many robots, run in a process of its own.
+    """The measurement of :func:`drive` in a process of its own.
 
     Args:
         key: of the service; without one, that of the environment.
@@ -95,7 +95,7 @@ def measure(url: str, path: str, frames: Path, robots: int, seconds: float, key:
 
 
 async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: float) -> dict[str, object]:
-    """Let so many robots drive; the numbers of statuses, and each answer's time in milliseconds."""
+    """Let robots drive; the numbers of statuses, and each answer's time in milliseconds."""
     parts = urlsplit(url)
     host, port = str(parts.hostname), parts.port or 80
     key = os.environ.get(KEY)
@@ -118,7 +118,7 @@ async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: 
 
 
 def processor_seconds() -> float:
-    """What this process has cost so far."""
+    """The cost of this process so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 

@@ -39,7 +39,7 @@ from service.commands.options.recordings import (
 if TYPE_CHECKING:
     from core.recordings import RecordedFrame
 
-Asked = tuple[str, "RecordedFrame", bool]
+QueryFrame = tuple[str, "RecordedFrame", bool]
 """The file of a frame as it was given, the frame, and whether it is one of a recording."""
 
 PATIENCE = 30.0
@@ -125,11 +125,11 @@ def query(
         every_change,
     )
 
-    def asked(encoder: str | None) -> Iterator[Asked]:
+    def frames(encoder: str | None) -> Iterator[QueryFrame]:
         return _frames(images, options, encoder)
 
     failures = run(
-        _query(CommandTarget(url, data_dir), map_id, asked, options.every_change is not None, parameters, as_json)
+        _query(CommandTarget(url, data_dir), map_id, frames, options.every_change is not None, parameters, as_json)
     )
     if failures:
         raise typer.Exit(1)
@@ -144,7 +144,7 @@ def _position(near: str | None, geographic: bool) -> dict[str, Any]:
     return dict(zip(("latitude", "longitude") if geographic else ("x", "y"), parts, strict=True))
 
 
-def _frames(images: list[Path], options: RecordingOptions, encoder: str | None) -> Iterator[Asked]:
+def _frames(images: list[Path], options: RecordingOptions, encoder: str | None) -> Iterator[QueryFrame]:
     """The frames of all that was given, in its order."""
     from core.recordings.folder import picture_frame
     from core.recordings.recording import is_recording
@@ -161,7 +161,7 @@ def _frames(images: list[Path], options: RecordingOptions, encoder: str | None) 
 async def _query(
     target: CommandTarget,
     map_id: str,
-    asked: Callable[[str | None], Iterator[Asked]],
+    frames: Callable[[str | None], Iterator[QueryFrame]],
     by_change: bool,
     parameters: dict[str, Any],
     as_json: bool,
@@ -172,7 +172,7 @@ async def _query(
     )
     async with open_service(target) as service:
         encoder = (await service.get(path_of("maps", map_id)))["encoder"] if by_change else None
-        for file, frame, of_recording in asked(encoder):
+        for file, frame, of_recording in frames(encoder):
             try:
                 data = await asyncio.to_thread(_load, file, frame)
                 answer = await _ask(service, map_id, data, parameters)
@@ -183,8 +183,8 @@ async def _query(
                 complain(f"{frame.name}: {error}")
                 continue
             if as_json:
-                told = {"file": file, **({"frame": frame.id} if of_recording else {}), **answer}
-                typer.echo(json.dumps(told, ensure_ascii=False))
+                line = {"file": file, **({"frame": frame.id} if of_recording else {}), **answer}
+                typer.echo(json.dumps(line, ensure_ascii=False))
             else:
                 rows.add_row(frame.name, *_cells(answer))
     if rows.row_count:

@@ -20,7 +20,7 @@ TYPES = {
 """The content type of each kind of file; files of other kinds are not served."""
 
 BUILD = "{build}"
-"""What the page says instead of the name of the folder of its files."""
+"""The placeholder in the page for the name of the folder of its files."""
 
 
 @dataclass(frozen=True)

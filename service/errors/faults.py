@@ -10,7 +10,7 @@ from typing import ClassVar
 
 
 class Fault(Exception):
-    """Base of all classes below; its text tells the caller in a sentence what is wrong and what to do."""
+    """Base of all classes below; its text explains to the caller, in a sentence, the fault and the remedy."""
 
 
 class MalformedBody(Fault):
@@ -79,7 +79,7 @@ class BatchOutOfOrder(Fault):
 
 
 class UnknownExplanation(Fault):
-    """The picture of an explanation does not exist, or is no longer kept."""
+    """The picture of an explanation does not exist, or is no longer stored."""
 
 
 class PlaceTaken(Fault):
@@ -87,7 +87,7 @@ class PlaceTaken(Fault):
 
 
 class UnknownJob(Fault):
-    """The job does not exist, or ended so long ago that it is no longer kept."""
+    """The job does not exist, or ended so long ago that it is no longer stored."""
 
 
 class JobEnded(Fault):
@@ -263,7 +263,7 @@ class PlanTooLarge(Fault):
 
 
 class TooManyExports(Fault):
-    """The most exports that may be kept are already being downloaded."""
+    """The most exports that may be stored are already being downloaded."""
 
 
 class TooManyImports(Fault):
@@ -271,7 +271,7 @@ class TooManyImports(Fault):
 
 
 class ExportGone(Fault):
-    """The export of which the caller has a part is no longer kept."""
+    """The export of which the caller has a part is no longer stored."""
 
 
 class DigestMismatch(Fault):

@@ -38,14 +38,14 @@ log = logging.getLogger("placerec.problems")
 
 
 class Problem(BaseModel):
-    """What went wrong, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
+    """A problem, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
 
     model_config = ConfigDict(extra="allow")
 
     type: str = Field(description="The stable name of this kind of problem.")
     title: str = Field(description="The kind of problem in a few words; always the same for a type.")
     status: int = Field(description="The HTTP status.")
-    detail: str = Field(description="What is wrong with this request, and what to do about it.")
+    detail: str = Field(description="The fault of this request, and the remedy.")
     instance: str | None = Field(default=None, description="The path of the request.")
     request_id: str | None = Field(default=None, description="The id of the request, which is also in the log.")
 
@@ -98,7 +98,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
     errors.TooManyToDelete: Kind(422, "too-many-to-delete", "Too many places would be deleted at once"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
-    errors.UnknownFrame: Kind(404, "unknown-frame", "The frame is not kept for review"),
+    errors.UnknownFrame: Kind(404, "unknown-frame", "The frame is not stored for review"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
     faults.PlanTooLarge: Kind(422, "plan-too-large", "The plan would list too many places"),
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
@@ -133,7 +133,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.InvalidArchive: Kind(422, "invalid-archive", "The file is not a valid export of a map"),
     errors.ArchiveTooNew: Kind(422, "archive-too-new", "The file was written by a later version"),
     faults.DigestMismatch: Kind(422, "digest-mismatch", "The body does not match its digest"),
-    faults.ExportGone: Kind(412, "export-gone", "The export is no longer kept"),
+    faults.ExportGone: Kind(412, "export-gone", "The export is no longer stored"),
     faults.RangeNotSatisfiable: Kind(416, "range-not-satisfiable", "The range begins after the end"),
     faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
     faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
@@ -152,7 +152,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.BodyTooLarge: Kind(413, "body-too-large", "The body has too many bytes"),
     faults.FrameNeeded: Kind(409, "frame-needed", "The frame has to be sent"),
     faults.BatchOutOfOrder: Kind(409, "batch-out-of-order", "The batch before it is not stored"),
-    faults.UnknownExplanation: Kind(404, "unknown-explanation", "The picture does not exist or is no longer kept"),
+    faults.UnknownExplanation: Kind(404, "unknown-explanation", "The picture does not exist or is no longer stored"),
     # Load
     faults.QueueFull: Kind(503, "queue-full", "Too many requests are waiting"),
     faults.MemoryFull: Kind(503, "memory-full", "Too many uploads are under way"),
@@ -253,7 +253,7 @@ def declared(error: Exception) -> Exception:
         return faults.MemoryFull("There is not enough memory for this request now. Try again later.")
     if isinstance(error, OSError) and error.errno in SHORTAGES:
         try:
-            with disk_errors("do what was asked for"):
+            with disk_errors("do what was requested"):
                 raise error
         except errors.PlacerecError as refusal:
             return refusal
@@ -261,7 +261,7 @@ def declared(error: Exception) -> Exception:
 
 
 def problem_of(error: Exception, instance: str | None = None, request_id: str | None = None) -> Problem:
-    """The problem object of an exception; that of an unexpected exception tells only that it happened."""
+    """The problem object of an exception; that of an unexpected exception says only that it happened."""
     error = declared(error)
     kind = kind_of(error)
     detail = str(error) or kind.title

@@ -1,1 +1,1 @@
-"""What happens in maps, as it happens: queries, enrolments, sessions, jobs, changes of the map."""
+"""The live events of maps: queries, enrolments, sessions, jobs, changes of the map."""

@@ -1,6 +1,6 @@
 """The live events of all maps.
 
-Nothing is kept of a map that nobody listens to: a request then costs the question whether there is a feed.  The feed of
+No event is stored of a map without listeners: a request then costs the question whether there is a feed.  The feed of
 a map begins with its first listener, and stays for a while after the last one, so that a listener whose connection
 broke can go on where it was.  Listeners read from the feed; nobody waits for them.
 """
@@ -18,17 +18,17 @@ from contextlib import contextmanager
 from core.errors import PlacerecError
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from service.errors.faults import TooManyListeners
-from service.events.feed import Feed, Kept, Listener
+from service.events.feed import Feed, FeedEvent, Listener
 from service.events.schemas import PRIVATE, Event, QueryEvent
 
 LINGER_SECONDS = 120.0
-"""How long the events of a map are kept after its last listener has left."""
+"""How long the events of a map are stored after its last listener has left."""
 
 PICTURE_SIDE, PICTURE_QUALITY = 160, 70
 """Longer side in pixels and JPEG quality of the pictures of frames."""
 
 MOST_DRAWING, MOST_DRAWING_BYTES = 8, 32 << 20
-"""The most frames, and bytes of their files, of which pictures are being made; further ones are told without."""
+"""The most frames, and bytes of their files, of which pictures are being made; further events go without one."""
 
 log = logging.getLogger("placerec.events")
 
@@ -51,7 +51,7 @@ class Events:
         self.stopping = False
 
     def heard(self, map_id: str) -> bool:
-        """Whether an event of a map would be told or kept; ask this before an event is made."""
+        """Whether an event of a map would be sent or stored; call this before an event is made."""
         return map_id in self._feeds
 
     def publish(self, event: Event, frame: bytes | None = None, maps: frozenset[str | None] | None = None) -> None:
@@ -87,10 +87,10 @@ class Events:
         full = event.model_dump_json(ensure_ascii=True)
         public = event.model_dump_json(ensure_ascii=True, exclude=set(PRIVATE))
         verdict = event.verdict if isinstance(event, QueryEvent) else None
-        kept = Kept(0, event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
-        self._keep(event.map, feed, kept)
+        stored = FeedEvent(0, event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
+        self._keep(event.map, feed, stored)
 
-    def _keep(self, map_id: str, feed: Feed | None, event: Kept) -> None:
+    def _keep(self, map_id: str, feed: Feed | None, event: FeedEvent) -> None:
         """Add an event to the feed of its map, if the map has one."""
         with self._lock:
             if feed is not None and not feed.ended:

@@ -12,16 +12,16 @@ from itertools import islice
 
 from service.events.schemas import EventKind
 
-MOST_KEPT = 1000
-"""The most events of one map that are kept for listeners that are slow, or come again."""
+MOST_EVENTS = 1000
+"""The most events of one map that are stored for listeners that are slow, or reconnect."""
 
 MOST_BYTES = 4 << 20
 """The most bytes of these events, pictures included."""
 
 
 @dataclass(frozen=True)
-class Kept:
-    """An event as it is kept.
+class FeedEvent:
+    """An event as a feed stores it.
 
     number: counts the events of the feed; 0 before it is in one.
     verdict: of a query; None of other kinds.
@@ -42,7 +42,7 @@ class Kept:
         """The JSON object for a listener.
 
         Args:
-            private: whether it sees who asked.
+            private: whether it sees the callers.
             pictures: whether it gets pictures.
         """
         text = self.full if private else self.public
@@ -58,7 +58,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Read:
-    """What a listener reads at one time.
+    """The events that a listener reads at one time.
 
     missed: how many events it has lost since it read last; None if that is not known.
     events: the events after those, oldest first.
@@ -66,7 +66,7 @@ class Read:
     """
 
     missed: int | None
-    events: list[Kept]
+    events: list[FeedEvent]
     before: str
 
 
@@ -82,20 +82,20 @@ class Feed:
     lock: threading.Lock
     epoch: str = field(default_factory=lambda: secrets.token_hex(6))
     number: int = 0
-    kept: deque[Kept] = field(default_factory=deque)
+    latest: deque[FeedEvent] = field(default_factory=deque)
     size: int = 0
     listeners: list[Listener] = field(default_factory=list)
     left_at: float | None = None
     ended: bool = False
 
-    def add(self, event: Kept) -> None:
+    def add(self, event: FeedEvent) -> None:
         """Append an event under the next number, and drop the oldest ones beyond the limits."""
         self.number += 1
         event = replace(event, number=self.number)
-        self.kept.append(event)
+        self.latest.append(event)
         self.size += event.size
-        while len(self.kept) > MOST_KEPT or (self.size > MOST_BYTES and len(self.kept) > 1):
-            self.size -= self.kept.popleft().size
+        while len(self.latest) > MOST_EVENTS or (self.size > MOST_BYTES and len(self.latest) > 1):
+            self.size -= self.latest.popleft().size
         self.wake()
 
     def wake(self) -> None:
@@ -141,7 +141,7 @@ class Listener:
         """The id of the last event that was read."""
         return self._feed.id_of(self._seen)
 
-    def id_of(self, event: Kept) -> str:
+    def id_of(self, event: FeedEvent) -> str:
         """The id of an event, with which a listener can resume."""
         return self._feed.id_of(event.number)
 
@@ -154,11 +154,11 @@ class Listener:
         """The events since the last read, at most ``most`` of them."""
         feed = self._feed
         with feed.lock:
-            oldest = feed.number - len(feed.kept)
+            oldest = feed.number - len(feed.latest)
             missed: int | None = max(0, oldest - self._seen)
             if self._lost_track:
                 missed, self._lost_track = None, False
             start = max(self._seen, oldest)
-            events = list(islice(feed.kept, start - oldest, start - oldest + most))
+            events = list(islice(feed.latest, start - oldest, start - oldest + most))
             self._seen = start + len(events)
             return Read(missed, events, feed.id_of(start))

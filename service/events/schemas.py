@@ -14,11 +14,11 @@ from service.access.audit import ASKER, Asker
 EventKind = Literal["query", "enrolment", "session", "job", "map"]
 
 PRIVATE = frozenset({"key", "explanation"})
-"""Fields that a key of the role query does not get: who asked, and the way to a picture of the frame."""
+"""Fields that a key of the role query does not get: the caller, and the path of a picture of the frame."""
 
 
 class Event(BaseModel):
-    """What all events have."""
+    """The fields of all events."""
 
     kind: ClassVar[EventKind]
 
@@ -27,7 +27,7 @@ class Event(BaseModel):
     request_id: str | None = Field(description="The id of the request that did it; null if none did.")
     key: str | None = Field(
         default=None,
-        description="The name of the key that asked for it; null if none did. Only for keys of the role enrol.",
+        description="The name of the caller's key; null without one. Only for keys of the role enrol.",
     )
 
     @classmethod
@@ -35,7 +35,7 @@ class Event(BaseModel):
         """An event of this moment.
 
         Args:
-            by: who asked for it; None: who is asking now (``service.access.audit.ASKER``).
+            by: the caller; None: the present one (``service.access.audit.ASKER``).
         """
         asker = ASKER.get() if by is None else by
         key = asker.principal if asker.key is not None else None
@@ -51,7 +51,7 @@ class QueryEvent(Event):
 
     kind: ClassVar[EventKind] = "query"
 
-    operation: str | None = Field(description="The operation that was asked for, such as query or send_frame.")
+    operation: str | None = Field(description="The operation that was called, such as query or send_frame.")
     verdict: Verdict
     probability: float | None
     place: str | None = Field(description="Id of the place; non-null only if recognized.")
@@ -69,7 +69,7 @@ class QueryEvent(Event):
     revision: int | None = Field(description="The revision of the map that answered.")
     explanation: str | None = Field(
         default=None,
-        description="The path of the picture that explains the answer, if it was asked for. Only for keys of the role "
+        description="The path of the picture that explains the answer, if it was requested. Only for keys of the role "
         "enrol.",
     )
 
@@ -89,7 +89,7 @@ class EnrolmentEvent(Event):
 
     kind: ClassVar[EventKind] = "enrolment"
 
-    operation: str | None = Field(description="The operation that was asked for, such as enrol_place.")
+    operation: str | None = Field(description="The operation that was called, such as enrol_place.")
     changes: dict[str, int] = Field(description="How many places were created, updated, replaced, unchanged, deleted.")
     places: list[ChangedPlace] = Field(default_factory=list, description="The first of those that changed.")
     sequence: str | None = Field(default=None, description="The traverse that was deleted as a whole.")
@@ -121,7 +121,7 @@ class JobEvent(Event):
     kind: ClassVar[EventKind] = "job"
 
     job: str
-    job_kind: str = Field(description="What the job does, such as re-encode.")
+    job_kind: str = Field(description="The kind of the job, such as re-encode.")
     state: str
     progress: dict[str, Any] = Field(description="`done`, `total` and `message`.")
     cancelling: bool
@@ -139,12 +139,12 @@ class MapEvent(Event):
 
 
 class Listening(BaseModel):
-    """The first event of a stream: what it will tell."""
+    """The first event of a stream: the selection of the events that follow."""
 
     map: str
     kinds: list[EventKind]
-    verdicts: list[Verdict] | None = Field(description="The verdicts of the queries that are told; null: all.")
-    pictures: bool = Field(description="Whether queries are told with a small picture of the frame.")
+    verdicts: list[Verdict] | None = Field(description="The verdicts of the queries that are sent; null: all.")
+    pictures: bool = Field(description="Whether queries come with a small picture of the frame.")
 
 
 class Missed(BaseModel):

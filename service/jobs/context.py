@@ -1,4 +1,4 @@
-"""What a running job uses: its context (progress, notes, cancellation), and encoding that lets requests go first."""
+"""Running jobs: their context (progress, notes, cancellation), and encoding that lets requests go first."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ WRITING_SECONDS = 2.0
 """The progress of a job is written to disk at most once in this time; its end is always written."""
 
 SLICE_SECONDS = 5.0
-"""A resumable job works for so long before it gives way to waiting jobs of other maps."""
+"""A resumable job works for this time before it gives way to waiting jobs of other maps."""
 
 
 class JobCancelled(Exception):
-    """Raised in a job that was asked to stop.  The job undoes what must not stay half done, and lets it propagate."""
+    """Raised in a job that was cancelled.  The job undoes what must not stay half done, and lets it propagate."""
 
 
 class JobInterrupted(Exception):
@@ -88,7 +88,7 @@ class JobContext:
         Args:
             done: steps that are done.
             total: all steps; None while their number is not known.
-            message: what the job is doing; at most 500 characters are kept.
+            message: the present step of the job; at most 500 characters are stored.
         """
         now = time.monotonic()
         writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
@@ -107,19 +107,19 @@ class JobContext:
 
     @property
     def cancelled(self) -> bool:
-        """Whether the job was asked to stop."""
+        """Whether the job was cancelled."""
         return self._jobs.get(self.id).cancelling
 
     @property
     def is_to_stop(self) -> bool:
-        """Whether the job was asked to stop, or has to go on later."""
+        """Whether the job was cancelled, or has to go on later."""
         return self._jobs.interrupts(self.id) or self.cancelled
 
     def check_cancelled(self) -> None:
         """Raise if the job has to stop.
 
         Raises:
-            JobCancelled: the job was asked to stop.
+            JobCancelled: the job was cancelled.
             JobInterrupted: the service is stopping, or has lost the job to another one.
         """
         if self._jobs.interrupts(self.id):
@@ -186,7 +186,7 @@ def run_after_requests(
 
     Raises:
         JobCancelled, JobInterrupted: the job has to stop.
-        Others: what the coroutine raises.
+        Others: the exceptions of the coroutine.
     """
 
     async def stopped() -> None:
@@ -215,7 +215,7 @@ def encode_after_requests(
         masks: for each frame the part that is ignored.
 
     Returns:
-        For each frame its encoding, without the pixels, or the error that kept it from being encoded.
+        For each frame its encoding, without the pixels, or the error that prevented it.
 
     Raises:
         JobCancelled, JobInterrupted: the job has to stop.

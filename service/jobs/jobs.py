@@ -1,7 +1,7 @@
 """Jobs: long work in the background, which can be followed and cancelled, and survives a restart.
 
 A job is a function that runs in a worker's thread.  A job of a registered kind (:meth:`Jobs.register`) is resumed from
-its arguments and notes after a restart; any other is then marked as failed.  A job stops when it is asked to only at
+its arguments and notes after a restart; any other is then marked as failed.  A cancelled job stops only at
 the points where it calls :meth:`JobContext.check_cancelled`.
 """
 
@@ -37,7 +37,7 @@ MOST_RESULT_BYTES = 4 << 20
 """The longest result, as JSON, that a job may have."""
 
 TELLING_SECONDS = 1.0
-"""Listeners of a map are told of a job's progress at most once in this time."""
+"""The shortest time between two events of a job's progress."""
 
 Discard = Callable[[Job], None]
 """Removes the files of a job once the job has ended."""
@@ -54,7 +54,7 @@ class Jobs:
         longest_queue: how many jobs may wait.
         history: how many ended jobs are remembered.
         most_watchers: how many clients may follow jobs at one time.
-        events: is told how the jobs go on; None: nobody is.
+        events: receives the progress of jobs; None: it is not published.
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the jobs' file.
@@ -72,7 +72,7 @@ class Jobs:
     ) -> None:
         self._workers, self._longest_queue, self._history = workers, longest_queue, history
         self._most_watchers, self._events = most_watchers, events
-        self._told: dict[str, tuple[str, float]] = {}  # of running jobs: the state that was told last, and when
+        self._published: dict[str, tuple[str, float]] = {}  # of running jobs: the state published last, and when
         self.stopping = False
         self._changed = threading.Condition()  # held while a job is changed
         self._kinds: dict[str, Work] = {}
@@ -289,11 +289,11 @@ class Jobs:
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
         context = JobContext(self, job)
-        ASKER.set(asker_of_fields(job.asker))  # what it does is done for who asked for it
+        ASKER.set(asker_of_fields(job.asker))  # it works on behalf of its caller
         try:
             result = dict(self._works[job.id](context))
             if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:
-                raise ValueError("the result is too long to be kept")
+                raise ValueError("the result is too long to be stored")
         except JobCancelled:
             ended = self._end(job.id, "cancelled")
         except JobInterrupted:
@@ -433,18 +433,18 @@ class Jobs:
                     loop.call_soon_threadsafe(event.set)
 
     def _tell(self, job: Job) -> None:
-        """Tell the listeners of the job's maps how it is; that it only went on is told at most once in a while."""
+        """Publish the state of a job to the listeners of its maps; mere progress at most once in a while."""
         used, events = job.used_maps(), self._events
         if events is None or not any(events.heard(name) for name in used if name is not None):
-            self._told.pop(job.id, None)
+            self._published.pop(job.id, None)
             return
         state, now = f"{job.state} {job.cancelling}", time.monotonic()
-        told, moment = self._told.get(job.id, ("", 0.0))
-        if told == state and now - moment < TELLING_SECONDS:
+        published, moment = self._published.get(job.id, ("", 0.0))
+        if published == state and now - moment < TELLING_SECONDS:
             return
-        self._told[job.id] = (state, now)
+        self._published[job.id] = (state, now)
         if job.ended:
-            self._told.pop(job.id, None)
+            self._published.pop(job.id, None)
         for name in used - {None}:
             events.publish(_event(str(name), job), maps=frozenset(used))
 

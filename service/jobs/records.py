@@ -59,16 +59,16 @@ class Job:
     number: counts the jobs; a later job has a larger number.
     arguments: the arguments of the job, as JSON values.
     resumable: whether the job is resumed from ``arguments`` and ``notes`` after a restart.
-    cancelling: whether the job was asked to stop.
+    cancelling: whether the job was cancelled.
     attempt: how often the job was started.
     change: counts the changes of the job within the attempt.
     done, total: steps that are done, and all steps; the total is None while it is not known.
-    notes: what the job has stored for its next attempt.
+    notes: stored by the job for its next attempt.
     result: the result of a job that has succeeded.
     problem: why the job failed, as a problem object (RFC 9457).
     maps: the ids of the maps that the job uses, with the time at which each was created: a map of the same id that was
         created at another time is another map.
-    asker: who asked for it, as ``service.access.audit.Asker`` has it; for the audit trail.
+    asker: its caller, the fields of ``service.access.audit.Asker``; for the audit trail.
     """
 
     number: int
@@ -118,7 +118,7 @@ class JobRecords:
     def __init__(self, directory: Path) -> None:
         """Open the file in a data directory that this process has locked.
 
-        A damaged file is renamed and replaced by a new one; the jobs that can still be read from it are kept as jobs
+        A damaged file is renamed and replaced by a new one; the jobs that can still be read from it stay as jobs
         that cannot be resumed.
 
         Raises:

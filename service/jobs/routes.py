@@ -74,7 +74,7 @@ Wait = Annotated[
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> JobPage:
-    """List jobs, the newest first; only the latest ended jobs are kept."""
+    """List jobs, the newest first; only the latest ended jobs are stored."""
     listing: Listing = ["jobs", page.map, page.kind, page.state]
     after = decode_number(listing, page.cursor)
     found = [

@@ -34,7 +34,7 @@ class Progress(BaseModel):
 
     done: int
     total: int | None = Field(description="Null while it is not known.")
-    message: str = Field(description="What the job is doing; may be empty.")
+    message: str = Field(description="The present step of the job; may be empty.")
 
 
 class JobView(BaseModel):
@@ -43,12 +43,12 @@ class JobView(BaseModel):
     model_config = ConfigDict(json_schema_extra={"examples": [JOB_EXAMPLE]})
 
     id: str
-    kind: str = Field(description="What the job does, such as re-encode.")
+    kind: str = Field(description="The kind of the job, such as re-encode.")
     map: str | None = Field(description="The map that the job works on.")
     state: JobState = Field(description="Queued, then running, then succeeded, failed or cancelled.")
     progress: Progress
     arguments: dict[str, Any] = Field(description="The arguments with which the job was submitted.")
-    cancelling: bool = Field(description="The job was asked to stop, and stops at the next point where it can.")
+    cancelling: bool = Field(description="The job was cancelled, and stops at the next point where it can.")
     resumable: bool = Field(description="The job goes on after a restart of the service; otherwise it then fails.")
     attempt: int = Field(description="How often the job was started.")
     result: dict[str, Any] | None = Field(description="The result, once the job has succeeded.")

@@ -1,6 +1,6 @@
 """Calibrating a map: the route, and the job that does it in the background.
 
-A map is asked frames whose places are known.  Its threshold, margin and probability curve follow from its answers, and
+Frames whose places are known query the map.  Its threshold, margin and probability curve follow from its answers, and
 become the map's own calibration unless an operator has set another one meanwhile.
 """
 
@@ -124,8 +124,8 @@ async def calibrate_map(
 ) -> CalibrationReport | Response:
     """Measure when a map's answers can be believed, and store the result as the map's calibration.
 
-    With a JSON body, the frames that are asked are the map's own: those of one traverse, compared with the others, or
-    all of them, or those that were kept for review and labelled. With a form, they are new frames: each is a file part,
+    With a JSON body, the queried frames are the map's own: those of one traverse, compared with the others, or
+    all of them, or those stored for review and labelled. With a form, they are new frames: each is a file part,
     and a part `calibration` holds the same JSON with a label for each frame. The threshold, the margin and the
     probability curve follow from the answers; the reported quality is cross-validated. If the answers are too few or
     too poor to calibrate the map, the request is refused and the map keeps its calibration.
@@ -283,7 +283,7 @@ def remember(statistics: QueryStatistics, map_: Map, report: CalibrationReport, 
     try:
         statistics.keep_calibration(map_key(map_), report.model_dump_json(), json.dumps(trials.record()))
     except errors.PlacerecError as error:
-        log.warning("what was measured in calibrating %s is not kept: %s", map_.record.id, error)
+        log.warning("the measurement of the calibration of %s is not stored: %s", map_.record.id, error)
 
 
 def _queries(
@@ -384,7 +384,7 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
 def _encode_known_after_requests(
     engine: Engine, context: JobContext, map_: Map
 ) -> tuple[list[KnownFrame], list[Encoding]]:
-    """What :func:`_encode_known` gives, in a job, which lets requests go first."""
+    """:func:`_encode_known` in a job, which lets requests go first."""
     found: list[tuple[KnownFrame, Encoding]] = []
     for chosen, files, masks in parts(map_, known_frames(map_, MOST_FRAMES)[0]):
         found += with_regions(chosen, encode_after_requests(engine, context, map_.record.encoder, files, masks))

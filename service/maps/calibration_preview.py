@@ -45,14 +45,14 @@ class LatestMeasurement(BaseModel):
 
 
 class CalibrationState(BaseModel):
-    """A map's calibration, and what it does with the frames that the map was last asked to be calibrated."""
+    """A map's calibration, and its effect on the frames of the latest calibrate."""
 
     map: str
     revision: int = Field(description="Of the map's settings; the ETag contains it.")
     calibration: Calibration | None = Field(description="The one in force; null if the encoder is not installed.")
     measured: LatestMeasurement | None = Field(description="Null if nothing was measured, or it is not known any more.")
-    now: Effect | None = Field(description="What the calibration in force does with the frames that were measured.")
-    then: Effect | None = Field(description="What it would do with the threshold and the margin that were given.")
+    now: Effect | None = Field(description="The effect of the calibration in force on the frames that were measured.")
+    then: Effect | None = Field(description="Its effect with the threshold and the margin that were given.")
 
 
 @router.get("", responses=problem_documentation(errors.StorageFull))
@@ -65,7 +65,7 @@ def read_calibration(
 ) -> CalibrationState:
     """Read a map's calibration, the reliability and the curves that were measured for it, and preview a threshold.
 
-    The frames are those of the latest calibrate, which are not asked again. To apply a threshold, send it by PATCH to
+    The frames are those of the latest calibrate, which are not queried again. To apply a threshold, send it by PATCH to
     the map with this answer's ETag as `If-Match`.
     """
     map_ = engine.maps.get(map_id)
@@ -89,7 +89,7 @@ def read_calibration(
 
 
 def _measured(stored: tuple[datetime, str, str] | None) -> tuple[LatestMeasurement, Trials] | None:
-    """What was measured, and its trials; None if there is nothing that this version can read."""
+    """The measurement and its trials; None if there is none that this version can read."""
     if stored is None:
         return None
     at, report, trials = stored

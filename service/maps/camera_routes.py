@@ -1,4 +1,4 @@
-"""Routes of a map's cameras: what is ignored in their frames (a bonnet, a time stamp), and their intrinsics."""
+"""Routes of a map's cameras: the areas ignored in their frames (a bonnet, a time stamp), and their intrinsics."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from service.access.roles import OPERATIONS, Principal, covers
 from service.engine.engine import Engine
 from service.errors.faults import Fault, InvalidRequest, RoleTooLow, TooManyListeners
 from service.errors.problems import problem_documentation
-from service.events.feed import Kept, Listener
+from service.events.feed import FeedEvent, Listener
 from service.events.schemas import EventKind, Listening, Missed
 from service.http.event_stream import (
     HEARTBEAT,
@@ -88,7 +88,7 @@ def _among(name: str, text: str | None, known: tuple[str, ...]) -> frozenset[str
     response_class=StreamingResponse,
     responses={
         200: described(
-            "The first is named `listening`, and tells what the stream will tell. Each other one is named after its "
+            "The first is named `listening`, and gives the selection of others. Each other one is named after its "
             "kind; its data is a QueryEvent, EnrolmentEvent, SessionEvent, JobEvent or MapEvent. `missed` says that "
             "events are lost for this listener."
         ),
@@ -105,9 +105,9 @@ async def follow_map(
 ) -> Response:
     """Follow what happens in a map by server-sent events: queries, enrolments, sessions, jobs, changes of the map.
 
-    A client that connects again with `Last-Event-ID` goes on where it was; the latest events are kept for two minutes
-    after the last listener of the map has left. A listener that reads too slowly, or comes too late, is told how many
-    events it has missed. A key of the role `query` does not see who asked. The stream ends when the map is deleted,
+    A client that connects again with `Last-Event-ID` goes on where it was; the latest events are stored for two minutes
+    after the last listener of the map has left. A listener that reads too slowly, or comes too late, learns how many
+    events it has missed. A key of the role `query` does not see the callers. The stream ends when the map is deleted,
     when the key is no longer valid for it, and when the service stops.
     """
     map_ = await engine.map(map_id)
@@ -186,7 +186,7 @@ class MapStream:
             return True
 
     def _unread(self, listener: Listener, principal: Principal) -> str | None:
-        """What the listener gets of the events since it read last; None if there were none."""
+        """The text for the listener of the events since it read last; None if there were none."""
         read = listener.read()
         if not read.events and read.missed == 0:
             return None
@@ -201,5 +201,5 @@ class MapStream:
             texts.insert(0, event_text(read.before, "missed", missed.model_dump_json()))
         return "".join(texts)
 
-    def _wants(self, event: Kept) -> bool:
+    def _wants(self, event: FeedEvent) -> bool:
         return event.kind in self._kinds and (event.verdict is None or event.verdict in self._verdicts)

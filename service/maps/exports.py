@@ -1,4 +1,4 @@
-"""Exports: the file of a map as it was when a download began, kept for a while so that the download can go on."""
+"""Exports: the file of a map as it was when a download began, stored for a while so that the download can go on."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOLDER = "exports"
 MEDIA_TYPE = "application/x-tar"
 
 SECONDS_AFTER_THE_END = 300.0
-"""For which an export is kept at most after its last byte was sent: who asks again then rarely lost it."""
+"""The longest time that an export is stored after its last byte was sent: few requests after that resume a download."""
 
 log = logging.getLogger("placerec.exports")
 
@@ -43,7 +43,7 @@ class Export:
     state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same.
     file: the export file.
     readers: how many responses read it now.
-    used: when it was last asked for, on the monotonic clock.
+    used: when it was last requested, on the monotonic clock.
     expiry: removes the export when it has not been used for a while.
     """
 
@@ -56,10 +56,10 @@ class Export:
 
 
 class Exports:
-    """All exports that are kept; to be used on the event loop.  No other process uses their folder.
+    """All stored exports; to be used on the event loop.  No other process uses their folder.
 
     Args:
-        settings: ``max_exports`` are kept, each for ``export_seconds`` after its last use.
+        settings: ``max_exports`` are stored, each for ``export_seconds`` after its last use.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -70,7 +70,7 @@ class Exports:
         self._under_way: dict[Map, tuple[object, asyncio.Task[Export]]] = {}
         """Of the maps that are being written, with their state before it began; None if it was not known."""
         self._tags: weakref.WeakKeyDictionary[Map, tuple[object, str]] = weakref.WeakKeyDictionary()
-        """The state of each map when it was last exported, and the tag of that export, whether it is kept or not."""
+        """The state of each map when it was last exported, and the tag of that export, even if it is gone."""
         self._creating = CapacityLimiter(1)  # each reads and writes a whole map
         self._closing = False
 
@@ -88,7 +88,7 @@ class Exports:
         return tag if state is not None and state == await in_thread(map_.exporter.state) else None
 
     async def create(self, map_: Map) -> Export:
-        """The export of a map as it is now; one that is kept if the map has not changed since.
+        """The export of a map as it is now; a stored one if the map has not changed since.
 
         Raises:
             TooManyExports: as many as are allowed are being read.
@@ -123,7 +123,7 @@ class Exports:
             log.warning("the map %s could not be exported: %s", map_.record.id, error)
 
     def _make_room(self) -> None:
-        """Remove the exports that were not read for the longest time until one more may be kept."""
+        """Remove the exports that were not read for the longest time until one more may be stored."""
         self._check_open()
         idle = sorted((export for export in self._exports.values() if not export.readers), key=lambda one: one.used)
         while len(self._exports) + len(self._under_way) >= self._max_exports:
@@ -181,7 +181,7 @@ class Exports:
     def hold(self, export: Export) -> Callable[[bool], None]:
         """Keep an export until the function that this returns is called; calling it again does nothing.
 
-        The function is told whether the last byte of the file was sent.
+        The function takes whether the last byte of the file was sent.
         """
         held = True
 
@@ -241,7 +241,7 @@ class _MalformedRange(Exception):
 
 
 class ExportResponse(FileResponse):
-    """An export file or the ranges of it that the request asks for; the export is kept until the response ends.
+    """An export file or the ranges of it that the request asks for; the export is stored until the response ends.
 
     A range that cannot be read is passed over (RFC 9110, section 14.2), and so is one with an If-Range other than the
     tag of the file: a date says too little, as a map may change within a second.
@@ -270,8 +270,8 @@ class ExportResponse(FileResponse):
                     raise RangeNotSatisfiable(said, self._size)
                 if message["status"] == 400:
                     raise _MalformedRange
-                told = Headers(raw=message["headers"]).get("content-range", "")
-                reaches_end = message["status"] == 200 or told.endswith(f"-{self._size - 1}/{self._size}")
+                given_range = Headers(raw=message["headers"]).get("content-range", "")
+                reaches_end = message["status"] == 200 or given_range.endswith(f"-{self._size - 1}/{self._size}")
             await send(message)
             ended = reaches_end and message["type"] == "http.response.body" and not message.get("more_body")
 

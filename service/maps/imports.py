@@ -205,7 +205,7 @@ class Imports:
             raise
 
     def run(self, context: JobContext) -> Mapping[str, Any]:
-        """Make the map of a job's file; an attempt after a restart begins again, since only the file is kept.
+        """Make the map of a job's file; an attempt after a restart begins again, since only the file is stored.
 
         Raises:
             WrongEncoder, InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.

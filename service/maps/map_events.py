@@ -1,4 +1,4 @@
-"""Events of maps: what the listeners of a map are told of changes of the map itself."""
+"""Events of maps: messages to the listeners of a map about changes of the map itself."""
 
 from __future__ import annotations
 

@@ -197,8 +197,8 @@ def edit_map(
     if edited.review is not None and "review" in settings:
         try:
             map_.review.shrink(edited.review)
-        except errors.PlacerecError as error:  # the map is edited; the next frame that is kept shrinks it again
-            log.warning("kept frames beyond the new limits stay for now: %s", error, extra={"map": map_id})
+        except errors.PlacerecError as error:  # the map is edited; the next frame that is stored shrinks it again
+            log.warning("frames stored beyond the new limits stay for now: %s", error, extra={"map": map_id})
     response.headers["ETag"] = entity_tag(edited.revision)
     return show_map(engine, map_, _last_day(statistics, map_))
 

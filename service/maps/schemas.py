@@ -68,7 +68,7 @@ class MapView(BaseModel):
     encoder: str = Field(description="Identity of its encoder.")
     dimension: int = Field(description="Values of one descriptor.")
     description: str
-    keep: Keep = Field(description="What is stored of each frame besides its descriptor.")
+    keep: Keep = Field(description="The picture that is stored of each frame.")
     same_place_radius: float = Field(
         description="Distance in metres up to which two enrolled places count as the same place, so that neither is "
         "a rival of the other."
@@ -76,14 +76,14 @@ class MapView(BaseModel):
     same_place_frames: int = Field(
         description="The same for places without poses: their distance in frames of one sequence."
     )
-    verification: bool = Field(description="Whether keypoints are kept of each frame, by which answers are verified.")
-    review: ReviewSetting | None = Field(description="Which frames are kept to be reviewed by people; null: none.")
+    verification: bool = Field(description="Whether keypoints of each frame are stored, by which answers are verified.")
+    review: ReviewSetting | None = Field(description="Which frames are stored to be reviewed by people; null: none.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
-    storage: StorageStatus = Field(description="What the map occupies on disk.")
+    storage: StorageStatus = Field(description="The size of the map on disk.")
     places: int
     last_day: VerdictCounts | None = Field(
         description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."
@@ -164,7 +164,7 @@ class MapChanges(BaseModel):
         default=None,
         description=f"auto, exact or compact (auto from {COMPACT_FROM} places on).",
     )
-    review: ReviewChanges | None = Field(default=None, description="null: no frames are kept from now on.")
+    review: ReviewChanges | None = Field(default=None, description="null: no frames are stored from now on.")
     calibration: CalibrationChanges | None = None
 
 
@@ -247,35 +247,33 @@ class CalibrationOrder(BaseModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [ORDER_EXAMPLE]})
 
     method: Method = Field(
-        description="Which frames the map is asked. `frames`: the labelled frames of this form. `sequence`: one "
+        description="Which frames query the map. `frames`: the labelled frames of this form. `sequence`: one "
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
-        "neighbours, which is the least reliable method. `labels`: the frames that were kept for review and labelled."
+        "neighbours, which is the least reliable method. `labels`: the frames that were stored for review and labelled."
     )
-    target: Target = Field(
-        default=Target(rule="precision", value=0.95), description="What the threshold is chosen to reach."
-    )
+    target: Target = Field(default=Target(rule="precision", value=0.95), description="The target of the threshold.")
     dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")
     background: bool = Field(strict=True, default=False, description="Answer 202 with a job; its result is the report.")
-    sequence: str | None = Field(default=None, max_length=128, description="The traverse whose frames are asked.")
+    sequence: str | None = Field(default=None, max_length=128, description="The traverse whose frames query the map.")
     pairs: dict[str, str | None] | None = Field(
         default=None,
         min_length=1,
         max_length=MOST_FRAMES,
         description="For places of the sequence, the id of a place of another sequence that shows the same, or null if "
-        "there is none. Only these places are asked. If left out, poses decide which places are the same.",
+        "there is none. Only these places query the map. If left out, poses decide which places are the same.",
     )
     most: int = Field(
         strict=True,
         default=300,
         ge=20,
         le=MOST_FRAMES,
-        description="How many frames are asked at most; they are chosen evenly.",
+        description="The largest number of frames that query the map; they are chosen evenly.",
     )
     beside: Literal["encoder", "map", "none"] = Field(
         default="encoder",
         description="With the method labels, what the labels join, since they are few and of the doubtful frames. "
         "`encoder`: the encoder's calibration, whose curve is moved as far as the labels demand; the target is not "
-        "used then. `map`: the map's own frames, which are asked as well. `none`: nothing.",
+        "used then. `map`: the map's own frames, which query it as well. `none`: nothing.",
     )
     labels: list[Label] | None = Field(
         default=None, min_length=1, max_length=MOST_FRAMES, description="One label for each frame of the form."

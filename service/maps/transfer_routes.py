@@ -208,7 +208,7 @@ async def import_map(
         return accepted(job, settings)
     await imports.build(received)
     map_ = await engine.map(received.map_id)
-    view = await in_thread(show_map, engine, map_, {})  # nobody has asked it yet
+    view = await in_thread(show_map, engine, map_, {})  # it has no queries yet
     headers = {
         "ETag": entity_tag(map_.record.revision),
         "Location": f"{settings.root_path}{router.prefix}/{received.map_id}",

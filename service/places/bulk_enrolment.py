@@ -37,7 +37,7 @@ BYTES_PER_COMMIT = 32 << 20
 """The most bytes of the frames of one commit, unless it is a single frame."""
 
 MOST_LISTED = 200
-"""The result of the job lists so many of the frames that could not be enrolled; the others are only counted."""
+"""The largest number of refused frames that the result of the job lists; the others are only counted."""
 
 PART = "places"
 """The form's part with the JSON array of places."""
@@ -110,7 +110,7 @@ def _read_form(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, S
 
 
 def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobContext) -> Mapping[str, Any]:
-    """The work of a job: enrol the frames of its form, from where an earlier attempt stopped; then align them if asked.
+    """The work of a job: enrol the frames of its form, from where an earlier attempt stopped; then align on request.
 
     Returns:
         The result of the job.
@@ -129,7 +129,7 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
 
 @dataclass
 class _Outcome:
-    """What became of the first ``done`` entries; it is stored in the job's notes.
+    """The outcome of the first ``done`` entries; it is stored in the job's notes.
 
     changes: how many places were created, updated, replaced or unchanged.
     failed: how many entries could not be enrolled.

@@ -105,7 +105,7 @@ async def enrol(
     Raises:
         QueueFull, DeadlineExceeded, ClientGone, BatchOutOfOrder: nothing was stored.
         TooManyPlaces: the map has no room for the places.
-        StorageFull, StorageFailure: nothing of the last commit was kept.
+        StorageFull, StorageFailure: nothing of the last commit was stored.
         Others: what ``reject`` raises.
     """
     digests = await in_thread(lambda: [digest_of(frame) for frame in frames])

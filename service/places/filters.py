@@ -115,7 +115,7 @@ class Deletion(BaseModel):
         default=None,
         min_length=1,
         max_length=MOST_DELETED,
-        description="Ids of places; those that are gone are told.",
+        description="Ids of places; those that are gone are listed in the answer.",
     )
     filter: PlaceConditions | None = Field(default=None, description="Conditions, at least one.")
     dry_run: bool = Field(strict=True, default=True, description="Only say which places would be deleted.")

@@ -1,4 +1,4 @@
-"""What callers say about a place beside its frame: in the query string, in form fields, in the JSON of a batch."""
+"""The fields of a place beside its frame: in the query string, in form fields, in the JSON of a batch."""
 
 from __future__ import annotations
 

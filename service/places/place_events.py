@@ -1,4 +1,4 @@
-"""Events of enrolment: what the listeners of a map are told of places that were created, changed or deleted."""
+"""Events of enrolment: messages to the listeners of a map about places created, changed or deleted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.engine.engine import Engine
 from service.events.schemas import ChangedPlace, EnrolmentEvent
 
 MOST_LISTED = 64
-"""An event lists so many places at most; the others are only counted."""
+"""The largest number of places that an event lists; the others are only counted."""
 
 
 def tell_enrolment(engine: Engine, map_: Map, stored: Sequence[tuple[Place, Change]]) -> None:

@@ -44,7 +44,7 @@ Numbers = list[float | None] | None
 class PlanParameters(Parameters):
     """How many of the places."""
 
-    step: int = Field(default=1, ge=1, le=1_000_000, description="List about every so manieth place.")
+    step: int = Field(default=1, ge=1, le=1_000_000, description="List about one place in every `step`.")
 
 
 class PlanView(BaseModel):
@@ -70,7 +70,7 @@ class PlanView(BaseModel):
     heading: Numbers = Field(description="Degrees, to 0.01.")
     timestamp: list[int | None] | None = Field(description="Milliseconds since 1970 (UTC).")
     flags: list[int] = Field(
-        description="The sum of 1, if the pose was handed over by an alignment, and 2, if a picture is kept."
+        description="The sum of 1, if the pose was handed over by an alignment, and 2, if a picture is stored."
     )
 
 
@@ -91,12 +91,12 @@ async def read_plan(
 ) -> Response:
     """Read where all places of a map are, in columns; made for drawing a hundred thousand of them.
 
-    The plan is kept until the map is written to. Send its ETag as `If-None-Match`: the answer is 304 while no place has
+    The plan is cached until a write to the map. Send its ETag as `If-None-Match`: the answer is 304 while no place has
     changed. It is compressed for callers that accept gzip. At most 200 000 places are listed; of a larger map ask for
     every n-th by `step`.
     """
     map_ = await engine.map(map_id)
-    plan = plans.kept(map_, options.step)
+    plan = plans.cached(map_, options.step)
     if plan is None:
         plan = await to_thread.run_sync(plans.make, map_, options.step, limiter=plans.one_at_a_time)
     headers = {"ETag": f'W/"{plan.revision}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}

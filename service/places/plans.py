@@ -1,4 +1,4 @@
-"""Plans of maps as they are sent: made one at a time, compressed, and kept until their map is written to."""
+"""Plans of maps as they are sent: made one at a time, compressed, and cached until their map is written to."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MOST_PLACES = 200_000
 """Places that one plan lists."""
 
 MOST_BYTES = 64 * 1024 * 1024
-"""Bytes of all compressed plans that are kept together."""
+"""Bytes of all cached plans together, compressed."""
 
 MOST_KEPT = 64
-"""Plans that are kept together: small ones, such as those of many steps, weigh more than their bytes."""
+"""Number of cached plans: small ones, such as those of many steps, weigh more than their bytes."""
 
 FAST = 1
 """The level of gzip: a higher one takes longer than a local network saves."""
@@ -45,16 +45,16 @@ class MadePlan:
 
 
 class Plans:
-    """The plans that were asked for last.  Any thread may use it."""
+    """The plans that were requested last.  Any thread may use it."""
 
     def __init__(self) -> None:
         self.one_at_a_time = CapacityLimiter(1)
-        """Limits the threads that make plans, so that their memory is bounded and searches are not kept waiting."""
-        self._kept: OrderedDict[PlanKey, MadePlan] = OrderedDict()
+        """Limits the threads that make plans, so that their memory is bounded and searches do not wait."""
+        self._cached: OrderedDict[PlanKey, MadePlan] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
 
-    def kept(self, map_: Map, step: int) -> MadePlan | None:
+    def cached(self, map_: Map, step: int) -> MadePlan | None:
         """The plan of a map if nothing was written to the map since it was made.
 
         Raises:
@@ -62,26 +62,26 @@ class Plans:
         """
         state = map_.state
         with self._lock:
-            found = self._kept.get(_key(map_, step))
+            found = self._cached.get(_key(map_, step))
             if found is None or found.state != state:
                 return None
-            self._kept.move_to_end(_key(map_, step))
+            self._cached.move_to_end(_key(map_, step))
             return found
 
     def make(self, map_: Map, step: int) -> MadePlan:
-        """The plan of a map, which is read from disk if it is not kept; blocks.
+        """The plan of a map, which is read from disk if it is not cached; blocks.
 
         Raises:
             PlanTooLarge: it would list more than ``MOST_PLACES``.
             UnknownMap, MapQuarantined, StorageFailure.
         """
-        if (found := self.kept(map_, step)) is not None:
+        if (found := self.cached(map_, step)) is not None:
             return found
         count = map_.count_places()
         if count > MOST_PLACES * step:
             raise PlanTooLarge(
                 f"The map has {count} places, and a plan lists at most {MOST_PLACES}: send "
-                f"step={-(-count // MOST_PLACES)} for every so manieth place."
+                f"step={-(-count // MOST_PLACES)} or more."
             )
         state = map_.state  # of now: what is written while the plan is read makes it old
         columns = map_.plan.columns(step)
@@ -94,11 +94,11 @@ class Plans:
 
     def _keep(self, key: PlanKey, plan: MadePlan) -> None:
         with self._lock:
-            before = self._kept.pop(key, None)
+            before = self._cached.pop(key, None)
             self._bytes += len(plan.compressed) - (0 if before is None else len(before.compressed))
-            self._kept[key] = plan
-            while self._bytes > MOST_BYTES or len(self._kept) > MOST_KEPT:
-                _, oldest = self._kept.popitem(last=False)
+            self._cached[key] = plan
+            while self._bytes > MOST_BYTES or len(self._cached) > MOST_KEPT:
+                _, oldest = self._cached.popitem(last=False)
                 self._bytes -= len(oldest.compressed)
 
 

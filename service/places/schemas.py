@@ -42,7 +42,7 @@ class PlaceView(BaseModel):
     camera: str | None = Field(description="The camera whose mask was applied to the frame.")
     metadata: dict[str, Any]
     regions: int = Field(description="Regions of interest found in the frame.")
-    picture: Keep = Field(description="What is kept of the frame.")
+    picture: Keep = Field(description="The picture that is stored of the frame.")
     created_at: Timestamp
     updated_at: Timestamp
 

@@ -146,7 +146,7 @@ class Staging:
         """Remove the forms that a crash left behind; call it before any form arrives.
 
         Args:
-            waited_for: the names of the forms that jobs wait for; these are kept.
+            waited_for: the names of the forms that jobs wait for; these stay.
         """
         if self._folder.is_dir():
             for found in self._folder.iterdir():

@@ -52,7 +52,7 @@ JOINED = {
 """Variables of a process that joins a cluster; it notes itself that the cluster is lost, and leaves it."""
 
 ANSWER_SECONDS = 4.0
-"""Seconds within which a cluster answers what it is asked of the encoders."""
+"""Seconds within which a cluster answers requests about the encoders."""
 
 CONNECT_SECONDS = 2.0
 """Seconds within which the head of a cluster accepts a connection, if it runs."""
@@ -66,7 +66,7 @@ class RayUnavailable(Exception):
 
 @dataclass(frozen=True)
 class State:
-    """What the cluster says of the encoders.
+    """The state of the encoders in the cluster.
 
     running: replicas that answer.
     problem: why there are none, or fewer than wanted; empty if all is well.
@@ -210,7 +210,7 @@ class Cluster:
             raise RayUnavailable(f"the encoders cannot be deployed: {_first_line(error)}") from error
 
     def state(self) -> State:
-        """What the cluster says of the encoders; blocks, not for long, and raises what Ray does if it does not answer.
+        """The state of the encoders in the cluster; blocks, not for long, and raises Ray's error if it does not answer.
 
         ``serve.status()`` would wait for ever, and a thread that waits while Ray is left ends the process.
         """
@@ -288,7 +288,7 @@ class Cluster:
 def prepare_environment(own: bool, local: bool) -> None:
     """Set what Ray reads when it is imported, and what its processes inherit."""
     if local:
-        # By this variable Ray chooses the loopback address for its ports; its name tells where that is the default.
+        # By this variable Ray chooses the loopback address for its ports; its name says where that is the default.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # else what is still at work in a cluster that was left starts a Ray
     os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
@@ -321,7 +321,7 @@ def start_no_dashboards() -> None:
 
 
 def caller() -> DeploymentHandle[EncoderReplica]:
-    """What calls replicas to encode, from the event loop that runs now and with no thread of Ray's between.
+    """The handle that calls replicas to encode, from the event loop that runs now and with no thread of Ray's between.
 
     It is no handle that Ray Serve keeps for others, which may have no such loop.
     """

@@ -1,4 +1,4 @@
-"""What a front does with its frames: it sends them to the replicas, several in one call where several wait.
+"""The encoders of a front: it sends frames to the replicas, several in one call where several wait.
 
 A call costs milliseconds of processor time however few frames it has.  So a replica that has nothing to do gets its
 share of what waits at once, and one that is at work gets a full batch ahead, or nothing: batches grow with the load,
@@ -42,7 +42,7 @@ GLANCE = 0.25
 """Seconds between two looks whether anybody still waits for the frames of a call; most have ended by then."""
 
 LONGEST_CALL = 60.0
-"""Seconds after which a call is given up, and its frames are sent elsewhere: no replica computes so long."""
+"""Seconds after which a call is given up, and its frames are sent elsewhere: no replica computes longer."""
 
 UNSERVED = 5.0
 """Seconds without a replica after which robots' frames are refused; until then, one may be starting."""
@@ -281,7 +281,7 @@ class RayEncoders:
                 self._finish(frame, made)
 
     async def _call(self, frames: list[QueuedFrame], sent: list[SentFrame]) -> list[ReturnedFrame | Exception]:
-        """What a replica makes of frames; the call is cancelled as soon as nobody waits for any of them.
+        """Frames as a replica encodes them; the call is cancelled as soon as nobody waits for any of them.
 
         Raises:
             TimeoutError: it takes too long.
@@ -343,7 +343,7 @@ class RayEncoders:
 
 
 class _RayThread:
-    """The thread in which all that blocks is asked of Ray, one thing after the other.
+    """The thread for all blocking calls of Ray, one after the other.
 
     It is one as long as Ray answers, since the processes of a local Ray end with the thread that has started them.
     """
@@ -357,7 +357,7 @@ class _RayThread:
             work()
 
     def end(self) -> None:
-        """End the thread once it has done what it is asked."""
+        """End the thread once it has done its work."""
         self._work.put(None)
 
     async def ask(self, work: Callable[[], Made], seconds: float) -> Made:
@@ -365,7 +365,7 @@ class _RayThread:
 
         Raises:
             TimeoutError: it does.
-            Others: what the work raises.
+            Others: the exceptions of the work.
         """
         made: Future[Made] = Future()
 

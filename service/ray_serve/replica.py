@@ -26,7 +26,7 @@ from service.errors.faults import DeadlineExceeded
 
 @dataclass(frozen=True)
 class ReplicaSettings:
-    """What a replica is made of.
+    """The settings of a replica.
 
     models: directory of encoders besides the packaged ones, at the same path on every machine; it need not exist.
     encoder: the name of the encoder that is loaded at the start; others are loaded with their first frame.
@@ -46,7 +46,7 @@ class SentFrame:
     """A frame on its way to a replica.
 
     identity: of the encoder.
-    keypoints, features: what is wanted besides descriptors.
+    keypoints, features: outputs wanted besides descriptors.
     seconds: until its deadline, from the moment at which it was sent; clocks of two machines need not agree.
     """
 

@@ -13,7 +13,7 @@ class ShortestQueueRouter(RequestRouter):
     """The replica with the fewest calls of this front gets the next one; of equal ones that with the fewest frames.
 
     Ray Serve's own router compares two replicas that it draws by lot.  A front makes at most two calls to a replica at
-    a time, so a draw would often miss the one that has nothing to do.  What other fronts have sent there decides
+    a time, so a draw would often miss the one that has nothing to do.  Frames of other fronts decide
     between those that are equal, as far as Ray Serve knows it.
 
     Ray Serve sends this class to the front as a copy, with copies of what its module has; so each method imports what

@@ -13,15 +13,15 @@ from core.method.encoder import Encoding
 from service.engine.encoders import Encoded
 
 TOGETHER = 32
-"""So many frames are read and encoded at a time."""
+"""Number of frames that are read and encoded at a time."""
 
 
 @dataclass(frozen=True)
 class KnownFrame:
-    """A kept frame of which it is known what it shows.
+    """A frame stored for review whose place is known, or known to be absent.
 
     number: of the frame.
-    camera: the camera that took it, as it was asked.
+    camera: the camera that took it, as the query named it.
     place: the id of the place that it shows; None if the map has none.
     enrolled: whether the frame was enrolled as this place.
     """
@@ -46,8 +46,8 @@ def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
     found = found[-most:]
     named = [frame.place for frame in found if frame.place is not None]
     there = {place for place, row in zip(named, map_.rows_of(named), strict=True) if row is not None}
-    kept = [frame for frame in found if frame.place is None or frame.place in there]
-    return kept, len(found) - len(kept)
+    usable = [frame for frame in found if frame.place is None or frame.place in there]
+    return usable, len(found) - len(usable)
 
 
 Part = tuple[list[KnownFrame], list[bytes], list[Mask | None]]

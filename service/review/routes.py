@@ -1,4 +1,4 @@
-"""Routes of review: list kept frames, see them, say what they show, export what was said."""
+"""Routes of review: list the stored frames, see them, label them, export the labels."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ router = APIRouter(
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
 )
-FrameNumber = Annotated[int, Path(alias="frame", ge=1, le=2**53, description="Id of the kept frame.", examples=[17])]
+FrameNumber = Annotated[int, Path(alias="frame", ge=1, le=2**53, description="Id of the stored frame.", examples=[17])]
 
 
 class ReviewPageParameters(PageParameters):
-    """Which kept frames."""
+    """The selection of stored frames."""
 
     labelled: bool | None = Field(default=None, description="Only frames with a label, or only those without one.")
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], engine: EngineDep) -> ReviewPage:
-    """List the frames that a map has kept for review, the newest first.
+    """List the frames that a map has stored for review, the newest first.
 
     A map keeps frames whose answers have the verdicts that its setting `review` names, from a moment after the answer
     on; by default it keeps none.
@@ -61,7 +61,7 @@ def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], e
 
 @router.get("/labels")
 def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
-    """Export what was said of the kept frames: for each the place that it shows, or null if the map has none."""
+    """Export the labels of the stored frames: for each the place that it shows, or null if the map has none."""
     return LabelList(
         items=[
             ExportedLabel(
@@ -90,7 +90,7 @@ def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
     },
 )
 def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) -> Response:
-    """See a kept frame."""
+    """See a frame stored for review."""
     data = engine.maps.get(map_id).review.picture(number)
     kinds = {found: kind for kind, found in FORMATS.items()}
     return Response(data, media_type=kinds[read_header(data).format], headers={"Cache-Control": "private, no-cache"})
@@ -116,10 +116,10 @@ def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) ->
 async def label_frame(
     map_id: MapId, number: FrameNumber, order: LabelOrder, engine: EngineDep, deadline: DeadlineDep
 ) -> Labelled:
-    """Say what a kept frame shows: a place of the map, a new place as which it is enrolled, or no place of the map.
+    """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
     Or throw it away. A label that is given again replaces the one before; what was enrolled stays. Labels serve to
-    calibrate the map, with the method `labels`. What is said of one frame at the same time is done one after the other.
+    calibrate the map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)
     async with engine.review_keeper.turn(map_, number):
@@ -150,7 +150,7 @@ async def _store(map_: Map, number: int, label: dict[str, Any], enrolled: PlaceV
 
 
 async def _enrol(engine: Engine, map_: Map, number: int, new: NewPlace, deadline: RequestDeadline) -> PlaceView:
-    """Enrol a kept frame; that again with the same id changes nothing but the fields.
+    """Enrol a stored frame; that again with the same id changes nothing but the fields.
 
     Raises:
         UnknownFrame, PlaceTaken, and what ``enrol`` raises.

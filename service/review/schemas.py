@@ -1,4 +1,4 @@
-"""JSON of kept frames and of their labels."""
+"""JSON of frames stored for review and of their labels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.places.schemas import PlaceView
 
 
 class ReviewLabel(BaseModel):
-    """What people say that a frame shows; one of the three is set."""
+    """People's label of a frame; one of the three is set."""
 
     place: str | None = Field(default=None, description="The place that it shows.")
     new: str | None = Field(default=None, description="The place as which it was enrolled.")
@@ -23,10 +23,10 @@ class ReviewLabel(BaseModel):
 
 
 class ReviewFrameView(BaseModel):
-    """A frame that is kept for review."""
+    """A frame that is stored for review."""
 
     id: int
-    at: Timestamp = Field(description="When it was asked.")
+    at: Timestamp = Field(description="The time of the query.")
     sha256: str
     bytes: int
     answer: dict[str, Any] = Field(
@@ -40,7 +40,7 @@ class ReviewFrameView(BaseModel):
 
     @classmethod
     def of(cls, frame: ReviewFrame) -> ReviewFrameView:
-        """The JSON view of a kept frame."""
+        """The JSON view of a stored frame."""
         label = frame.label
         return cls(
             id=frame.number,
@@ -55,11 +55,11 @@ class ReviewFrameView(BaseModel):
 
 
 class ReviewPage(BaseModel):
-    """Kept frames, the newest first."""
+    """Frames stored for review, the newest first."""
 
     items: list[ReviewFrameView]
     next_cursor: Cursor
-    frames: int = Field(description="How many frames are kept.")
+    frames: int = Field(description="How many frames are stored.")
     bytes: int = Field(description="The bytes of their files together.")
 
 
@@ -73,7 +73,7 @@ class NewPlace(PlaceDescription):
 
 
 class LabelOrder(BaseModel):
-    """What a frame shows, or that it is thrown away: exactly one of these."""
+    """A label, or that the frame is thrown away: exactly one of these."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -93,7 +93,7 @@ class LabelOrder(BaseModel):
 
 
 class Labelled(BaseModel):
-    """What became of a frame."""
+    """The result of a label."""
 
     id: int
     discarded: bool
@@ -105,7 +105,7 @@ class ExportedLabel(BaseModel):
     """A frame whose place is known."""
 
     id: int
-    at: Timestamp = Field(description="When the frame was asked.")
+    at: Timestamp = Field(description="The time of the query.")
     sha256: str
     camera: str | None
     verdict: Verdict = Field(description="How it was answered.")

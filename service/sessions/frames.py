@@ -140,7 +140,7 @@ def _repeated(session: Session, options: FrameParameters, request_id: str | None
         again = request_id == session.request
     if again:
         if session.answer is None:
-            raise FrameOutOfOrder("The frame was processed already; its answer is not kept any more.")
+            raise FrameOutOfOrder("The frame was processed already; its answer is not stored any more.")
         return SessionAnswer.model_validate_json(session.answer).model_copy(update={"repeated": True})
     if number is not None and last is not None and number < last:
         raise FrameOutOfOrder(f"Frame {number} comes after frame {last}.")

@@ -78,7 +78,7 @@ class NewSession(BaseModel):
         default=0,
         ge=0,
         le=20,
-        description="Also estimate where the robot was so many frames ago, given all frames since.",
+        description="Also estimate where the robot was this number of frames ago, given all frames since.",
     )
     camera: CameraName = None
     verify: Verification = "auto"
@@ -188,7 +188,7 @@ class FrameParameters(Parameters):
             if getattr(self, first) is not None and (absent := [name for name in needed if name not in given]):
                 raise ValueError(f"{first} needs {absent[0]} beside it")
         if self.forward is not None and self.odometry_x is not None:
-            raise ValueError("forward and odometry_x tell the motion in two ways; give one of them")
+            raise ValueError("forward and odometry_x give the motion in two ways; give one of them")
         return self
 
     @field_validator("odometry_covariance")
@@ -206,7 +206,7 @@ class FrameParameters(Parameters):
         return Odometry(self.forward, self.left or 0.0, turn, (self.deviation or 0.0) ** 2, spread**2)
 
     def odometry_pose(self) -> OdometryPose | None:
-        """Where odometry says that the robot is; None if the frame does not tell."""
+        """Where odometry says that the robot is; None if the frame does not say."""
         x, y, heading, text = self.odometry_x, self.odometry_y, self.odometry_heading, self.odometry_covariance
         if x is None or y is None or heading is None:
             return None

@@ -42,7 +42,7 @@ REMEMBERED = 10_000
 """How many ended sessions are remembered."""
 
 GRAPH_REUSE = 20.0
-"""The graph of a map that changes is used for so many times as long as it took to build, then built again."""
+"""The graph of a map that changes is used for this multiple of the time it took to build, then built again."""
 
 REPEATED_SECONDS = 60.0
 """For how long a session that has no frame is the answer to the request that began it, sent again."""
@@ -157,7 +157,7 @@ class Sessions:
     """All sessions.  Thread-safe.
 
     Args:
-        events: is told when a session begins and ends.
+        events: receives the begin and the end of sessions.
         store: keeps the sessions; None: a file in the data directory.
     """
 
@@ -177,7 +177,7 @@ class Sessions:
             self._store.close()
 
     def _load(self) -> None:
-        now, kept = time.time(), []
+        now, restored = time.time(), []
         for stored in sorted(self._store.all(), key=lambda one: -one.used):
             if stored.ended is not None:
                 if now - stored.used > REMEMBERED_SECONDS or len(self._ended) >= REMEMBERED:
@@ -192,11 +192,11 @@ class Sessions:
                 self._store.end(stored.id, STATE_LOST, now)
                 self._ended[stored.id] = (stored.map, STATE_LOST)
                 continue
-            kept.append(stored.id)
+            restored.append(stored.id)
             session.restored, session.idle_since = True, time.monotonic() - max(0.0, now - stored.used)
             self._living[stored.id] = session
-        if kept:
-            log.info("sessions are restored", extra={"sessions": len(kept)})
+        if restored:
+            log.info("sessions are restored", extra={"sessions": len(restored)})
 
     # Creating, finding and ending sessions
 
@@ -443,7 +443,7 @@ def creation_time(map_: Map) -> str:
 
 
 def asking_now() -> tuple[str, str | None, str | None] | None:
-    """Who asks now, and the id of the request; None if nothing tells one request from another."""
+    """The present caller and the id of the request; None if requests cannot be distinguished."""
     asker = ASKER.get()
     return None if asker.request_id is None else (asker.principal, asker.key, asker.request_id)
 

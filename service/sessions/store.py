@@ -71,7 +71,7 @@ HEAD = COLUMNS[:-2]
 
 
 class SessionRecords(Protocol):
-    """What keeps sessions.
+    """The stored sessions.
 
     A write is durable when it returns.  Every method but ``close`` may raise an error if the disk or server refuses.
     """

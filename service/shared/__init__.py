@@ -23,7 +23,7 @@ def open_database(settings: Settings) -> SharedDatabase | None:
     """The PostgreSQL that has what services share; None if this service keeps its state in its data directory.
 
     Raises:
-        MissingExtra: what speaks to PostgreSQL is not installed.
+        MissingExtra: the client of PostgreSQL is not installed.
     """
     if settings.postgres is None:
         return None

@@ -23,7 +23,7 @@ MAKING_TABLES = 7_061_636_573
 
 
 def configure(connection: Connection[Any]) -> None:
-    """What is committed is durable, whatever the server's default is, and nothing takes for ever."""
+    """Settings by which a commit is durable, whatever the server's default is, and no statement takes for ever."""
     connection.execute("SET synchronous_commit TO on")
     connection.execute(f"SET statement_timeout TO '{STATEMENT_SECONDS}s'")
 
@@ -44,7 +44,7 @@ class SharedDatabase(Postgres):
         """Execute one statement, which is durable when this returns; the rows that it gives.
 
         Args:
-            action: what it does, for the message of an error.
+            action: its work, for the message of an error.
         """
         with self.connection(action) as connection:
             cursor = connection.execute(query, values)

@@ -68,7 +68,7 @@ class ReplicaDifferences:
     def __init__(self, settings: Settings, database: SharedDatabase, replica: str) -> None:
         self._settings, self._database, self._replica = settings, database, replica
         self._catalogue = EncoderCatalogue(settings.models_directory)
-        self._told: str | None = None
+        self._written: str | None = None
         self._mine, self._read = dict[str, Any](), -math.inf
         self.state = "ok"
 
@@ -81,15 +81,15 @@ class ReplicaDifferences:
         if time.monotonic() - self._read > READ_SECONDS:
             self._mine, self._read = self._read_mine(), time.monotonic()
         mine = self._mine
-        if (text := json.dumps(mine)) != self._told:
+        if (text := json.dumps(mine)) != self._written:
             query = "UPDATE service.replicas SET settings = %s WHERE id = %s"
             self._database.execute("tell its settings", query, (text, self._replica))
-            self._told = text
+            self._written = text
         query = (
             "SELECT r.id, r.settings, extract(epoch FROM clock_timestamp())::float8"
             " FROM service.replicas r JOIN service.living USING (id) ORDER BY r.id"
         )
-        asked = time.time()
+        sent = time.time()
         found = self._database.execute("compare settings", query)
         answered = time.time()
         differences = [
@@ -98,7 +98,7 @@ class ReplicaDifferences:
             if name != self._replica and theirs is not None
             for difference in _differences(mine, json.loads(theirs), name)
         ]
-        if found and (late := _off_by(found[0][2], asked, answered)):
+        if found and (late := _off_by(found[0][2], sent, answered)):
             away = f"{abs(late):.0f} s {'behind' if late > 0 else 'ahead of'} PostgreSQL's"
             differences.append((f"The clock of this machine is {away}", "keys expire by it"))
         self._note(differences)
@@ -121,7 +121,7 @@ class ReplicaDifferences:
 
 
 def _differences(mine: Mapping[str, Any], theirs: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
-    """What differs, and the values."""
+    """The differing settings, and their values."""
     other = f"{name} ({theirs.get('at')})"
     return [
         (f"{key} is not that of {other}", f"{value} here, {theirs.get(key)} there")
@@ -130,8 +130,8 @@ def _differences(mine: Mapping[str, Any], theirs: Mapping[str, Any], name: str) 
     ]
 
 
-def _off_by(told: float, asked: float, answered: float) -> float:
+def _off_by(theirs: float, sent: float, answered: float) -> float:
     """Seconds by which PostgreSQL's clock is ahead of ours; 0 if that is little, or could be the time of the answer."""
-    if asked - CLOCK_SECONDS <= told <= answered + CLOCK_SECONDS:
+    if sent - CLOCK_SECONDS <= theirs <= answered + CLOCK_SECONDS:
         return 0.0
-    return told - (asked + answered) / 2
+    return theirs - (sent + answered) / 2

@@ -1,6 +1,6 @@
 """Live events over any number of services.
 
-A service that has listeners of a map says so; the others then tell it what happens there, by a table and a notice that
+A service that has listeners of a map says so; the others then send it their events, by a table and a notice that
 something new is in it.  Nothing is written of a map that nobody listens to.
 """
 
@@ -13,22 +13,22 @@ from collections import deque
 
 from core.errors import StorageFailure, StorageFull
 from service.events.events import Events
-from service.events.feed import Feed, Kept
+from service.events.feed import Feed, FeedEvent
 from service.shared.replica import LIVING, ServiceReplica
 
 EVENT, LISTENING = "event", "listening"
-"""What services tell each other of: that there are new events, and that somebody listens to other maps than before."""
+"""Topics between services: there are new events, and somebody listens to other maps than before."""
 
 MOST_WAITING = 2000
-"""Events that wait to be told to others; the oldest ones beyond that are not."""
+"""Events that wait to be sent to others; beyond that the oldest ones are dropped."""
 
 GATHER_SECONDS = 0.05
-"""Events of this time are told together."""
+"""Events within this time are sent together."""
 
 AT_ONCE = 500
 
 LOOK_BACK = 1000
-"""Events may become visible in another order than that of their numbers, if they are told at the same time."""
+"""Events may become visible in another order than that of their numbers, if they are written at the same time."""
 
 KEPT_SECONDS = 30
 
@@ -55,7 +55,7 @@ class SharedEvents(Events):
         replica.every(self._keep_up)
 
     def start(self) -> None:
-        """Begin to tell others."""
+        """Begin to send events to other services."""
         self._teller.start()
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class SharedEvents(Events):
         if self._teller.is_alive():
             self._teller.join(5)
 
-    # What happens here
+    # Events of this service
 
     def heard(self, map_id: str) -> bool:
         return super().heard(map_id) or map_id in self._elsewhere
@@ -76,7 +76,7 @@ class SharedEvents(Events):
     def _shows_pictures(self, map_id: str, feed: Feed | None) -> bool:
         return self._elsewhere.get(map_id, False) or super()._shows_pictures(map_id, feed)
 
-    def _keep(self, map_id: str, feed: Feed | None, event: Kept) -> None:
+    def _keep(self, map_id: str, feed: Feed | None, event: FeedEvent) -> None:
         super()._keep(map_id, feed, event)
         if map_id in self._elsewhere:
             self._outbox.append((map_id, _text(event)))
@@ -99,7 +99,7 @@ class SharedEvents(Events):
                 self._say_who_listens()
                 self._tell_events()
             except (StorageFull, StorageFailure) as error:
-                log.warning("events are not told to other services: %s", error)
+                log.warning("events are not sent to other services: %s", error)
             threading.Event().wait(GATHER_SECONDS)
 
     def _tell_events(self) -> None:
@@ -111,7 +111,7 @@ class SharedEvents(Events):
                 " SELECT pg_notify('placerec', %s || max(number)) FROM new"
             )
             maps, events = [map_id for map_id, _ in taken], [event for _, event in taken]
-            self._database.execute("tell events", query, (self._replica.id, maps, events, f"{EVENT} "))
+            self._database.execute("send events", query, (self._replica.id, maps, events, f"{EVENT} "))
 
     def _say_who_listens(self) -> None:
         with self._lock:
@@ -125,7 +125,7 @@ class SharedEvents(Events):
             connection.execute("SELECT pg_notify('placerec', %s)", (f"{LISTENING} ",))
         self._said = now
 
-    # What happens elsewhere
+    # Events of other services
 
     def _keep_up(self) -> None:
         self._something.set()  # feeds that nobody listens to any more go away by themselves
@@ -160,11 +160,11 @@ class SharedEvents(Events):
                 super()._keep(map_id, self._feeds.get(map_id), _event(text))
 
 
-def _text(event: Kept) -> str:
+def _text(event: FeedEvent) -> str:
     fields = event.kind, event.verdict, sorted(event.maps, key=str), event.full, event.public, event.picture
     return json.dumps(fields)
 
 
-def _event(text: str) -> Kept:
+def _event(text: str) -> FeedEvent:
     kind, verdict, maps, full, public, picture = json.loads(text)
-    return Kept(0, kind, verdict, frozenset(maps), full, public, picture)
+    return FeedEvent(0, kind, verdict, frozenset(maps), full, public, picture)

@@ -70,7 +70,7 @@ class JobTable:
             home: the only service that can do it; None: any.
 
         Raises:
-            JobQueueFull: so many jobs wait.
+            JobQueueFull: the largest number of jobs wait.
         """
         names = ("id", "kind", "map", "state", "resumable", "cancelling", "attempt", "change", "done", "total",
                  "message", *_JSON)  # fmt: skip
@@ -160,7 +160,7 @@ class JobTable:
         return _job(found[0]) if found else None
 
     def write(self, job: Job) -> bool | None:
-        """Write a running job of this service, ended or not; whether it was asked to stop, None if it was lost."""
+        """Write a running job of this service, ended or not; whether it was cancelled, None if it was lost."""
         query = (
             f"UPDATE service.jobs SET {', '.join(f'{n} = %s' for n in _WRITTEN)} WHERE {_OWNED} RETURNING cancelling"
         )
@@ -186,7 +186,7 @@ class JobTable:
         return job.number, self._service, job.attempt
 
     def held(self, jobs: Sequence[Job]) -> dict[str, bool]:
-        """Of some jobs those that this service still owns, each with whether it was asked to stop."""
+        """Of some jobs those that this service still owns, each with whether it was cancelled."""
         query = (
             "SELECT id, cancelling FROM service.jobs j JOIN unnest(%s::bigint[], %s::int[]) AS t (number, attempt)"
             " USING (number, attempt) WHERE owner = %s AND state = 'running'"
@@ -285,7 +285,7 @@ class SharedJobs(Jobs):
         replica.hear(TOPIC, self._hear)
 
     def _open(self, directory: Path) -> None:
-        """Hold nothing yet: jobs are read when they are asked for."""
+        """Hold nothing yet: jobs are read when they are requested."""
 
     def _close(self) -> None:
         """Do nothing: the connections are not of the jobs."""
@@ -300,12 +300,12 @@ class SharedJobs(Jobs):
         """Take over what is left of services that are gone, and learn which jobs were lost or cancelled."""
         with self._taking:
             held = self._jobs.copy()
-            kept = self._table.held(list(held.values()))
+            owned = self._table.held(list(held.values()))
             resumed = self._table.let_go(list(held))
             why = "The service ended while the job was running or waiting, and this kind of job cannot be resumed."
             failed = self._table.fail_lost(list(self._works), problem_of_job(JobLost(why)))
         for job_id in held:
-            self._mirror(job_id, kept.get(job_id))
+            self._mirror(job_id, owned.get(job_id))
         for job in (*resumed, *failed):
             if job.ended:
                 note_event(job, job.state)
@@ -313,7 +313,7 @@ class SharedJobs(Jobs):
         self._counts = self._table.counts()
 
     def _mirror(self, job_id: str, cancelling: bool | None) -> None:
-        """Note of a job that this service does whether it was asked to stop; None: it was lost."""
+        """Note whether a job of this service was cancelled; None: it was lost."""
         with self._changed:
             job = self._jobs.get(job_id)
             if job is not None and cancelling is None:
@@ -325,9 +325,9 @@ class SharedJobs(Jobs):
         """Learn that a job has changed; None: any may have."""
         if job_id is None or job_id in self._jobs:
             held = [job for job in self._jobs.copy().values() if job_id in (None, job.id)]
-            kept = self._table.held(held)
+            owned = self._table.held(held)
             for job in held:
-                self._mirror(job.id, kept.get(job.id))
+                self._mirror(job.id, owned.get(job.id))
         with self._changed:
             self._news += 1
             self._changed.notify_all()
@@ -452,9 +452,9 @@ class SharedJobs(Jobs):
             job = self._jobs[job_id]
             now = datetime.now(UTC)
             ended = replace(job, state=state, ended_at=now, notes={}, change=job.change + 1, **outcome)  # type: ignore[arg-type]
-        kept = self._persist(job_id, lambda: self._table.write(ended) is not None)
+        owned = self._persist(job_id, lambda: self._table.write(ended) is not None)
         self._drop(job_id)
-        if not kept:
+        if not owned:
             log.warning("job %s was lost to another service, which does it again", job_id)
             return replace(job, state="queued")
         note_event(ended, state)

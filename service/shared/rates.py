@@ -31,7 +31,7 @@ log = logging.getLogger("placerec.shared")
 
 
 class SharedBuckets(Buckets):
-    """Buckets of which other services take, too.  Any thread may use them.
+    """Buckets that are shared with other services.  Any thread may use them.
 
     Args:
         kind: distinguishes them from others in the database.

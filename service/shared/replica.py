@@ -20,7 +20,7 @@ BEAT_SECONDS = 2.0
 """How often a service says that it is there."""
 
 LOSING_SECONDS = 7.0
-"""A service that could not say so for so long stops its jobs, by its own clock: before it counts as gone by the
+"""A service that cannot write its beat for this time stops its jobs, by its own clock: before it counts as gone by the
 database's, and others take them over (``service.living`` in tables.sql)."""
 
 LIVING = "SELECT id FROM service.living"
@@ -30,7 +30,7 @@ CHANNEL = "placerec"
 RECONNECT_SECONDS = 1.0
 
 Heard = Callable[[str | None], None]
-"""Is told what was said; None: the connection was lost for a while, so anything may have been said."""
+"""Called with a message; None: the connection was lost for a while, so any message may have been missed."""
 
 log = logging.getLogger("placerec.shared")
 
@@ -41,7 +41,7 @@ class ServiceReplica:
     id: of the data directory, the same after a restart.
 
     Args:
-        database: what the services share; it is closed by its owner.
+        database: shared by the services; it is closed by its owner.
         directory: the data directory.
 
     Raises:
@@ -65,7 +65,7 @@ class ServiceReplica:
         self._tasks.append(task)
 
     def hear(self, topic: str, heard: Heard) -> None:
-        """Be told in a thread what services say about a topic; call it before :meth:`start`."""
+        """Call a function, in a thread, with the messages of services on a topic; before :meth:`start`."""
         self._heard[topic] = heard
 
     def start(self) -> None:
@@ -109,8 +109,8 @@ class ServiceReplica:
         return "ok" if self.living else next(iter(self._trouble.values()), "PostgreSQL cannot be reached.")
 
     def say(self, topic: str, text: str = "") -> None:
-        """Tell all services, this one included; what is said is not kept for those that do not hear it."""
-        self.database.execute("tell others", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
+        """Send a message to all services, this one included; it is not stored for those that are not connected."""
+        self.database.execute("notify other services", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
 
     # The threads
 

@@ -44,10 +44,10 @@ ADDING = 7_061_636_574
 """The lock of whoever adds a session, so that together they keep to the limit."""
 
 LATE_SECONDS = 30
-"""A session is ended so long after it has expired, since a frame that came in time may still be in the works."""
+"""A session is ended this time after it has expired, since a frame that came in time may still be in the works."""
 
 TIDYING_BEATS = 30
-"""Records of sessions that ended long ago are deleted at every so manieth beat."""
+"""Number of beats between deletions of the records of sessions that ended long ago."""
 
 _TIMES = {"created", "used"}
 _READ = ", ".join(f"extract(epoch FROM {name})::float8" if name in _TIMES else name for name in COLUMNS)
@@ -57,7 +57,7 @@ log = logging.getLogger("placerec.sessions")
 
 @dataclass(frozen=True)
 class Head:
-    """What a service has to know of a session before each frame.
+    """The state of a session that a service needs before each frame.
 
     idle: seconds since its last frame.
     """
@@ -73,7 +73,7 @@ class Head:
 class SessionTable:
     """The table of the sessions; a :class:`service.sessions.store.SessionRecords`.
 
-    Moments are told by the database's clock, so what a record says of them is not looked at.  Every method but
+    Moments are those of the database's clock; the moments in a record are not read.  Every method but
     ``close`` may raise StorageFull and StorageFailure.
     """
 
@@ -104,7 +104,7 @@ class SessionTable:
         return (_stored(found[0][:-1]), found[0][-1]) if found else None
 
     def head(self, session_id: str) -> Head | None:
-        """What is to be known of a session before a frame; None if there is no such session."""
+        """The state of a session that is needed before a frame; None if there is no such session."""
         query = (
             "SELECT map, map_created_at, ended, expires_after,"
             " extract(epoch FROM clock_timestamp() - used)::float8, revision FROM service.sessions WHERE id = %s"
@@ -116,7 +116,7 @@ class SessionTable:
         """Write a session, new or changed.
 
         Args:
-            begun_by: who asked for it, with which request.
+            begun_by: the caller, and the request.
             most: how many sessions may live.
 
         Raises:

@@ -22,7 +22,7 @@ class SharedState:
     """Makes the parts, and runs what keeps them up to date.
 
     Args:
-        database: what the services share.  It is not closed with the state.
+        database: shared by the services.  It is not closed with the state.
         shared_maps: whether all services have the same maps, so that each can do the jobs of all.
     """
 

@@ -15,7 +15,7 @@ SECONDS = 300
 """The time that is looked back on."""
 
 SLOT_SECONDS = 10
-"""Counts are dropped in steps of so many seconds."""
+"""Counts are dropped in steps of this many seconds."""
 
 STEP = math.log(1.05)
 SHORTEST = 1e-6

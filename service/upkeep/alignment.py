@@ -1,6 +1,6 @@
 """The job that aligns a traverse with others: which of its frames show the places of another.
 
-Descriptors as they are stored are compared, by inner products; nothing is encoded.  What was found is stored in one
+Descriptors as they are stored are compared, by inner products; nothing is encoded.  The result is stored in one
 commit, for the places that are then still as they were compared; so an attempt that was cancelled or killed has stored
 nothing, or everything, and the next attempt begins again.
 """
@@ -122,7 +122,7 @@ def check_request(map_: Map, sequence: str, others: Sequence[str] | None) -> Non
 class TraversesToAlign:
     """The traverses of a map at one moment, with at least one frame each.
 
-    snapshot: what is searched at that moment.
+    snapshot: the searched places at that moment.
     whereabouts: of its rows.
     places: the places by their rows.
     """
@@ -130,7 +130,7 @@ class TraversesToAlign:
     def __init__(self, map_: Map) -> None:
         outline = map_.transfer.outline()
         self.snapshot = map_.snapshot()
-        self.whereabouts = self.snapshot.whereabouts  # of now: some stores read them only when they are asked for
+        self.whereabouts = self.snapshot.whereabouts  # of now: some stores read them only when they are needed
         # A place that is being stored at this moment is listed before its row is in a snapshot.
         self.places = {place.row: place for place in outline if place.row < self.snapshot.rows}
         self._members: dict[str, list[Outline]] = {}
@@ -170,7 +170,7 @@ class TraversesToAlign:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the aligned traverse shares with another one.
+    """The stretches that the aligned traverse shares with another one.
 
     name: of the other.
     rows: int64 [r], of its frames.
@@ -187,15 +187,15 @@ class Shared:
 def _shared(snapshot: Snapshot, name: str, first: Rows, second: Rows, advance: Callable[[int], None]) -> Shared:
     """Compare two traverses by the inner products of their descriptors.
 
-    If the other one has so many more frames that a path could not keep up with it, its frames are matched with those
+    If the other one has too many frames for a path to keep up with it, its frames are matched with those
     of the first.
     """
     turned = len(second) > LARGEST_STEP * len(first)
     along, beside = (second, first) if turned else (first, second)
 
     def scores(frames: Rows) -> Callable[[Rows], NDArray[np.float32]]:
-        asked = snapshot.descriptors_at(along[frames])
-        return lambda others: asked @ snapshot.descriptors_at(beside[others]).T
+        queries = snapshot.descriptors_at(along[frames])
+        return lambda others: queries @ snapshot.descriptors_at(beside[others]).T
 
     found = shared_stretches(scores, len(along), len(beside), advance)
     stretches = [np.stack([along[one.first], beside[one.second]], axis=1) for one in found]
@@ -214,9 +214,9 @@ def _pairs(found: Sequence[Shared], still: NDArray[np.bool_]) -> Rows:
 def _change(
     map_: Map, traverses: TraversesToAlign, own: Rows, found: Sequence[Shared], forget: bool, poses: bool
 ) -> Correspondence:
-    """What to store, for the places that are what they were when they were compared; call it while no write begins.
+    """The changes for the places that are unchanged since they were compared; call it while no write begins.
 
-    What an earlier alignment of these traverses stored gives way, unless nothing was found in its place.
+    The result of an earlier alignment of these traverses gives way, unless nothing was found in its place.
 
     Args:
         own: the rows of the aligned traverse.

@@ -107,7 +107,7 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         for gap in walk.gaps
     ]
     gaps.sort(key=lambda gap: -gap.severity)
-    standing = [
+    stopped = [
         StopView(
             sequence=own.places[stop.places[0]].sequence or "", place=names[stop.places[0]], frames=len(stop.places)
         )
@@ -122,8 +122,8 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         aliasing=_aliasing_view(own, first, aliasing, statistics, limit),
         gaps=gaps[:limit],
         gap_count=len(gaps),
-        stops=standing[:limit],
-        stop_count=len(standing),
+        stops=stopped[:limit],
+        stop_count=len(stopped),
         retraverse=_retraverse(own, walks, aliasing, statistics, set(silent))[:limit],
     )
 
@@ -164,12 +164,12 @@ def _trend_view(found: Trend | None) -> TrendView | None:
 def _never_matched(
     own: SelfQueries, views: NDArray[np.int64], statistics: Statistics, silent: list[int], limit: int
 ) -> SilentPlaces | None:
-    asked = sum(week.compared for week in statistics.weeks)
-    if not asked or not len(views):
+    queries = sum(week.compared for week in statistics.weeks)
+    if not queries or not len(views):
         return None
     places = [own.places[i] for i in np.intersect1d(views, silent).tolist()]
     # Poisson: how many places no query would match if each query matched a place drawn at random.
-    by_chance = len(views) * math.exp(-asked / len(views))
+    by_chance = len(views) * math.exp(-queries / len(views))
     ids = [place.id for place in sorted(places, key=lambda place: place.number)[:limit]]
     return SilentPlaces(count=len(places), by_chance=by_chance, places=ids)
 

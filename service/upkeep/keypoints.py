@@ -16,7 +16,7 @@ from core.frames.images import ANY_SIZE, decode
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import KeptFrame, Map
+from core.maps import Map, PicturedPlace
 from core.networks.xfeat import packaged_xfeat
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, yield_to_requests
@@ -31,45 +31,45 @@ MOST_LISTED = 20
 
 
 def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Find the keypoints of the places that have none and whose picture is kept.
+    """Find the keypoints of the places that have none and have a stored picture.
 
     Returns:
         The result of the job.
 
     Raises:
-        UnknownMap, MapQuarantined, StorageFull, StorageFailure: what was committed before stays.
+        UnknownMap, MapQuarantined, StorageFull, StorageFailure: earlier commits stay.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
     map_ = context.map(engine.maps)
-    told: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
+    done: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
     total = map_.count_places()
-    while places := map_.without_keypoints(told["after"], PLACES_PER_COMMIT):
-        made: list[tuple[KeptFrame, Keypoints]] = []
+    while places := map_.without_keypoints(done["after"], PLACES_PER_COMMIT):
+        made: list[tuple[PicturedPlace, Keypoints]] = []
         for place in places:
             yield_to_requests(engine, context)
             try:
                 made.append((place, _keypoints(map_, place)))
             except (InvalidImage, StorageFailure) as error:
-                told["unreadable"] += 1
-                told["named"] = [*told["named"], {"id": place.id, "detail": str(error)}][:MOST_LISTED]
+                done["unreadable"] += 1
+                done["named"] = [*done["named"], {"id": place.id, "detail": str(error)}][:MOST_LISTED]
         with engine.writing(map_.record.id):
-            told["found"] += map_.add_keypoints(made)
-        told["after"] = places[-1].number
-        context.remember(told=told)
-        context.progress(told["found"] + told["unreadable"], total, "finding keypoints")
+            done["found"] += map_.add_keypoints(made)
+        done["after"] = places[-1].number
+        context.remember(told=done)
+        context.progress(done["found"] + done["unreadable"], total, "finding keypoints")
         context.give_way()
     status, count = map_.storage_status(), map_.count_places()
     assert status.keypoints is not None  # the map is open
     return {
         "map": map_.record.id,
         "places": count,
-        "found": told["found"],
+        "found": done["found"],
         "without": max(0, count - status.keypoints.places),
-        "unreadable": {"count": told["unreadable"], "places": told["named"]},
+        "unreadable": {"count": done["unreadable"], "places": done["named"]},
     }
 
 
-def _keypoints(map_: Map, place: KeptFrame) -> Keypoints:
+def _keypoints(map_: Map, place: PicturedPlace) -> Keypoints:
     """The keypoints in the picture that a map keeps of a place.
 
     Raises:

@@ -42,7 +42,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class MergePlan:
-    """What a merge is going to do.
+    """The steps of a merge.
 
     coming: the places of the other map that are copied, each with its id in this map.
     known: how many places this map has already, with the same frame.

@@ -1,7 +1,7 @@
 """The job that prunes a map: it removes places whose neighbours can stand in for them, and measures what is lost.
 
 Where the robot stood, the first frame stands for the others and always stays.  That the others go is the first thing
-that is tried.  What is lost is counted without them, for the many frames of a stop would outvote all other places.
+that is tried.  The loss is counted without them, for the many frames of a stop would outvote all other places.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def _search(
     if not found:
         raise NothingToMeasure(
             "No frame of the map has another frame of the same place by which it could be recognized: there is nothing "
-            "to prune, or poses and sequences do not tell which places are the same."
+            "to prune, or poses and sequences do not show which places are the same."
         )
     positions, scores, gains, right = (np.stack(column) for column in zip(*found, strict=True))
     return RemovalTrial(positions, scores, gains, right, stage)

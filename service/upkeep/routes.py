@@ -112,7 +112,7 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
 
 @router.post("/keypoints", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
 def fill_keypoints(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Find the keypoints of the places that have none, such as those enrolled before the map kept keypoints.
+    """Find the keypoints of the places that have none, such as those enrolled before the map stored keypoints.
 
     They are found in the pictures that the map keeps; of a place without a picture they cannot be found. Queries of
     places that have theirs are verified meanwhile. If the map's setting `verification` is false, this finds nothing.
@@ -151,7 +151,7 @@ def align_map(map_id: MapId, options: Aligning, engine: EngineDep, jobs: JobsDep
     """Find which frames of a traverse show the places of others; from then on these are the same places.
 
     Several traverses of one environment without poses show every place several times, and the frames of one are
-    rivals of the others', so that answers are ambiguous. Sequence matching of the stored descriptors tells which
+    rivals of the others', so that answers are ambiguous. Sequence matching of the stored descriptors shows which
     frames correspond; the result of the job names, for each of the other traverses, the frames paired, the stretches
     that are shared, and the poses handed over. Traverses that share nothing are reported, and nothing is stored.
     Everything is stored in one commit. With `"dry_run": true` nothing is stored.

@@ -56,7 +56,7 @@ class Pruning(BaseModel):
         "frame is a query for which the map is searched without that frame. This overestimates recall, since the "
         "neighbouring frames were taken with it.",
     )
-    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="How many queries are asked at most.")
+    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="The largest number of queries.")
 
 
 class Aligning(BaseModel):
@@ -95,7 +95,7 @@ class Merging(BaseModel):
     )
     on_conflict: Literal["refuse", "rename", "skip"] = Field(
         default="refuse",
-        description="What to do if an id belongs to another frame here, both maps have a sequence of the same name, or "
+        description="The action if an id belongs to another frame here, both maps have a sequence of the same name, or "
         "a camera has another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, "
         "and append places of a sequence to the sequence of the same name.",
     )
@@ -300,7 +300,7 @@ class ComparedTraverse(BaseModel):
 
 
 class SimilarityScale(BaseModel):
-    """What the 8-bit values of the matrix mean: a score is `low` + value / 255 · (`high` - `low`)."""
+    """The meaning of the 8-bit values of the matrix: a score is `low` + value / 255 · (`high` - `low`)."""
 
     low: float
     high: float
@@ -325,7 +325,7 @@ class SimilarityView(BaseModel):
     columns: int
     scale: SimilarityScale
     stretches: list[SharedPath] = Field(
-        description="What they share, the surest first; empty if they share nothing, or one has fewer than ten frames."
+        description="The shared stretches, the surest first; empty if there are none, or one has fewer than ten frames."
     )
     truth: list[int | None] | None = Field(
         description="For each row the column that is nearest by the poses, null if none is within `radius`; null as a "

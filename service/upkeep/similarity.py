@@ -36,7 +36,7 @@ router = APIRouter(prefix="/v1/maps/{map}", tags=["upkeep"], dependencies=[Depen
 JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
 
 KEPT = 2
-"""So many matrices are kept: the JSON and the picture of a matrix are fetched one after the other."""
+"""The number of matrices that are cached: the JSON and the picture of a matrix are fetched one after the other."""
 
 
 class SimilarityParameters(Parameters):
@@ -71,7 +71,7 @@ class Matrix:
 
     @cached_property
     def stretches(self) -> list[SharedStretch]:
-        """What the traverses share."""
+        """The stretches that the traverses share."""
         return stretches_of(self.scores)
 
 
@@ -120,9 +120,9 @@ async def compare_traverses(
     """Compare two traverses of a map frame by frame: the matrix of their scores, and the way through it.
 
     With `Accept: image/png` the matrix is a grey picture with a row for each frame of `query` and a column for each of
-    `reference`; with `application/octet-stream` it is the same values, row by row. JSON, the default, tells its size
+    `reference`; with `application/octet-stream` it is the same values, row by row. JSON, the default, gives its size
     and scale, the places, the stretches that the traverses share by sequence matching, and what poses and alignment
-    say. The scores are those of the first stage. One matrix is made at a time; the latest are kept for a moment, so
+    say. The scores are those of the first stage. One matrix is made at a time; the latest are cached for a moment, so
     that the picture after the JSON costs nothing.
     """
     map_ = await engine.map(map_id)

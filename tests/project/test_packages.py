@@ -94,7 +94,7 @@ def test_without_uv_pip_installs(tmp_path: Path) -> None:
     assert "uv could not install" in said and status == 0
 
 
-def test_a_failure_is_told(tmp_path: Path) -> None:
+def test_a_failure_is_reported(tmp_path: Path) -> None:
     lines, said, status = installed(tmp_path, full="")
     assert lines == ["pip installer.lock"]
     assert "could not be installed" in said and status == 1

@@ -64,7 +64,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
         server.stop()
 
 
-def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
+def test_a_key_is_requested_and_passed_on(proxied: Proxied) -> None:
     with proxied.client() as stranger:
         assert stranger.get("/readyz").status_code == 200
         refused = stranger.get("/v1/maps")

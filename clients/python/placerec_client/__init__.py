@@ -8,7 +8,7 @@
         answer = client.maps["lab"].query("frame.jpg")
         print(answer.verdict, answer.place and answer.place.id)
 
-What a program does not use, such as the asynchronous half, is not imported.
+Unused parts, such as the asynchronous half, are not imported.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for."""
+    """Import a name when it is first used."""
     if name in ("models", "parameters", "problems"):
         return import_module(f"{__name__}.{name}")
     if name not in _HOMES:

@@ -1,4 +1,4 @@
-"""What comes back: whether an answer is final, and the exception for one that is no success."""
+"""Answers: whether one is final, and the exception for one that is no success."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def is_passing(response: httpx.Response) -> bool:
 
 def retry_after(response: httpx.Response) -> float | None:
     """Seconds that the service asks to wait; None if it does not say."""
-    asked = response.headers.get("retry-after", "")
-    return float(asked) if asked.isdecimal() else None
+    seconds = response.headers.get("retry-after", "")
+    return float(seconds) if seconds.isdecimal() else None
 
 
 def refusal(response: httpx.Response, after_loss: bool = False) -> PlacerecError:

@@ -1,4 +1,4 @@
-"""Files of exported maps: what names one, and whether it is whole."""
+"""Files of exported maps: their tags, and the check that one is whole."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_archive(path: Path, expected: str | None = None) -> str:
     """Compare all parts of a file with the SHA-256 in its manifest; return that of the manifest.
 
     Args:
-        expected: what that must be; None for any.
+        expected: the value that it must have; None for any.
 
     Raises:
         TransferFailed: the file cannot be read, is cut or damaged, or is another one.

@@ -1,4 +1,4 @@
-"""Many frames: what is given, what is told of each, and the bounds of a batch."""
+"""Batches of frames: their input, the outcome of each, and the bounds of a batch."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OUT_OF_ORDER = problems.BatchOutOfOrder
 """The problem of a batch whose predecessor is not stored."""
 
 PLACE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,127}")
-"""What the service takes for the id of a place. It also names the frame's part of a form, which cannot be any text."""
+"""The pattern of the id of a place. It also names the frame's part of a form, which cannot be any text."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class NewPlace:
 
 @dataclass(frozen=True)
 class Enrolled:
-    """What became of one frame.
+    """The outcome of one frame.
 
     Attributes:
-        place: what was to be enrolled.
+        place: the frame to enrol.
         change: ``created``, ``replaced``, ``updated`` or ``unchanged``; None if the frame was refused.
         error: why it was refused.
         view: the place as the service has it.
-        fields: what was sent of it.
+        fields: those that were sent of it.
         uploaded: whether its bytes were sent; otherwise the service had them, or they could not be read.
     """
 
@@ -108,13 +108,13 @@ class Read:
 
 
 def read_place(place: NewPlace, digest: bool = False) -> Read:
-    """Read a frame and make its entry; with ``digest`` only the digest of its bytes is kept.
+    """Read a frame and make its entry; with ``digest`` only the digest of its bytes is held.
 
     Raises:
         InvalidParameter: the place is none; what is wrong with one is its ``error``.
     """
     if not isinstance(place, NewPlace):
-        raise InvalidParameter(f"What is enrolled has to be a NewPlace, not a {type(place).__name__}.")
+        raise InvalidParameter(f"A frame to enrol has to be a NewPlace, not a {type(place).__name__}.")
     try:
         if not PLACE_ID.fullmatch(name_of(place.id)):
             raise InvalidName(
@@ -134,7 +134,7 @@ def read_place(place: NewPlace, digest: bool = False) -> Read:
 
 
 def outcome_of(read: Read, item: models.BatchResult | None, error: PlacerecError | None, uploaded: bool) -> Enrolled:
-    """What became of a frame, from the service's answer, or without one."""
+    """The outcome of a frame, from the service's answer, or without one."""
     if item is None or item.change is None:
         return Enrolled(
             read.place, None, error or read.error, fields=read.fields, uploaded=uploaded and read.error is None
@@ -143,7 +143,7 @@ def outcome_of(read: Read, item: models.BatchResult | None, error: PlacerecError
 
 
 class Pace:
-    """The size of the next batch: so many frames as take about BATCH_SECONDS, within what the service accepts."""
+    """The size of the next batch: as many frames as take about BATCH_SECONDS, within what the service accepts."""
 
     def __init__(self) -> None:
         self.frames, self._most = FIRST_BATCH, LARGEST_BATCH

@@ -1,4 +1,4 @@
-"""What can go wrong with a call: every error of this package is a :class:`PlacerecError`."""
+"""The errors of calls: every error of this package is a :class:`PlacerecError`."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Problem(PlacerecError):
         type: the stable name of the kind, such as ``urn:placerec:problem:unknown-map``.
         slug: its last part, such as ``unknown-map``.
         title: the kind in a few words.
-        detail: what is wrong with this request; also the text of the exception.
+        detail: the fault of this request; also the text of the exception.
         request_id: the id under which the service's log has the request.
         retry_after: seconds after which the request may succeed; None if the service does not say.
         body: the whole problem object.

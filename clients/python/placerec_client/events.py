@@ -38,7 +38,7 @@ class Event:
 
 @dataclass(frozen=True)
 class MapEvent:
-    """What happened in a map.
+    """An event of a map.
 
     Attributes:
         kind: ``query``, ``enrolment``, ``session``, ``job`` or ``map``; of the stream itself, ``listening`` or

@@ -1,4 +1,4 @@
-"""What the service answers with: a model for each schema of its interface, under the same name.
+"""Models of the answers of the service: one for each schema of its interface, under the same name.
 
 Written from openapi.json by scripts/client.  Do not edit.
 """
@@ -12,13 +12,13 @@ from placerec_client.model import Known, Model
 
 
 class AgreementDefinition(Model):
-    """The second stage of an encoder. ``layers`` share one grid; ``values`` of each are kept, and its cosine counts
-    by its ``weights``. ``reach`` is how far a cell may have moved, in rows and columns. ``candidates`` are examined;
-    the mean squared cosine over all cells makes up ``share`` of their score, the first stage's score the rest. They
-    are the first of the ranking or, if more places are ``screened``, the most promising of these. ``centred`` is the
-    share of its mean over the frame that each value of a cell loses before it is divided by its deviation over the
-    frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own, others those of the
-    regions. Encoders of other people's networks have none of the three.
+    """The second stage of an encoder. ``layers`` share one grid; ``values`` of each are retained, and its cosine
+    counts by its ``weights``. ``reach`` is how far a cell may have moved, in rows and columns. ``candidates`` are
+    examined; the mean squared cosine over all cells makes up ``share`` of their score, the first stage's score the
+    rest. They are the first of the ranking or, if more places are ``screened``, the most promising of these.
+    ``centred`` is the share of its mean over the frame that each value of a cell loses before it is divided by its
+    deviation over the frame; None: cells stay as they are. Cells that are ``taught`` have projections of their own,
+    others those of the regions. Encoders of other people's networks have none of the three.
     """
 
     layers: list[str]
@@ -123,7 +123,7 @@ class AuditPage(Model):
 
 
 class Problem(Model, extra="allow"):
-    """What went wrong, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
+    """A problem, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
 
     type: str
     title: str
@@ -154,8 +154,8 @@ class EstimatedPose(Model, extra="allow"):
 
 class Pose(Model):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``heading`` is in
-    degrees: counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is kept
-    within [0, 360).
+    degrees: counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is
+    normalized to [0, 360).
     """
 
     x: float | None = None
@@ -361,7 +361,7 @@ class Share(Model):
 
 
 class Bin(Model):
-    """Answers whose probability lies between ``low`` and ``high``: what was promised, and what came of it."""
+    """Answers whose probability lies between ``low`` and ``high``: the promised share, and the outcome."""
 
     low: float
     high: float
@@ -410,12 +410,12 @@ class GeometryTerms(Model):
 class Calibration(Model):
     """When to believe a match; measured on frames held out of training. ``threshold`` is on the decision value,
     ``margin`` on the difference of two scores. ``background_mean`` and ``background_deviation`` describe the score
-    of unrelated frames, in units of the score. ``curve`` tells how probable a decision value is right; a calibration
-    on frames that are all alike has none. ``decision`` names the decision value, of which there is one.
-    ``environment`` describes the scores of other places of one environment, which stand for those that a small map
-    does not have yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames
-    do. ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence
-    changes the order of the candidates only.
+    of unrelated frames, in units of the score. ``curve`` gives the probability that a decision value is right; a
+    calibration on frames that are all alike has none. ``decision`` names the kind of decision value. ``environment``
+    describes the scores of other places of one environment, which stand for those that a small map does not have
+    yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
+    ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes
+    the order of the candidates only.
     """
 
     source: str
@@ -431,7 +431,7 @@ class Calibration(Model):
 
 
 class Reliability(Model):
-    """What stated probabilities are worth, over n answers whose truth is known."""
+    """The reliability of stated probabilities over n answers whose truth is known."""
 
     answers: int
     right: int
@@ -442,7 +442,7 @@ class Reliability(Model):
 
 
 class Held(Model):
-    """What the verdicts did with frames that had no part in the threshold by which they were judged."""
+    """The verdicts on held-out frames: those that had no part in the threshold by which they were judged."""
 
     precision: Share
     recall: Share
@@ -451,7 +451,7 @@ class Held(Model):
 
 
 class Point(Model):
-    """What one threshold on the decision value does, on all frames; the margin is not applied."""
+    """The effect of one threshold on the decision value, on all frames; the margin is not applied."""
 
     threshold: float
     precision: float
@@ -460,7 +460,7 @@ class Point(Model):
 
 
 class Measurement(Model):
-    """What was measured in making a calibration."""
+    """The measurements made for a calibration."""
 
     frames: int
     trials: int
@@ -475,10 +475,10 @@ class Measurement(Model):
 
 
 class Target(Model):
-    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
-    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
-    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
-    has no value.
+    """The target of the threshold. ``precision``: the share of right answers among those believed.
+    ``false_accept_rate``: the share of frames of places that the map lacks that may be believed.
+    ``mean_of_negatives``: rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it has
+    no value.
     """
 
     rule: Known[Literal["precision", "false_accept_rate", "mean_of_negatives"]]
@@ -508,7 +508,7 @@ class Mix(Model):
 
 
 class Effect(Model):
-    """What a calibration does with queries whose truth is known. The calibration may have been fitted to the same
+    """The effect of a calibration on queries whose truth is known. The calibration may have been fitted to the same
     queries, so these figures are a little too good; those of :class:`Measurement` are cross-validated. A best match
     that does not stand out counts as unknown, also where rivals explain it.
     """
@@ -530,7 +530,7 @@ class LatestMeasurement(Model):
 
 
 class CalibrationState(Model):
-    """A map's calibration, and what it does with the frames that the map was last asked to be calibrated."""
+    """A map's calibration, and its effect on the frames of the latest calibrate."""
 
     map: str
     revision: int
@@ -892,7 +892,7 @@ class LabelList(Model):
 
 
 class ReviewLabel(Model):
-    """What people say that a frame shows; one of the three is set."""
+    """People's label of a frame; one of the three is set."""
 
     place: str | None = None
     new: str | None = None
@@ -900,7 +900,7 @@ class ReviewLabel(Model):
 
 
 class ReviewFrameView(Model):
-    """A frame that is kept for review."""
+    """A frame that is stored for review."""
 
     id: int
     at: datetime
@@ -913,7 +913,7 @@ class ReviewFrameView(Model):
 
 
 class Labelled(Model):
-    """What became of a frame."""
+    """The result of a label."""
 
     id: int
     discarded: bool
@@ -1009,7 +1009,7 @@ class ReviewSetting(Model):
 
 
 class StorageStatus(Model):
-    """What a map takes on disk."""
+    """The size of a map on disk."""
 
     precision: str
     bytes_per_place: int
@@ -1096,7 +1096,7 @@ class OperationState(Model):
 
 
 class OwnKey(Model):
-    """Who asks, and what the asker may do."""
+    """The caller, and the caller's rights."""
 
     id: str | None = None
     name: str
@@ -1261,7 +1261,7 @@ class RequestsState(Model):
 
 
 class ReviewPage(Model):
-    """Kept frames, the newest first."""
+    """Frames stored for review, the newest first."""
 
     items: list[ReviewFrameView]
     next_cursor: str | None = None
@@ -1411,7 +1411,7 @@ class SharedPath(Model):
 
 
 class SimilarityScale(Model):
-    """What the 8-bit values of the matrix mean: a score is `low` + value / 255 · (`high` - `low`)."""
+    """The meaning of the 8-bit values of the matrix: a score is `low` + value / 255 · (`high` - `low`)."""
 
     low: float
     high: float
@@ -1436,7 +1436,7 @@ class SimilarityView(Model):
 
 
 class VerifyReport(Model):
-    """What a full reading of a map found."""
+    """The result of a full reading of a map."""
 
     ok: bool
     places: int

@@ -51,7 +51,7 @@ class Odometry:
             raise InvalidOdometry(f"origin has to be a text of at most {LONGEST_ORIGIN} characters.")
 
     def fields(self) -> parameters.SendFrame:
-        """The parameters of a frame that tell the pose."""
+        """The parameters of a frame that give the pose."""
         return {
             "odometry_x": self.x,
             "odometry_y": self.y,

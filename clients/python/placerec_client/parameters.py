@@ -284,7 +284,7 @@ class ReadPlan(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/plan``."""
 
     step: int
-    """List about every so manieth place."""
+    """List about one place in every `step`."""
 
 
 class FollowMap(TypedDict, total=False):
@@ -709,7 +709,7 @@ class ReadAudit(TypedDict, total=False):
     """Only lines about this map."""
 
     key: str | None
-    """Only what the key of this id or name asked for."""
+    """Only calls with the key of this id or name."""
 
     operation: str | None
     """Only this operation."""
@@ -727,16 +727,16 @@ class NewMap(TypedDict, total=False):
     description: str
 
     keep: Literal["none", "thumbnail", "image"]
-    """What is kept of each frame. A change applies to frames enrolled from then on."""
+    """The picture that is stored of each frame. A change applies to frames enrolled from then on."""
 
     same_place_radius: float
-    """Places within so many metres are the same place."""
+    """Places within this distance in metres are the same place."""
 
     same_place_frames: int
-    """Without poses: places so many frames apart in their sequence are the same place."""
+    """Without poses: places this many frames apart in their sequence are the same place."""
 
     verification: bool
-    """Whether keypoints are kept of each frame, by which answers are verified. A change applies to frames enrolled
+    """Whether keypoints of each frame are stored, by which answers are verified. A change applies to frames enrolled
     from then on.
     """
 
@@ -746,7 +746,7 @@ class NewMap(TypedDict, total=False):
     """
 
     review: ReviewSetting | None
-    """Which frames are kept to be reviewed by people; null: none."""
+    """Which frames are stored to be reviewed by people; null: none."""
 
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
@@ -772,7 +772,7 @@ class MapChanges(TypedDict, total=False):
     """auto, exact or compact (auto from 256 places on)."""
 
     review: ReviewChanges | None
-    """null: no frames are kept from now on."""
+    """null: no frames are stored from now on."""
 
     calibration: CalibrationChanges | None
 
@@ -808,7 +808,7 @@ class NewSession(TypedDict, total=False):
     """Only the places of these traverses."""
 
     lag: int
-    """Also estimate where the robot was so many frames ago, given all frames since."""
+    """Also estimate where the robot was this number of frames ago, given all frames since."""
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
@@ -856,7 +856,7 @@ class Pruning(TypedDict, total=False):
     """
 
     sample: int
-    """How many queries are asked at most."""
+    """The largest number of queries."""
 
 
 class Merging(TypedDict, total=False):
@@ -866,7 +866,7 @@ class Merging(TypedDict, total=False):
     """Only report what would be copied, and how far the maps overlap."""
 
     on_conflict: Literal["refuse", "rename", "skip"]
-    """What to do if an id belongs to another frame here, both maps have a sequence of the same name, or a camera has
+    """The action if an id belongs to another frame here, both maps have a sequence of the same name, or a camera has
     another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, and append places
     of a sequence to the sequence of the same name.
     """
@@ -889,26 +889,26 @@ class CalibrationOrder(TypedDict, total=False):
     """How a map is to be calibrated, and for which target."""
 
     target: Target
-    """What the threshold is chosen to reach."""
+    """The target of the threshold."""
 
     dry_run: bool
     """Report the calibration without storing it."""
 
     sequence: str | None
-    """The traverse whose frames are asked."""
+    """The traverse whose frames query the map."""
 
     pairs: Mapping[str, str | None] | None
     """For places of the sequence, the id of a place of another sequence that shows the same, or null if there is
-    none. Only these places are asked. If left out, poses decide which places are the same.
+    none. Only these places query the map. If left out, poses decide which places are the same.
     """
 
     most: int
-    """How many frames are asked at most; they are chosen evenly."""
+    """The largest number of frames that query the map; they are chosen evenly."""
 
     beside: Literal["encoder", "map", "none"]
     """With the method labels, what the labels join, since they are few and of the doubtful frames. `encoder`: the
     encoder's calibration, whose curve is moved as far as the labels demand; the target is not used then. `map`: the
-    map's own frames, which are asked as well. `none`: nothing.
+    map's own frames, which query it as well. `none`: nothing.
     """
 
     labels: Sequence[Label] | None
@@ -952,7 +952,7 @@ class Deletion(TypedDict, total=False):
     """Which places to delete: those of some ids, or those that fulfil some conditions."""
 
     ids: Sequence[str] | None
-    """Ids of places; those that are gone are told."""
+    """Ids of places; those that are gone are listed in the answer."""
 
     filter: PlaceConditions | None
     """Conditions, at least one."""
@@ -962,7 +962,7 @@ class Deletion(TypedDict, total=False):
 
 
 class LabelOrder(TypedDict, total=False):
-    """What a frame shows, or that it is thrown away: exactly one of these."""
+    """A label, or that the frame is thrown away: exactly one of these."""
 
     place: str | None
     """It shows this place of the map."""
@@ -991,10 +991,10 @@ class Label(TypedDict):
 
 
 class Target(TypedDict):
-    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
-    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
-    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
-    has no value.
+    """The target of the threshold. ``precision``: the share of right answers among those believed.
+    ``false_accept_rate``: the share of frames of places that the map lacks that may be believed.
+    ``mean_of_negatives``: rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it has
+    no value.
     """
 
     rule: Literal["precision", "false_accept_rate", "mean_of_negatives"]
@@ -1113,7 +1113,7 @@ class ReviewSetting(TypedDict):
     """Which frames a map keeps so that people can say later what they show, and how many at most."""
 
     verdicts: NotRequired[Sequence[Literal["recognized", "ambiguous", "unknown"]]]
-    """Frames that are answered with one of these are kept."""
+    """Frames that are answered with one of these are stored."""
 
     most_frames: NotRequired[int]
     """Most frames; the oldest go first."""

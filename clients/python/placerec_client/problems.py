@@ -54,11 +54,11 @@ class UnknownCamera(Problem):
 
 
 class UnknownExplanation(Problem):
-    """404 ``unknown-explanation``: The picture does not exist or is no longer kept."""
+    """404 ``unknown-explanation``: The picture does not exist or is no longer stored."""
 
 
 class UnknownFrame(Problem):
-    """404 ``unknown-frame``: The frame is not kept for review."""
+    """404 ``unknown-frame``: The frame is not stored for review."""
 
 
 class UnknownJob(Problem):
@@ -174,7 +174,7 @@ class SessionExpired(Problem):
 
 
 class ExportGone(Problem):
-    """412 ``export-gone``: The export is no longer kept."""
+    """412 ``export-gone``: The export is no longer stored."""
 
 
 class RevisionMismatch(Problem):

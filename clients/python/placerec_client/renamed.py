@@ -9,7 +9,7 @@ from placerec_client.errors import Renamed
 
 
 class OldNames:
-    """A class whose methods once had other names says so when it is asked for one of these.
+    """A class whose methods once had other names names the new one when an old one is used.
 
     The names are given with the class: ``class Keys(OldNames, revoke="delete")``.
     """
@@ -33,7 +33,7 @@ DELETING = ("forget", "revoke", "end")
 
 
 class Subscripted:
-    """A collection whose members have the methods: asked for one of these itself, it says whose it is."""
+    """A collection whose members have the methods: if one of these is called on it, the error says so."""
 
     if not TYPE_CHECKING:
 

@@ -1,4 +1,4 @@
-"""What is sent: paths, query strings, JSON, forms."""
+"""The parts of requests: paths, query strings, JSON, forms."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def text_of(name: str, value: Any) -> str:
 
 
 def _single(name: str, value: Any) -> str:
-    """The text of what is no list."""
+    """The text of a value that is no list."""
     if getattr(value, "ndim", None) == 0:  # a number of NumPy, whose text is not the number's
         value = value.item()
     if isinstance(value, str):
@@ -109,7 +109,7 @@ def dumps(value: Any, name: str = "what is given") -> str:
     """A value as JSON; times become ISO 8601.
 
     Args:
-        name: what an error calls it.
+        name: its name in errors.
 
     Raises:
         InvalidParameter: it has something that JSON has not.
@@ -172,7 +172,7 @@ def form(parts: Sequence[Part]) -> tuple[bytes, str]:
 
 
 def part_head(part: Part, boundary: str) -> bytes:
-    """What comes before the data of one part."""
+    """The bytes before the data of one part."""
     name = (
         text_of("the name of a frame", part.name)
         .replace("\\", "\\\\")
@@ -188,7 +188,7 @@ def part_head(part: Part, boundary: str) -> bytes:
 
 
 def part_end(boundary: str) -> bytes:
-    """What comes after the last part and its line end."""
+    """The bytes after the last part and its line end."""
     return f"--{boundary}--\r\n".encode()
 
 

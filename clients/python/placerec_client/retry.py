@@ -35,7 +35,7 @@ class Retry:
     longest_pause: float = 8.0
 
     def pause(self, attempt: int) -> float:
-        """Seconds to wait after so many failed attempts, at random between half and one and a half of the nominal."""
+        """Seconds to wait after failed attempts, at random between half and one and a half of the nominal."""
         nominal = self.first_pause * 2.0 ** min(attempt - 1, 30)
         return min(nominal, self.longest_pause) * random.uniform(0.5, 1.5)
 
@@ -62,22 +62,22 @@ class Clock:
         self._retry = retry
         self.deadline = deadline
         self.attempts = 0
-        self.lost = False  # whether the service may have done what was asked for without being heard
+        self.lost = False  # whether the service may have done the request although its answer was lost
 
     def left(self) -> float | None:
         """Seconds until the deadline; None without one."""
         return None if self._until is None else self._until - time.monotonic()
 
-    def pause(self, asked: float | None = None) -> float | None:
+    def pause(self, least: float | None = None) -> float | None:
         """Seconds to wait before the next attempt; None if there is no time for one.
 
         Args:
-            asked: seconds that the service asks to wait, which are never shortened.
+            least: seconds that the service asks to wait, which are never shortened.
         """
         left = self._last - time.monotonic()
         retry = self._retry
         pause = min(retry.pause(self.attempts), left / 2)
         if pause < min(retry.first_pause / 2, retry.longest_pause / 2, SHORTEST_PAUSE):
             return None
-        pause = max(pause, asked or 0.0)
+        pause = max(pause, least or 0.0)
         return pause if pause < left else None

@@ -1,1 +1,1 @@
-"""A ROS 2 node that tells a robot where it is, by a placerec service."""
+"""A ROS 2 node that localizes a robot by a placerec service."""

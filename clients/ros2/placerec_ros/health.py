@@ -1,4 +1,4 @@
-"""What the node knows of its own health: troubles, counters, times. It is what ``/diagnostics`` shows.
+"""The health of the node, as ``/diagnostics`` shows it: troubles, counters, times.
 
 A trouble that lasts is logged when it begins and when it is over. One of single frames is logged once in each wording.
 """
@@ -74,7 +74,7 @@ class Health:
             self._log(WARN, sentence)
 
     def answered(self, seconds: float, localized: str | None) -> None:
-        """Note an answer: what it took, and the moment of the frame if the robot was localized."""
+        """Note an answer: its time, and the moment of the frame if the robot was localized."""
         with self._lock:
             self.counts["frames answered"] += 1
             self._latencies.append(seconds)

@@ -66,10 +66,10 @@ def _distortion(message: Any) -> tuple[str, list[float]]:
     most = max(COUNTS[model])
     if any(coefficients[most:]):
         raise UnfitCamera(f"{model} has {len(coefficients)} coefficients in CameraInfo; the service takes {most}")
-    kept = coefficients[:most]
-    if len(kept) not in COUNTS[model]:
-        raise UnfitCamera(f"{model} has {len(kept)} coefficients in CameraInfo; the service needs {min(COUNTS[model])}")
-    return model, kept
+    used = coefficients[:most]
+    if len(used) not in COUNTS[model]:
+        raise UnfitCamera(f"{model} has {len(used)} coefficients in CameraInfo; the service needs {min(COUNTS[model])}")
+    return model, used
 
 
 def camera_name(intrinsics: dict[str, Any]) -> str:

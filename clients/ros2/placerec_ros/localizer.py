@@ -1,6 +1,6 @@
 """The thread that speaks with the service, so that the node's callbacks never wait for it.
 
-Frames come in by :meth:`Localizer.add`, answers go out by an :class:`Outlet`. What the node's services ask for is done
+Frames come in by :meth:`Localizer.add`, answers go out by an :class:`Outlet`. Requests of the node's services are done
 by the same thread, between two frames.
 """
 
@@ -29,7 +29,7 @@ from placerec_ros.pose import UNKNOWN_ANGLE, PoseEstimate, estimate, metric
 from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
-"""Seconds before the service is asked again after a trouble; they double."""
+"""Seconds before the next request after a trouble; they double."""
 IDLE_CHECK = 5.0
 """Seconds without a frame after which the node asks whether the service is there."""
 CAMERA_WAIT = 2.0
@@ -43,7 +43,7 @@ OF_THE_FRAME = frozenset({400, 413, 415, 422})
 class Answered:
     """An answer with what follows from it.
 
-    report: what is published as JSON.
+    report: the answer that is published as JSON.
     robot: the robot's pose in the map; None while it is not localized.
     correction: the transform from the map to the odometry; None without odometry, or if the heading is not known.
     """
@@ -67,7 +67,7 @@ class Outlet(Protocol):
 
 @dataclass(frozen=True)
 class Done:
-    """What a service of the node answers."""
+    """The answer of a service of the node."""
 
     success: bool
     message: str
@@ -91,7 +91,7 @@ class Localizer:
         self._wake = threading.Event()
         self._active = self._stopped = False
         self._generation = 0
-        # What follows is the worker's own.
+        # The fields below belong to the worker.
         self._client: Client | None = None
         self._run: Run | None = None
         self._run_generation = 0
@@ -115,7 +115,7 @@ class Localizer:
         self._wake.set()
 
     def camera(self, intrinsics: dict[str, Any] | None) -> None:
-        """Take in the camera's intrinsics; None if the message tells none."""
+        """Take in the camera's intrinsics; None if the message has none."""
         self._intrinsics = intrinsics
         self._camera_due = 0.0
 
@@ -139,7 +139,7 @@ class Localizer:
         self._wake.set()
 
     def stop(self, patience: float) -> None:
-        """End the thread. If a request keeps it longer than so many seconds, it ends by itself after the request."""
+        """End the thread. If a request takes longer than ``patience`` seconds, it ends by itself after the request."""
         self.deactivate()
         self._stopped = True
         self._wake.set()
@@ -185,7 +185,6 @@ class Localizer:
         return IDLE_CHECK
 
     def _work_once(self) -> None:
-        """Do all there is to do."""
         while not self._stopped:
             if self._run is not None and self._run_generation != self._generation:
                 self._end_run()
@@ -207,7 +206,7 @@ class Localizer:
         return self._client
 
     def _guarded(self, step: Callable[[], None]) -> None:
-        """Run a step; what goes wrong is told, and the next attempt waits."""
+        """Run a step; a failure is reported, and the next attempt waits."""
         try:
             step()
         except (UnfitPicture, InvalidOdometry) as error:
@@ -217,7 +216,7 @@ class Localizer:
             reason = reason_of(error)
             if isinstance(reason, Problem):
                 self._health.over("service")
-                self._told(reason)
+                self._react(reason)
             else:
                 self._health.fact("service", str(reason))
                 self._health.begins("service", str(reason), ERROR)
@@ -229,7 +228,7 @@ class Localizer:
         else:
             self._health.over("node")
 
-    def _told(self, problem: Problem) -> None:
+    def _react(self, problem: Problem) -> None:
         """Decide what a problem means for the frames to come."""
         if problem.slug in SESSION_GONE:
             self._run = None  # a new one begins with the next frame
@@ -270,7 +269,7 @@ class Localizer:
             return
         run = self._running()
         # Odometry's own pose: a frame without an answer may have reached the session, and its motion must count once.
-        odometry = self.odometer.told(frame.stamp, math.radians(self._settings.camera_yaw)) if frame.stamp else None
+        odometry = self.odometer.odometry(frame.stamp, math.radians(self._settings.camera_yaw)) if frame.stamp else None
         began = time.monotonic()
         answer = run.send(picture, frame.number, frame.stamp, odometry)
         took = time.monotonic() - began

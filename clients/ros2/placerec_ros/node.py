@@ -55,7 +55,7 @@ Success, Failure = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 
 def sensor_qos(depth: int) -> QoSProfile:
-    """Best effort, the last few: a sensor's message that was lost is not asked for again."""
+    """Best effort, the last few: a sensor's message that was lost is not sent again."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -88,9 +88,9 @@ class PlacerecNode(LifecycleNode):
 
     # ---- parameters
 
-    def _may_set(self, asked: list[Any]) -> SetParametersResult:
+    def _may_set(self, parameters: list[Any]) -> SetParametersResult:
         """Refuse what would have no effect until the node is configured anew."""
-        for one in asked:
+        for one in parameters:
             present = self.get_parameter(one.name).value if self.has_parameter(one.name) else None
             reason = refusal(one.name, one.value, present, self._settings is not None)
             if reason is not None:
@@ -365,7 +365,7 @@ class PlacerecNode(LifecycleNode):
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """What ROS shows of a parameter, and the range that it holds it to."""
+    """The description of a parameter in ROS, and the range that it enforces."""
     made = ParameterDescriptor(description=parameter.description)
     if parameter.choices:
         made.additional_constraints = f"One of: {', '.join(parameter.choices)}"
@@ -391,7 +391,7 @@ def _is_local(url: str) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until it is told to end."""
+    """Run the node until it is stopped."""
     rclpy.init(args=arguments)
     node = PlacerecNode()
     executor = SingleThreadedExecutor()
@@ -402,7 +402,7 @@ def main(arguments: list[str] | None = None) -> int:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except RuntimeError:  # rclpy's, of a message that came while it was told to end
+    except RuntimeError:  # rclpy's, of a message that came while it was stopped
         if rclpy.ok():
             raise
     finally:

@@ -41,10 +41,10 @@ Covariance = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Reading:
-    """What a message of odometry tells.
+    """The content of a message of odometry.
 
     stamp: nanoseconds.
-    speed: metres a second, by the twist; 0 if the message tells none.
+    speed: metres a second, by the twist; 0 if the message has none.
     covariance: of x, y and yaw, nine numbers row by row; None if the message has none that can be used.
     """
 
@@ -118,8 +118,8 @@ class Odometer:
             reading = self._read(stamp)
         return None if reading is None else reading.pose
 
-    def told(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
-        """What the service is told with a frame of a moment, in nanoseconds; None if no odometry is near it.
+    def odometry(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
+        """The odometry to send with a frame of a moment, in nanoseconds; None if none is near it.
 
         Args:
             camera_yaw: radians by which the camera looks to the left of the robot's front; the heading is that of the

@@ -20,7 +20,7 @@ _UNSEEN = (
     r"\uffa0\ufff9-\ufffb"
 )
 TRAVERSE = re.compile(rf"(\.{{0,2}}[^.\s/\\{_UNSEEN}]|\.{{3}})[^/\\{_UNSEEN}]*")
-"""What the service takes for the name of a traverse, of 128 characters at most: no ``.`` or ``..``, nothing unseen."""
+"""The pattern of the name of a traverse, of 128 characters at most: no ``.`` or ``..``, nothing unseen."""
 KEY_VARIABLE = "PLACEREC_KEY"
 
 
@@ -90,7 +90,7 @@ PARAMETERS = (
         "advance",
         0.0,
         "Places of the map's traverse that usually go by from image to image, where neither odometry nor a "
-        "speed limit tells it; 0: the session learns it.",
+        "speed limit gives it; 0: the session learns it.",
         0.0,
         100.0,
     ),

@@ -63,7 +63,7 @@ def file_of(message: Any) -> bytes:
 def pixels_of(message: Any) -> Pixels:
     """The pixels of a ``sensor_msgs/Image``, uint8 [height, width] or [height, width, 3] in the order BGR.
 
-    Of channels with 16 bits the upper 8 are kept.
+    Of channels with 16 bits the upper 8 are used.
 
     Raises:
         UnfitPicture: the encoding is none of a picture, or the data are fewer than the message says.
@@ -108,7 +108,7 @@ def _paired(rows: Pixels, places: tuple[int, int, int, int]) -> Pixels:
 
 
 def picture_of(message: Any) -> bytes | Pixels:
-    """What is sent of a message: the bytes of a file, or pixels.
+    """The picture of a message: the bytes of a file, or pixels.
 
     Raises:
         UnfitPicture: it holds no picture that the service could use.

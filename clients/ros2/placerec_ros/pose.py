@@ -12,7 +12,7 @@ from placerec_ros.planar import Planar, wrapped
 UNKNOWN_HEIGHT = 1e6
 """Variance of z in m² where places have none, as the service gives it."""
 UNKNOWN_ANGLE = math.pi**2 / 3
-"""Variance in rad² of an angle of which nothing is known."""
+"""Variance in rad² of an unknown angle."""
 HEADING_VARIANCE = math.radians(20) ** 2
 """A frame may be turned by so much and still match its place."""
 

@@ -1,4 +1,4 @@
-"""The file of a map, whatever stores it: what it holds, writing it, reading and checking it.
+"""The file of a map, whatever stores it: its content, writing it, reading and checking it.
 
 manifest, tar_layout, lines     what the file holds, and where each part lies in it
 writing                         writing it from what a store has

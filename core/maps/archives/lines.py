@@ -51,7 +51,7 @@ class CameraLine(_Line):
 
 
 class Picture(_Line):
-    """The picture kept of a place's frame: its bytes are the next ones in the pictures of its group."""
+    """The stored picture of a place's frame: its bytes are the next ones in the pictures of its group."""
 
     kind: Literal["thumbnail", "image"]
     bytes: Annotated[int, Field(ge=0, le=MOST_PICTURE_BYTES, strict=True)]
@@ -62,10 +62,10 @@ class PlaceLine(_Line):
     """A place.
 
     track, station: the sequence and the ordinal at which another traverse shows the same; None: its own.  A sequence
-        that is gone has no name any more, but a number, by which the places on its track are told from others.
+        that is gone has no name any more, but a number, which distinguishes the places on its track from others.
     pose_of: the place whose pose it got from an alignment.
     digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
-    keypoints: how many its frame has, whose record is the next one in the keypoints of its group; None: none are kept.
+    keypoints: the number of those of its frame; their record is the next one in its group.  None: none are stored.
     """
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]

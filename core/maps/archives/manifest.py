@@ -9,7 +9,7 @@ The file is a plain tar (ustar).  Its members, in this order:
     places-000001.jsonl         a line per place, in the order of enrolment
     descriptors-000001.bin      of the same places: descriptor and local descriptors as the map stores them,
                                 without anything between them
-    pictures-000001.bin         of the same places: the pictures kept of their frames
+    pictures-000001.bin         of the same places: the stored pictures of their frames
     keypoints-000001.bin        of the same places: the records of their keypoints (:mod:`core.geometry.keypoints`)
     places-000002.jsonl …       and so on
 
@@ -101,7 +101,7 @@ def group_names(number: int) -> list[str]:
 def written(manifest: Manifest) -> bytes:
     """The manifest as bytes; equal manifests are always the same bytes.
 
-    Which frames are kept for review is left out, as these frames are.
+    The setting of frames stored for review is left out, as these frames are.
     """
     content = manifest.model_dump(mode="json", exclude={"map": {"review"}})
     return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()

@@ -24,7 +24,7 @@ def header(name: str, size: int) -> bytes:
 
 
 def padded(size: int) -> int:
-    """What a member of ``size`` bytes takes behind its header."""
+    """The length of a member of ``size`` bytes behind its header, padding included."""
     return -(-size // BLOCK) * BLOCK
 
 
@@ -46,7 +46,7 @@ class TarLayout:
     """The members of a file in their order, and its length in bytes."""
 
     def __init__(self, manifest: Manifest, manifest_bytes: int) -> None:
-        """Of a manifest that is written in so many bytes."""
+        """The layout for a manifest that is written in ``manifest_bytes`` bytes."""
         sizes = [(MANIFEST, manifest_bytes), (SEAL, _SEAL_BYTES), *((part.name, part.bytes) for part in manifest.parts)]
         self.members: list[Member] = []
         position = 0
@@ -73,7 +73,7 @@ def manifest_size(first: bytes) -> int:
 
 
 def describe(block: bytes, expected: Member) -> str:
-    """What stands where the header of a member should, for a person."""
+    """The content in the place of a member's header, described for people."""
     if not any(block):
         return f"{expected.name} is missing: the tar ends before it"
     try:

@@ -1,4 +1,4 @@
-"""Writing the file of a map from what a store has of it at one moment.
+"""Writing the file of a map from its content in a store at one moment.
 
 The store is read twice: first the lines, for the sizes of all parts, from which it follows how long the file will be
 and where each part lies; then everything, to write it.
@@ -34,13 +34,13 @@ from core.maps.archives.tar_layout import BLOCK, END_BYTES, TarLayout, header, p
 
 PLACES_PER_GROUP = 1024
 BYTES_PER_GROUP = 256 << 20
-"""A group is also full when it has so many bytes of pictures or of descriptors."""
+"""A group is also full with this number of bytes of pictures or of descriptors."""
 
 Advance = Callable[[int], None]
-"""Is called with the number of places that were written; what it raises ends the work."""
+"""Called with the number of places that were written; its exceptions end the work."""
 
 Expect = Callable[[int], None]
-"""Is called with the size of the file in bytes before it is made; what it raises ends the work."""
+"""Called with the size of the file in bytes before it is made; its exceptions end the work."""
 
 Chunks = Iterable[bytes | memoryview]
 
@@ -66,8 +66,8 @@ class ArchivedPlace:
     text: the line.
     number, row: of the place and its descriptor in the store.
     checksum: of its descriptor, where the store has one.
-    picture_bytes: size of the picture kept of its frame; 0 if none is kept.
-    keypoints_bytes: size of the record of its keypoints; 0 if none are kept.
+    picture_bytes: size of the stored picture of its frame; 0 without one.
+    keypoints_bytes: size of the record of its keypoints; 0 without one.
     """
 
     id: str
@@ -80,7 +80,7 @@ class ArchivedPlace:
 
 
 class ArchiveSource(Protocol):
-    """What a store has of a map at one moment; every method may raise StorageFailure and UnknownMap."""
+    """The content of a map at one moment; every method may raise StorageFailure and UnknownMap."""
 
     @property
     def record(self) -> ArchivedRecord:
@@ -88,7 +88,7 @@ class ArchiveSource(Protocol):
 
     @property
     def frame_bytes(self) -> int:
-        """What the descriptors of one place take, as the map stores them."""
+        """The size of one place's descriptors, as the map stores them."""
 
     def sequence_lines(self) -> Iterator[bytes]:
         """The lines of sequences by name; that of places without a sequence comes first."""
@@ -118,7 +118,7 @@ def write_archive(source: ArchiveSource, path: Path, advance: Advance, expect: E
     Raises:
         StorageFailure: the map is too large for one file.
         OSError: the disk refuses.
-        Others: what the source raises.
+        Others: the exceptions of the source.
     """
     manifest = _planned(source)
     tape = TarLayout(manifest, len(written(manifest)))

@@ -19,7 +19,7 @@ Access = Callable[[], AbstractContextManager[Connection[Any]]]
 
 
 class MilvusCameras(Cameras):
-    """All cameras of one map.  Any thread may use it.
+    """All cameras of one map (:class:`core.maps.cameras.Cameras`).  Any thread may use it.
 
     Args:
         map_number: of the map.
@@ -36,7 +36,6 @@ class MilvusCameras(Cameras):
             return [CameraRecord.model_validate_json(text) for (text,) in found]
 
     def known(self, name: str) -> CameraRecord | None:
-        """One camera; None if the map has none of this name."""
         if not is_storable(name):
             return None
         with self._reading() as connection:

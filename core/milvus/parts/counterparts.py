@@ -23,12 +23,10 @@ class MilvusCounterparts:
         self._map, self._reading, self._writing = map_number, reading, writing
 
     def handed_over(self) -> dict[int, str]:
-        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
         with self._reading() as connection:
             return ledger.handed_over(connection, self._map)
 
     def store(self, change: Correspondence) -> None:
-        """Store stations and poses, all of them or, if this raises, none; rows whose place is gone are left out."""
         if not change.rows:
             return
         with self._writing() as write:
@@ -38,12 +36,6 @@ class MilvusCounterparts:
                 write.set_counterpart(stored, track, station, pose, pose_of)
 
     def copy(self, other: MilvusCounterparts, names: Mapping[str, str]) -> None:
-        """Bring places that were copied from another map to the stations that they have there, in one write.
-
-        Args:
-            other: of the map from which they were copied.
-            names: the ids of the copied places in this map, by their ids in the other.
-        """
         with other._reading() as connection:
             there = ledger.standings(connection, other._map)
         with self._writing() as write:

@@ -22,7 +22,7 @@ from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.forms import Form
 from core.milvus.ledger import MapState
-from core.milvus.pictures.kept import Kept, digest_of, read_pictures, size_of
+from core.milvus.pictures.stored import StoredPicture, digest_of, read_pictures, size_of
 from core.places import Pose
 
 if TYPE_CHECKING:
@@ -85,8 +85,8 @@ class _Source:
         query = "SELECT record FROM cameras WHERE map = %s ORDER BY name"
         for (text,) in self._connection.execute(query, (self._map,)):
             camera = CameraRecord.model_validate_json(text)
-            kept = {name: json.loads(camera.model_dump_json(include={name}))[name] for name in ("mask", "intrinsics")}
-            yield written_line({"name": camera.name, **kept, "updated_at": moment_text(camera.updated_at)})
+            values = {name: json.loads(camera.model_dump_json(include={name}))[name] for name in ("mask", "intrinsics")}
+            yield written_line({"name": camera.name, **values, "updated_at": moment_text(camera.updated_at)})
 
     def places(self) -> Iterator[ArchivedPlace]:
         query = (
@@ -100,8 +100,8 @@ class _Source:
         with self._connection.cursor(name="placerec_export") as cursor:
             cursor.itersize = READ_AT_ONCE
             for *columns, track, picture, name, size, digest, keypoints in cursor.execute(query, (self._map,)):
-                kept = ledger.kept_of(picture, name, size, digest)
-                yield _place(ledger.entry_of(tuple(columns)), track, kept, keypoints, lost)
+                stored = ledger.stored_picture(picture, name, size, digest)
+                yield _place(ledger.entry_of(tuple(columns)), track, stored, keypoints, lost)
 
     def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         for some in _in_pieces(group):
@@ -113,8 +113,8 @@ class _Source:
 
     def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         for some in _in_pieces([place for place in group if place.picture_bytes]):
-            kept = ledger.pictures_of(self._connection, self._map, [place.row for place in some])
-            found = read_pictures(self._objects, kept)
+            stored = ledger.pictures_of(self._connection, self._map, [place.row for place in some])
+            found = read_pictures(self._objects, stored)
             for place in some:
                 picture = found.get(place.row)
                 if picture is None:
@@ -142,7 +142,7 @@ def _in_pieces(group: Sequence[ArchivedPlace]) -> Iterator[Sequence[ArchivedPlac
 
 
 def _place(
-    entry: ledger.PlaceEntry, track: str | None, picture: Kept, keypoints: int | None, lost: dict[int, int]
+    entry: ledger.PlaceEntry, track: str | None, picture: StoredPicture, keypoints: int | None, lost: dict[int, int]
 ) -> ArchivedPlace:
     """The line of a place.
 
@@ -152,9 +152,9 @@ def _place(
         lost: the numbers of the tracks whose sequence is gone, by their codes; it gets those that it lacks.
     """
     place = entry.place
-    kept = None
+    described = None
     if picture is not None:
-        kept = {"kind": place.picture, "bytes": size_of(picture), "sha256": digest_of(picture).hex()}
+        described = {"kind": place.picture, "bytes": size_of(picture), "sha256": digest_of(picture).hex()}
     text = written_line(
         {
             "id": place.id,
@@ -169,7 +169,7 @@ def _place(
             "metadata": json.loads(metadata_text(place.metadata)),
             "regions": place.regions,
             "digest": entry.digest.hex(),
-            "picture": kept,
+            "picture": described,
             "keypoints": None if keypoints is None else count_of(keypoints),
             "created_at": moment_text(place.created_at),
             "updated_at": moment_text(place.updated_at),

@@ -18,7 +18,7 @@ from core.maps.review import ReviewFrame, ReviewPage, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
-from core.milvus.pictures.kept import new_object, read_pictures
+from core.milvus.pictures.stored import new_object, read_pictures
 
 if TYPE_CHECKING:
     from core.milvus.pictures.objects import Objects
@@ -27,7 +27,7 @@ _COLUMNS = "number, at, digest, size, answer, label"
 
 
 class MilvusReview:
-    """The kept frames of one map (:class:`core.maps.review.Review`).
+    """The frames of one map stored for review (:class:`core.maps.review.Review`).
 
     They are not part of what a search needs, so writing them does not wait for other writes to the map.
 
@@ -50,11 +50,6 @@ class MilvusReview:
             yield connection
 
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
-        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
-
-        Returns:
-            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
-        """
         if len(data) > setting.most_bytes:
             return False
         digest = hashlib.sha256(data).digest()
@@ -80,12 +75,11 @@ class MilvusReview:
         return True
 
     def shrink(self, setting: ReviewSetting) -> None:
-        """Drop the oldest frames beyond new limits."""
         with self._writing() as connection:
             self._drop_oldest(connection, setting)
 
     def _drop_oldest(self, connection: Connection[Any], setting: ReviewSetting) -> None:
-        """Drop frames, those without a label first and the oldest of these first, until the limits are kept."""
+        """Drop frames, those without a label first and the oldest of these first, until the limits hold."""
         count, size = self._size(connection)
         if setting.allows(count, size):
             return
@@ -94,12 +88,6 @@ class MilvusReview:
         connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
-        """The latest frames, newest first, and how many are kept in all, as of one moment.
-
-        Args:
-            before: only frames with a smaller number; None: all.
-            labelled: only frames with a label, or without one; None: all.
-        """
         also = "" if labelled is None else f" AND label IS {'NOT ' * labelled}NULL"
         query = (
             f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number < %s{also} ORDER BY number DESC LIMIT %s"
@@ -109,33 +97,21 @@ class MilvusReview:
             return ReviewPage([_frame(values) for values in found], *self._size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
         query = f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND label IS NOT NULL ORDER BY number"
         with self._reading() as connection:
             return [_frame(values) for values in connection.execute(query, (self._map,))]
 
     def _size(self, connection: Connection[Any]) -> tuple[int, int]:
-        """How many frames are kept, and their bytes."""
+        """How many frames are stored, and their bytes."""
         query = "SELECT count(*), coalesce(sum(size), 0) FROM review_frames WHERE map = %s"
         ((count, size),) = connection.execute(query, (self._map,)).fetchall()
         return int(count), int(size)
 
     def find(self, number: int) -> ReviewFrame:
-        """One frame.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._reading() as connection:
             return self._expect(connection, number)
 
     def picture(self, number: int) -> bytes:
-        """The file of a frame.
-
-        Raises:
-            UnknownFrame: it is not kept.
-            StorageFailure: it is damaged.
-        """
         with self._reading() as connection:
             frame = self._expect(connection, number)
             query = (
@@ -143,8 +119,8 @@ class MilvusReview:
                 " WHERE f.map = %s AND f.number = %s"
             )
             ((near, name),) = connection.execute(query, (self._map, number)).fetchall()
-        kept = ledger.kept_of(near, name, frame.size, frame.digest)
-        data = read_pictures(self._objects, {number: kept}).get(number)
+        stored = ledger.stored_picture(near, name, frame.size, frame.digest)
+        data = read_pictures(self._objects, {number: stored}).get(number)
         if data is None or hashlib.sha256(data).digest() != frame.digest:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
         return data
@@ -159,11 +135,6 @@ class MilvusReview:
             self._held.discard(number)
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Say what a frame shows, in place of what was said before.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._writing() as connection:
             frame = self._expect(connection, number)
             query = "UPDATE review_frames SET label = %s WHERE map = %s AND number = %s"
@@ -172,11 +143,6 @@ class MilvusReview:
         return replace(frame, label=label)
 
     def discard(self, number: int) -> None:
-        """Throw a frame away.
-
-        Raises:
-            UnknownFrame: it is not kept.
-        """
         with self._writing() as connection:
             query = "DELETE FROM review_frames WHERE map = %s AND number = %s"
             if not connection.execute(query, (self._map, number)).rowcount:

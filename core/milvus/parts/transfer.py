@@ -33,45 +33,30 @@ class MilvusTransfer:
         self.paused_writes = paused_writes
 
     def outline(self) -> list[Outline]:
-        """All places in the order of their enrolment."""
         with self._reading() as connection:
             entries = ledger.entries_after(connection, self._map, -1, None, EVERY_PLACE)
         return [entry.outline() for entry in entries]
 
     def count_without_image(self) -> int:
-        """How many places keep no original image."""
         with self._reading() as connection:
             return ledger.count_without_image(connection, self._map)
 
     def sequence_ends(self) -> dict[str | None, int]:
-        """The ordinal that the next place of each sequence will get; the key None is for places without a sequence."""
         with self._reading() as connection:
             return ledger.sequence_ends(connection, self._map)
 
     def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
-        """Places by id, each with its descriptor row; ids that do not exist are left out."""
         with self._reading() as connection:
             found = ledger.entries_by(connection, self._map, "id", place_ids)
         return {entry.place.id: (entry.place, entry.row) for entry in found}
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
-        """Store places of another map with their history, all of them or, if this raises, none.
-
-        Raises:
-            ValueError: a descriptor is of the wrong kind.
-            InvalidField, StorageFull, StorageFailure.
-        """
         if items:
             with self._writing() as write:
                 for item, history in items:
                     write.adopt(item, history)
 
     def forget(self, frames: Mapping[str, bytes]) -> int:
-        """Delete places in one write, except those that show another frame by now; returns how many were deleted.
-
-        Args:
-            frames: by the id of each place, the SHA-256 of its image.
-        """
         if not frames:
             return 0
         count = 0

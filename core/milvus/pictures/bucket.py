@@ -29,7 +29,7 @@ class Bucket:
 
     @property
     def prefix(self) -> str:
-        """What the keys of all objects begin with, without a slash at its end; empty without one."""
+        """The prefix of the keys of all objects, without a slash at its end; empty without one."""
         return self._parts[1].strip("/")
 
     @property

@@ -25,7 +25,7 @@ from obstore.store import S3Store
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.milvus.outage import Outage, Unreachable
 from core.milvus.pictures.bucket import Bucket
-from core.milvus.pictures.kept import StoredObject
+from core.milvus.pictures.stored import StoredObject
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, S3Config
@@ -42,7 +42,7 @@ CONNECT_SECONDS, ANSWER_SECONDS = 2, 10
 """A request that takes longer has failed; a write to a map does not wait much longer for others either."""
 
 PROBE_SECONDS = 1.5
-"""A store that was gone, and does not answer in so long, is still gone."""
+"""A store that was gone, and does not answer within this time, is still gone."""
 
 PROBE = "probe"
 """The name of the object that is written to see whether objects can be written."""
@@ -105,7 +105,7 @@ class Objects:
         return next((why for why in self._all(put, pictures.items()) if why is not None), None)
 
     def _all(self, do: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
-        """Do something several times at once; raises what the first one raised, when all have ended."""
+        """Do something several times at once; raises the first one's error when all have ended."""
         every = list(arguments)
         if len(every) == 1:
             return [do(*every[0])]
@@ -139,7 +139,7 @@ class Objects:
             with self._outage.noticed(), self._answers() as store:
                 obstore.delete(store, list(names))
 
-    def read(self, kept: Sequence[StoredObject]) -> list[bytes | None]:
+    def read(self, stored: Sequence[StoredObject]) -> list[bytes | None]:
         """Pictures; None for one that is missing, or whose bytes are not those that were stored.
 
         Raises:
@@ -154,10 +154,10 @@ class Objects:
                 return None
             return found if hashlib.sha256(found).digest() == one.digest else None
 
-        if not kept:
+        if not stored:
             return []
         with self._outage.noticed():
-            return self._all(get, ((one,) for one in kept))
+            return self._all(get, ((one,) for one in stored))
 
     def names_after(self, folder: str, name: str) -> Iterator[list[str]]:
         """The names of a folder's objects behind a name, in their order, some at a time.
@@ -183,7 +183,7 @@ class Objects:
         self.put({PROBE: b"placerec"})
 
     def close(self) -> None:
-        """Wait for what is under way."""
+        """Wait for the calls under way."""
         self._workers.shutdown()
 
     def _ask(self) -> None:
@@ -240,17 +240,17 @@ def _opened(bucket: Bucket, seconds: float) -> S3Store:
     if bucket.access_key:
         config |= {"access_key_id": bucket.access_key, "secret_access_key": bucket.secret_key}
     prefix = bucket.prefix or None
-    # Who asked decides whether to ask again.
+    # The caller decides whether to try again.
     return S3Store(bucket.name, prefix=prefix, config=config, client_options=options, retry_config={"max_retries": 0})
 
 
 def _reason(text: str) -> str:
-    """What an error says, without addresses and identifiers of the request."""
+    """The reason that an error gives, without addresses and identifiers of the request."""
     status = re.search(r"non-2xx status code: ([^:]+)", text)
     if status is None:
         first = " ".join(text.partition("\n")[0].rpartition(" - ")[2].split())[:200]
         late = "no answer in time" if "kind: Timeout" in text else None
-        cause = _CAUSE.search(text)  # in the words of the library that was asked last
+        cause = _CAUSE.search(text)  # in the words of the library below
         return late or (first if cause is None else cause[1])
     code = _CODE.search(text)
     said = "" if code is None else f" ({': '.join(part for part in code.groups() if part)})"

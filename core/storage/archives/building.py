@@ -158,7 +158,7 @@ class _Building(Unpacking):
         return self.lost[line.track]
 
     def _check(self) -> None:
-        """Check what concerns several places; each place was checked by itself."""
+        """Check conditions across places; each place was checked by itself."""
         query = (
             "SELECT s.name FROM sequences s LEFT JOIN places p ON p.sequence = s.code GROUP BY s.code"
             " HAVING coalesce(max(p.ordinal), -1) >= s.next_ordinal OR (s.name IS NOT NULL AND count(p.number) = 0)"

@@ -1,4 +1,4 @@
-"""The lines of an export file as SQLite has what stands in them."""
+"""The lines of an export file from SQLite."""
 
 from __future__ import annotations
 

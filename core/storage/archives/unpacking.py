@@ -33,10 +33,10 @@ MOST_PLACE_BYTES = 1 << 30
 """Most bytes of one descriptor with its local descriptors, as float32."""
 
 LINES_BETWEEN = 1024
-"""After so many lines of sequences ``advance`` is called, which may end the work."""
+"""``advance``, which may end the work, is called after this number of lines of sequences."""
 
 Advance = Callable[[int, int], None]
-"""Is called with the number of places done and of all; what it raises ends the work."""
+"""Called with the number of places done and of all; its exceptions end the work."""
 
 CheckPicture = Callable[[bytes], None]
 """Raises InvalidImage for bytes that must not be shown as a picture."""
@@ -75,10 +75,10 @@ def check_sizes(manifest: Manifest) -> None:
 
 
 class Content(NamedTuple):
-    """What is kept of a place's frame.
+    """The stored picture and keypoints of a place's frame.
 
-    picture: its bytes and their SHA-256; None: none is kept.
-    keypoints: the record of its keypoints; None: none are kept.
+    picture: its bytes and their SHA-256; None: none is stored.
+    keypoints: the record of its keypoints; None: none are stored.
     """
 
     picture: tuple[bytes, bytes] | None
@@ -86,7 +86,7 @@ class Content(NamedTuple):
 
 
 class Unpacking(ABC):
-    """Reads a file, and has what it holds stored; used for one file.
+    """Reads a file, and has its content stored; used for one file.
 
     Args:
         most_picture_bytes: a larger picture is refused before it is read.
@@ -115,7 +115,7 @@ class Unpacking(ABC):
 
         Args:
             frames: their descriptors as they are stored (:attr:`Layout.frame`), in their order.
-            contents: of their frames, in their order; each is read when it is asked for.
+            contents: of their frames, in their order; each is read when it is needed.
         """
 
     def unpack(self) -> None:
@@ -123,7 +123,7 @@ class Unpacking(ABC):
 
         Raises:
             InvalidArchive: it is damaged, or holds what no map may hold.
-            Others: what storing raises.
+            Others: the exceptions of storing.
         """
         manifest = self.archive.manifest
         sequences, cameras = manifest.parts[:2]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from core.errors import InvalidKeypoints, StorageFailure
 from core.geometry.keypoints import Keypoints, keypoints_of
-from core.maps.records import KeptFrame
+from core.maps.records import PicturedPlace
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def _read(place_id: str, digest: bytes, checksum: int, record: bytes) -> Keypoin
         InvalidKeypoints: it is damaged.
     """
     if not isinstance(record, bytes) or checksum != checksum_of(record, digest):
-        raise InvalidKeypoints(f"The keypoints kept of place {place_id!r} do not match their checksum.")
+        raise InvalidKeypoints(f"The stored keypoints of place {place_id!r} do not match their checksum.")
     return keypoints_of(record)
 
 
@@ -93,14 +93,14 @@ def delete(connection: sqlite3.Connection, number: int) -> None:
     connection.execute("DELETE FROM keypoints WHERE place = ?", (number,))
 
 
-def frames_without(connection: sqlite3.Connection, after: int, limit: int) -> list[KeptFrame]:
+def frames_without(connection: sqlite3.Connection, after: int, limit: int) -> list[PicturedPlace]:
     """Up to ``limit`` places behind number ``after`` that keep a picture and no keypoints, or only damaged ones."""
     query = (
         "SELECT p.number, p.id, p.digest, p.camera, p.picture FROM places p LEFT JOIN keypoints k ON k.place = p.number"
         f" WHERE p.number > ? AND p.picture <> 'none' AND (k.place IS NULL OR NOT {_IS_SOUND})"
         " ORDER BY p.number LIMIT ?"
     )
-    return [KeptFrame(*values) for values in connection.execute(query, (after, limit)).fetchall()]
+    return [PicturedPlace(*values) for values in connection.execute(query, (after, limit)).fetchall()]
 
 
 def room(connection: sqlite3.Connection) -> tuple[int, int]:

@@ -56,7 +56,7 @@ class StoredPlace:
 
 @dataclass(frozen=True)
 class SegmentEntry:
-    """What SQLite records of a segment file.
+    """The record of a segment file in SQLite.
 
     number: counted from 0.
     checksum: of the checksums of its rows (:func:`core.storage.files.segment_files.segment_checksum`).
@@ -169,7 +169,7 @@ def rows_of_sequence(connection: sqlite3.Connection, name: str) -> list[int]:
 
 
 def picture(connection: sqlite3.Connection, number: int, place_id: str) -> bytes | None:
-    """The picture kept of a place's frame; None if none is kept.
+    """The stored picture of a place's frame; None if there is none.
 
     Args:
         number, place_id: of the place.
@@ -182,7 +182,7 @@ def picture(connection: sqlite3.Connection, number: int, place_id: str) -> bytes
         return None
     content: bytes = found[0]
     if not isinstance(content, bytes) or hashlib.sha256(content).digest() != found[1]:
-        raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
+        raise StorageFailure(f"The stored picture of place {place_id!r} is damaged.")
     return content
 
 
@@ -214,7 +214,7 @@ def latest_in_sequence(
     """The end of a sequence: ordinal and row of its last place, and the row of the first place at each last ordinal.
 
     Args:
-        positions: so many ordinals before the last one are looked at, too.
+        positions: the number of ordinals before the last one that are looked at, too.
     """
     found = connection.execute("SELECT code, next_ordinal FROM sequences WHERE name = ?", (name,)).fetchone()
     if found is None:

@@ -38,7 +38,7 @@ _DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_
 # The column "seal" is the checksum of a row (:mod:`core.storage.database.row_checksums`).
 _TABLES = (
     # local_cells and local_values are the shape of the local descriptors; 0 without a second stage.  Which frames are
-    # kept for review is JSON; NULL: none.
+    # stored for review is JSON; NULL: none.
     """CREATE TABLE map (
         only INTEGER PRIMARY KEY CHECK (only = 1),
         id TEXT NOT NULL,
@@ -143,7 +143,6 @@ SCHEMA = Schema(APPLICATION_ID, 9, _TABLES)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
-    """The columns of each table."""
     tables = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
     return {
         name: {column for (column,) in connection.execute("SELECT name FROM pragma_table_info(?)", (name,))}
@@ -183,7 +182,7 @@ def _parts(connection: sqlite3.Connection) -> tuple[set[tuple[str, str]], dict[s
 
 
 def _expected(read: Callable[[sqlite3.Connection], T]) -> T:
-    """What ``read`` returns for a file that has the tables of a map."""
+    """The result of ``read`` for a file that has the tables of a map."""
     wanted = sqlite3.connect(":memory:", isolation_level=None)
     try:
         prepare(wanted, create=True)

@@ -90,12 +90,12 @@ def _paired(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(codes[..., ::2] | codes[..., 1::2] << 4)
 
 
-def unpack_descriptors(kept: NDArray[Any], precision: Precision, dimension: int) -> NDArray[np.float32]:
+def unpack_descriptors(stored: NDArray[Any], precision: Precision, dimension: int) -> NDArray[np.float32]:
     """Convert descriptors back from the form that :func:`pack_descriptors` gave: float32 [n, D]."""
     if precision != COMPRESSED:
-        return np.ascontiguousarray(kept, dtype=np.float32)
-    n, count = len(kept), -(-dimension // BLOCK)
-    scales, pairs, quarters = _parts_of(kept, dimension)
+        return np.ascontiguousarray(stored, dtype=np.float32)
+    n, count = len(stored), -(-dimension // BLOCK)
+    scales, pairs, quarters = _parts_of(stored, dimension)
     values = _UPPER[pairs].reshape(n, count * BLOCK)
     values += _LOWER[quarters].reshape(n, count * BLOCK)
     blocks = values.reshape(n, count, BLOCK)
@@ -103,11 +103,11 @@ def unpack_descriptors(kept: NDArray[Any], precision: Precision, dimension: int)
     return np.ascontiguousarray(values[:, :dimension])
 
 
-def _parts_of(kept: NDArray[Any], dimension: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+def _parts_of(stored: NDArray[Any], dimension: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
     """The scales, float32 [n, blocks], the upper four bits of values (two a byte) and the lower two (four a byte)."""
     count = -(-dimension // BLOCK)
-    scales = np.ascontiguousarray(kept[:, : 2 * count]).view("<f2").astype(np.float32)
-    return scales, kept[:, 2 * count : (2 + BLOCK // 2) * count], kept[:, (2 + BLOCK // 2) * count :]
+    scales = np.ascontiguousarray(stored[:, : 2 * count]).view("<f2").astype(np.float32)
+    return scales, stored[:, 2 * count : (2 + BLOCK // 2) * count], stored[:, (2 + BLOCK // 2) * count :]
 
 
 def pack_local(local: Local, precision: Precision) -> NDArray[Any]:
@@ -123,30 +123,30 @@ def pack_local(local: Local, precision: Precision) -> NDArray[Any]:
     return np.concatenate([steps, pairs.reshape(n, -1)], axis=1)
 
 
-def unpack_local(kept: NDArray[Any], precision: Precision, local_shape: tuple[int, int]) -> Local:
+def unpack_local(stored: NDArray[Any], precision: Precision, local_shape: tuple[int, int]) -> Local:
     """Convert local descriptors back from the form that :func:`pack_local` gave: int8 [n, C, L]."""
     if precision != COMPRESSED:
-        return np.ascontiguousarray(kept)
-    n, (cells, values) = len(kept), local_shape
+        return np.ascontiguousarray(stored)
+    n, (cells, values) = len(stored), local_shape
     if not cells:
         return np.empty((n, *local_shape), np.int8)
-    steps, pairs = kept[:, :cells].astype(np.int16), kept[:, cells:]
+    steps, pairs = stored[:, :cells].astype(np.int16), stored[:, cells:]
     real = _LOCAL[pairs].reshape(n, cells, 2 * -(-values // 2))[:, :, :values] * steps[:, :, np.newaxis]
     return np.clip(real, -127, 127).astype(np.int8)
 
 
-def inner_products(queries: NDArray[np.float32], kept: NDArray[Any], precision: Precision) -> NDArray[np.float32]:
+def inner_products(queries: NDArray[np.float32], stored: NDArray[Any], precision: Precision) -> NDArray[np.float32]:
     """Inner products of queries, float32 [B, D], with descriptors in their stored form, [k, …]: float32 [B, k].
 
     Every product is summed in float32.
     """
-    rows, dimension = len(kept), queries.shape[1]
+    rows, dimension = len(stored), queries.shape[1]
     if precision == COMPRESSED:
         if len(queries) > _FEW_QUERIES:
-            return np.asarray(queries @ unpack_descriptors(kept, precision, dimension).T)
-        scales, uppers, lowers = _parts_of(kept, dimension)
+            return np.asarray(queries @ unpack_descriptors(stored, precision, dimension).T)
+        scales, uppers, lowers = _parts_of(stored, dimension)
         made = [packed_products(query, scales, uppers, lowers) for query in _whole_blocks(queries)]
         return np.array(made, np.float32).reshape(len(queries), rows)
     index = flat_index(rows, dimension, precision == HALF)
-    vectors(index)[:] = kept
+    vectors(index)[:] = stored
     return products(index, queries)

@@ -62,7 +62,7 @@ _CHUNK_BYTES = 8 << 20
 
 @dataclass(frozen=True)
 class Layout:
-    """What all segment files of a map have in common; ``local_shape`` is (C, L), the shape of local descriptors."""
+    """The layout that all segment files of a map share; ``local_shape`` is (C, L), the shape of local descriptors."""
 
     dimension: int
     identity: str

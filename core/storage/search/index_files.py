@@ -20,7 +20,7 @@ from core.storage.files.array_files import StaleArrays, check_arrays, read_array
 from core.storage.files.segment_files import Layout
 
 GROUP_ROWS = 4096
-"""About so many rows have their codes in one file: some 9 MB with the default encoder."""
+"""About the number of rows that have their codes in one file: some 9 MB with the default encoder."""
 
 
 def segments_per_group(layout: Layout) -> int:
@@ -43,7 +43,7 @@ class IndexFiles:
         self.group_size = segments_per_group(layout)
         """How many segments have their codes in one file."""
         self.coder = Coder.of(layout.dimension)
-        """What makes the codes."""
+        """The encoder of the codes."""
 
     @property
     def _made_by(self) -> str:

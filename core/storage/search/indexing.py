@@ -48,7 +48,7 @@ class Stopped(Exception):
 
 @dataclass(frozen=True)
 class IndexedMap:
-    """What the indexer uses of its map.
+    """The interface of a map for its indexer.
 
     setting: returns the tier that the owner chose.
     snapshot: returns the newest snapshot.
@@ -209,7 +209,7 @@ class Indexer:
         """Build codes again from the descriptors; the present ones are searched until they are replaced.
 
         Args:
-            progress: is called with the rows done and all rows; what it raises leaves everything as it was.
+            progress: called with the number of rows done and of all; if it raises, nothing changes.
 
         Raises:
             Stopped: the map was closed.

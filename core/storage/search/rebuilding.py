@@ -17,7 +17,7 @@ def rebuilt(newest: Callable[[], Snapshot], progress: Callable[[int, int], None]
 
     Args:
         newest: returns the newest snapshot.
-        progress: is called with the rows done and all rows; what it raises ends the work.
+        progress: called with the number of rows done and of all; its exceptions end the work.
     """
     snapshot = newest()
     progress(0, snapshot.rows)

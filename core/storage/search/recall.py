@@ -1,4 +1,4 @@
-"""Measuring how often a search by codes finds what an exact search finds.
+"""Measuring how often a search by codes finds the result of an exact search.
 
 Real queries are not known, so places of the map are searched for by synthetic second visits: a random third of the
 blocks of a descriptor is that of the place, the others are those of another random place.  The best place of an exact
@@ -39,7 +39,7 @@ def best_products(
     """The largest inner product of each query with any place, by comparing all places: float32 [B].
 
     Args:
-        progress: is called with the rows done and all rows; what it raises ends the work.
+        progress: called with the number of rows done and of all; its exceptions end the work.
     """
     living = np.flatnonzero(snapshot.alive)
     best = np.full(len(queries), -np.inf, np.float32)

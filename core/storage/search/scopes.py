@@ -1,4 +1,4 @@
-"""The rows of a map that a query may find, from what its caller knows of the place."""
+"""The rows of a map that a query may find, from its caller's knowledge of the place."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def together(run: Callable[[Part], None], parts: Sequence[Part]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """All places of a map at one moment.  Immutable; any thread may search it.
+    """All places of a map at one moment (:class:`core.maps.store.Snapshot`).  Immutable; any thread may search it.
 
     dimension, rows_per_segment, local_shape: of the map; ``local_shape`` is (C, L).
     row_reader: reads the descriptors of segments that hold none in memory.
@@ -116,7 +116,6 @@ class Snapshot:
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:
-        """Whether each row belongs to a place: bool [rows]."""
         parts = [segment.alive for segment in self.segments]
         return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
 
@@ -272,7 +271,7 @@ class Snapshot:
         in_memory: Callable[[Segment, int], NDArray[Any]],
         on_disk: Callable[[RowReader, NDArray[np.int64], NDArray[np.uint32]], NDArray[Any]],
     ) -> None:
-        """Fill ``found`` with what is kept of rows, by what gives a held row of a segment and what reads others."""
+        """Fill ``found`` with the stored data of rows: a row of a segment, or rows on disk."""
         self._check_rows(rows)
         held = self._held[rows]
         for position in np.flatnonzero(held).tolist():
@@ -409,7 +408,6 @@ class SearchScope:
         return None if self.weights is None else self.weights[rows]
 
     def living_rows(self) -> NDArray[np.int64]:
-        """The rows of the places of the scope, int64 [n], ascending."""
         alive = self.snapshot.alive
         return np.flatnonzero(alive if self.allowed is None else alive & self.allowed)
 

@@ -1,4 +1,4 @@
-"""The tiers: how a map is searched, chosen by its size or by its owner, and what it reports about this."""
+"""The tiers: how a map is searched, chosen by its size or by its owner, and the status about it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from core.maps.records import COMPACT_FROM, Precision, TierSetting
 from core.maps.status import IndexStatus, KeypointsStatus, StorageStatus, Tier
 
 ON_DISK_FROM = 4096
-"""From so many places on descriptors are not held in memory, where the default encoder's take 65 KB a place."""
+"""From this number of places on, descriptors are not held in memory, where the default encoder's take 65 KB a place."""
 
 
 def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
-    """The tier that a map of so many places should have.
+    """The tier that a map with this number of places should have.
 
     A map that shrinks changes its tier at half the number of places at which a growing one does, so that a map of about
     that size is not built again and again.
@@ -28,7 +28,7 @@ def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
 
 
 def holds_for(setting: TierSetting, places: int, present: bool) -> bool:
-    """Whether a map of so many places should hold its descriptors in memory.
+    """Whether a map with this number of places should hold its descriptors in memory.
 
     Args:
         present: whether it does.

@@ -29,7 +29,7 @@ _option = partial(typer.Option, rich_help_panel="Output")
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is measured beside the accuracy, and what is written."""
+    """The measurements beside the accuracy, and the files to write."""
 
     json_file: Annotated[Path | None, _option("--json", metavar="OUT.json", help="Write the figures.")] = None
     results: Annotated[
@@ -66,7 +66,7 @@ class OutputOptions:
         return EvaluationCache(None if self.no_cache else self.cache or default_folder())
 
     def extras(self, seed: int) -> Extras:
-        """What is measured beside the accuracy; ``seed`` draws the disturbances."""
+        """The measurements beside the accuracy; ``seed`` draws the disturbances."""
         from lab.evaluation.run import Extras
 
         return Extras(self.scalability, self.severity, seed, map_sizes=self.report is not None)
@@ -152,10 +152,10 @@ def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Se
     for note in notes:
         remark(note)
     reasons = dict.fromkeys((name, reason) for row in figures for name, reason in row.notes.items())
-    told: dict[str, list[str]] = {}
+    named: dict[str, list[str]] = {}
     for name, reason in reasons:
-        told.setdefault(reason, []).append(name)
-    for reason, names in told.items():
+        named.setdefault(reason, []).append(name)
+    for reason, names in named.items():
         remark(f"{', '.join(names)}: {reason}")
     if cached:
         remark(f"Taken from the cache, times included: {', '.join(cached)}.")

@@ -62,10 +62,10 @@ class SavedOptions:
         if self.from_results:
             needless |= {"ground-truth": truth.given(), "results": output, "limit-references": limit}
             needless["transposed"] = self.transposed
-        asked = [f"--{name}" for name, value in needless.items() if value]
-        if asked:
+        given = [f"--{name}" for name, value in needless.items() if value]
+        if given:
             source = "--from-results" if self.from_results else "--from-similarity"
-            raise typer.BadParameter(f"{source} cannot go with {', '.join(asked)}: there are only saved figures")
+            raise typer.BadParameter(f"{source} cannot go with {', '.join(given)}: there are only saved figures")
         if self.from_similarity:
             if (truth.ground_truth is None) == (truth.tolerance is None):
                 raise typer.BadParameter("--from-similarity goes with --ground-truth or --tolerance, one of them")

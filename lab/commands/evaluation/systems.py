@@ -98,7 +98,7 @@ def build_systems(
     Args:
         names: of systems or encoders; if empty, the default encoder.
         every: add all systems that run without a file, or whose file is given.
-        verify: when encoders that are asked as the service asks them verify.
+        verify: when encoders verify, if they are queried as by the service.
 
     Raises:
         MissingWeights, UnknownEncoder, InvalidModel: one cannot be made.
@@ -106,20 +106,20 @@ def build_systems(
     """
     from lab.baselines.registry import build, systems
 
-    asked = list(names)
+    requested = list(names)
     if every:
         damaged = {summary.name for summary in models.describe() if summary.damaged is not None}
-        asked += [
+        requested += [
             about.name
             for about in systems(models)
             if about.name not in damaged and (about.weights is None or about.name in weights)
         ]
-    asked = list(dict.fromkeys(asked or [default_encoder()]))
-    idle = weights.keys() - {name_of(name) for name in asked}
+    requested = list(dict.fromkeys(requested or [default_encoder()]))
+    idle = weights.keys() - {name_of(name) for name in requested}
     if idle:
         raise typer.BadParameter(f"--weights for {', '.join(sorted(idle))}, which --encoder does not name")
     built: dict[str, System] = {}
-    for name in asked:
+    for name in requested:
         system = build(name, models=models, weights=weights.get(name), verify=verify)
         built.setdefault(system.about.name, system)
     return list(built.values())

@@ -183,9 +183,9 @@ def _images(path: Path, options: RecordingOptions, stack: ExitStack, encoder: st
 
 def name_pair(reference: Path, query: Path) -> str:
     """The name of a pair: ``nordland, winter against summer`` if both lie in one folder, else without the folder."""
-    known, asked = reference.resolve(), query.resolve()
-    traverses = f"{asked.name} against {known.name}"
-    same = known.parent == asked.parent and known.parent.name
+    known, queried = reference.resolve(), query.resolve()
+    traverses = f"{queried.name} against {known.name}"
+    same = known.parent == queried.parent and known.parent.name
     return f"{known.parent.name}, {traverses}" if same else traverses
 
 

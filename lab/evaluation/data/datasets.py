@@ -73,7 +73,7 @@ def _find(dataset: Dataset, folder: Path) -> tuple[Layout, Path]:
 
 
 def _missing(dataset: Dataset, folder: Path) -> str:
-    """What is missing, and where it was looked for."""
+    """The missing files, and where they were looked for."""
     said = f"nothing of it is in the folder {folder}."
     for names, what in ((dataset.references, "references"), (dataset.queries, "queries")):
         if names and not any(path.is_dir() for name in names for path in folder.glob(name)):

@@ -24,7 +24,7 @@ Names = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Traverses:
-    """What a layout holds.
+    """The traverses of a layout.
 
     truth: of each query; None where a rule has to say it.
     excluded: of each query, references that it is not matched against.
@@ -70,7 +70,7 @@ class Layout:
         return None
 
     def looked_for(self) -> str:
-        """What was looked for, in words."""
+        """The files that were looked for, in words."""
         held = ", ".join(names[0] for names in self.holds)
         return f"{self.home}/{{{held}}} ({self.publisher})" if self.home else f"{{{held}}} ({self.publisher})"
 
@@ -110,11 +110,11 @@ def folders(
     """
 
     def read(base: Path) -> Traverses:
-        known, asked = _images(base, references, only), _images(base, queries, only)
+        known, queried = _images(base, references, only), _images(base, queries, only)
         path = present(base, (truth_file,)) if truth_file else None
         if path is None or read_truth is None or (base / TRUTH_FILE).is_file():
-            return Traverses(known, asked)
-        return Traverses(known, asked, read_truth(path, asked, known))
+            return Traverses(known, queried)
+        return Traverses(known, queried, read_truth(path, queried, known))
 
     return Layout(publisher, home, (references, queries), read, truth_file)
 
@@ -146,13 +146,13 @@ def group(
         columns: of a table in CSV, those of the numbers of the query and of its reference (from the end where below 0),
             which is true with two frames on either side; None: the file of truth is MATLAB's.
     """
-    known, asked = (*references, "*_ref*", "*[Rr]ef*"), (*queries, "*_test*", "*[Qq]uery*", "*[Tt]est*")
+    known, queried = (*references, "*_ref*", "*[Rr]ef*"), (*queries, "*_test*", "*[Qq]uery*", "*[Tt]est*")
     reader = read_matrix if columns is None else read_table(*columns, 2)
-    return folders("The thesis's group", home, known, asked, truth_file, reader)
+    return folders("The thesis's group", home, known, queried, truth_file, reader)
 
 
 def vpr_bench(name: str, own_truth: bool = False) -> Layout:
-    """As VPR-Bench (Zaffar et al., IJCV 2021) hands it out, with its own truth where it is asked for."""
+    """As VPR-Bench (Zaffar et al., IJCV 2021) hands it out, with its own truth where it is requested."""
     truth = ("ground_truth_new.npy", read_array) if own_truth else ()
     return folders("VPR-Bench", f"datasets/{name}", ("ref",), ("query",), *truth)
 

@@ -30,14 +30,14 @@ def dbstruct(home: str, files: Names, references: Names, queries: Names) -> Layo
         path = present(base, files)
         assert path is not None, "found"
         fields = _fields(path)
-        known, asked = (_text(fields, names, path) for names in (("dbImageFns", "dbImage"), ("qImageFns", "qImage")))
+        known, queried = (_text(fields, names, path) for names in (("dbImageFns", "dbImage"), ("qImageFns", "qImage")))
         at_known = _positions(fields, ("utmDb", "locDb"), len(known), path)
-        at_asked = _positions(fields, ("utmQ", "locQ"), len(asked), path)
+        at_queried = _positions(fields, ("utmQ", "locQ"), len(queried), path)
         metres = _scalar(fields, "posDistThr", path)
         return Traverses(
             existing(_root(base, references, known[0]), known, path),
-            existing(_root(base, queries, asked[0]), asked, path),
-            near(at_asked, at_known, metres)[0],
+            existing(_root(base, queries, queried[0]), queried, path),
+            near(at_queried, at_known, metres)[0],
         )
 
     return Layout("NetVLAD's dbStruct", home, (files,), read, files[0])
@@ -56,16 +56,16 @@ def patch_netvlad(name: str, truth: str = "") -> Layout:
     positions = (f"dataset_gt_files/{truth}.npz", f"{truth}.npz")
 
     def read(base: Path) -> Traverses:
-        known, asked = (_listed_images(base, names) for names in lists)
+        known, queried = (_listed_images(base, names) for names in lists)
         if not truth:
-            return Traverses(known, asked)
+            return Traverses(known, queried)
         path = present(base, positions)
         assert path is not None, "found"
-        at_asked, at_known, distance = read_positions(path)
-        for images, positions_of, what in ((asked, at_asked, "queries"), (known, at_known, "references")):
+        at_queried, at_known, distance = read_positions(path)
+        for images, positions_of, what in ((queried, at_queried, "queries"), (known, at_known, "references")):
             if len(images) != len(positions_of):
                 raise InvalidGroundTruth(f"{path.name} has {len(positions_of)} {what}, and the list {len(images)}.")
-        return Traverses(known, asked, near(at_asked, at_known, distance)[0])
+        return Traverses(known, queried, near(at_queried, at_known, distance)[0])
 
     held = (*lists, positions) if truth else tuple(lists)
     return Layout("Patch-NetVLAD", "", held, read, positions[0] if truth else "")
@@ -76,11 +76,11 @@ def gsv_cities(home: str, stem: str, truths: Names) -> Layout:
     lists = [(f"{stem}_{side}Images.npy", f"{home.split('/')[-1]}/{stem}_{side}Images.npy") for side in ("db", "q")]
 
     def read(base: Path) -> Traverses:
-        known, asked = (_names(present(base, names)) for names in lists)
+        known, queried = (_names(present(base, names)) for names in lists)
         chosen = present(base, (f"{stem}_qIdx.npy",))
         if chosen is not None:
-            asked = [asked[int(index)] for index in _whole(chosen, len(asked))]
-        references, queries = (existing(base, names, base / lists[0][0]) for names in (known, asked))
+            queried = [queried[int(index)] for index in _whole(chosen, len(queried))]
+        references, queries = (existing(base, names, base / lists[0][0]) for names in (known, queried))
         path = present(base, truths)
         assert path is not None, "found"
         return Traverses(references, queries, read_array(path, queries, references))
@@ -97,7 +97,7 @@ def mapillary(cities: Names, metres: float) -> Layout:
 
     def read(base: Path) -> Traverses:
         known: list[Path] = []
-        asked: list[Path] = []
+        queried: list[Path] = []
         truth: Truth = []
         for city in cities:
             references, at_references = _city(base / city / "database")
@@ -105,11 +105,11 @@ def mapillary(cities: Names, metres: float) -> Layout:
             found, _ = near(at_queries, at_references, metres)
             answerable = [index for index, true in enumerate(found) if len(true)]
             truth += [found[index] + len(known) for index in answerable]
-            asked += [queries[index] for index in answerable]
+            queried += [queries[index] for index in answerable]
             known += references
-        if not asked:
+        if not queried:
             raise InvalidGroundTruth(f"{base}: no query lies within {metres:g} m of a reference.")
-        return Traverses(known, asked, truth)
+        return Traverses(known, queried, truth)
 
     held = tuple((f"{city}/{side}/postprocessed.csv",) for city in cities for side in ("query", "database"))
     return Layout("Mapillary", "mapillary_sls/train_val", held, read)

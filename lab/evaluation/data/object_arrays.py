@@ -75,7 +75,7 @@ def read_object_array(path: Path) -> Array:
         raise InvalidGroundTruth(
             f"{path.name} is not read: it holds {error}, which no list of references does."
         ) from None
-    # Whatever a damaged file makes of the instructions: too few values, a number for a list, no end.
+    # Faults of the instructions in a damaged file: too few values, a number for a list, no end.
     except (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError, UnicodeError) as error:
         raise InvalidGroundTruth(f"{path.name} is not a whole NumPy file of objects.") from error
     if not isinstance(found, Array):
@@ -88,7 +88,7 @@ class _Refused(Exception):
 
 
 def _pickle(data: bytes) -> bytes:
-    """What follows the header of a ``.npy`` file."""
+    """The data behind the header of a ``.npy`` file."""
     if data[:6] != b"\x93NUMPY":
         raise ValueError("no NumPy file")
     wide = 2 if data[6] == 1 else 4
@@ -152,7 +152,7 @@ class _Reader:
 
 
 def _made(named: Any, arguments: tuple[Any, ...]) -> Any:
-    """What the calls give that NumPy writes: an empty array, a type, a number, and bytes as Python 2 has them."""
+    """The results of the calls that NumPy writes: an empty array, a type, a number, and bytes as Python 2 has them."""
     match named:
         case _Name(module=module, name="_reconstruct") if module in _MULTIARRAYS:
             return Array()

@@ -54,8 +54,8 @@ def within_truth(queries: Sequence[Pose], references: Sequence[Pose], metres: fl
     Raises:
         InvalidGroundTruth: poses are in two frames, one has no heading that needs one, or none is near another.
     """
-    asked, known = _positions(queries, references)
-    truth, closest = near(asked, known, metres)
+    at_queries, at_references = _positions(queries, references)
+    truth, closest = near(at_queries, at_references, metres)
     if degrees is not None:
         truth = [
             found[_turns([query], [references[index] for index in found])[0] <= degrees] if len(found) else found
@@ -69,17 +69,17 @@ def within_truth(queries: Sequence[Pose], references: Sequence[Pose], metres: fl
     return truth
 
 
-def near(asked: NDArray[np.float64], known: NDArray[np.float64], metres: float) -> tuple[Truth, float]:
+def near(queries: NDArray[np.float64], references: NDArray[np.float64], metres: float) -> tuple[Truth, float]:
     """The references within ``metres`` of each query, and the least distance of any two.
 
     Args:
-        asked, known: positions of queries and references, float64 [Q, d] and [R, d].
+        queries, references: positions of queries and references, float64 [Q, d] and [R, d].
     """
     from scipy.spatial import KDTree
 
-    tree = KDTree(known)
-    found = [np.array(sorted(row), np.int64) for row in tree.query_ball_point(asked, metres * (1 + 1e-12), workers=1)]
-    return found, float(tree.query(asked)[0].min())
+    tree = KDTree(references)
+    found = [np.array(sorted(row), np.int64) for row in tree.query_ball_point(queries, metres * (1 + 1e-12), workers=1)]
+    return found, float(tree.query(queries)[0].min())
 
 
 def nearest_truth(queries: Sequence[Pose], references: Sequence[Pose], frames: int) -> Truth:
@@ -88,9 +88,9 @@ def nearest_truth(queries: Sequence[Pose], references: Sequence[Pose], frames: i
     Raises:
         InvalidGroundTruth: poses are in two frames.
     """
-    asked, known = _positions(queries, references)
+    at_queries, at_references = _positions(queries, references)
     # A row at a time: Q x R differences of long traverses would not fit into memory.
-    nearest = [int(np.linalg.norm(known - position, axis=1).argmin()) for position in asked]
+    nearest = [int(np.linalg.norm(at_references - position, axis=1).argmin()) for position in at_queries]
     return [
         np.arange(max(0, index - frames), min(len(references), index + frames + 1), dtype=np.int64) for index in nearest
     ]
@@ -108,8 +108,8 @@ def _turns(queries: Sequence[Pose], references: Sequence[Pose]) -> NDArray[np.fl
     headings = [[pose.heading for pose in poses] for poses in (queries, references)]
     if any(heading is None for side in headings for heading in side):
         raise InvalidGroundTruth("a pose without a heading cannot be held to a number of degrees.")
-    asked, known = (np.array(side, np.float64) for side in headings)
-    return np.abs((asked[:, None] - known[None, :] + 180) % 360 - 180)
+    at_queries, at_references = (np.array(side, np.float64) for side in headings)
+    return np.abs((at_queries[:, None] - at_references[None, :] + 180) % 360 - 180)
 
 
 def _listed(path: Path) -> dict[str, Pose]:

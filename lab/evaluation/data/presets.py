@@ -57,7 +57,7 @@ class Dataset:
     rule: what is true where no file says it; None where one must.
     sizes: None where there are none to compare with.
     layouts: the published ways to lay it out, tried before the two folders themselves.
-    excluded: what a query is not matched against, in words; ``exclude`` finds it.
+    excluded: the references that a query is not matched against, in words; ``exclude`` finds it.
     source: the publication whose protocol it is.
     """
 

@@ -1,6 +1,6 @@
 """Figures that others have published, as ``published.toml`` lists them; none of them was measured here.
 
-Each was read in the source that stands beside it, or in a transcript of its table.  What could not be read is left out,
+Each was read in the source that stands beside it, or in a transcript of its table.  Unreadable ones are omitted,
 which is all but one figure of MegaLoc, and so are those of another protocol than the one of that name here.
 """
 
@@ -53,6 +53,6 @@ PUBLISHED = _published()
 
 
 def published_figures(protocol: str) -> list[Published]:
-    """What others have published of a protocol, the best first; nothing for folders without a name."""
+    """The published results of a protocol, the best first; nothing for folders without a name."""
     found = [one for one in PUBLISHED if one.protocol == protocol]
     return sorted(found, key=lambda one: -one.recall_at[0])

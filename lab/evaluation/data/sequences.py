@@ -1,4 +1,4 @@
-"""Layouts of one drive that comes back to places: each frame is asked against the frames of another time."""
+"""Layouts of one drive that comes back to places: each frame queries the frames of another time."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def baidu(metres: float) -> Layout:
     )
 
     def read(base: Path) -> Traverses:
-        (known, at_known), (asked, at_asked) = (_cameras(base / images[0], base / poses) for images, poses in sides)
-        return Traverses(known, asked, near(at_asked, at_known, metres)[0])
+        (known, at_known), (queried, at_queried) = (_cameras(base / images[0], base / poses) for images, poses in sides)
+        return Traverses(known, queried, near(at_queried, at_known, metres)[0])
 
     held = (*(images for images, _ in sides), *((poses,) for _, poses in sides))
     return Layout("Baidu", "baidu_datasets", held, read)

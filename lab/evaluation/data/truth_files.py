@@ -78,10 +78,10 @@ def read_table(query: int, reference: int, tolerance: int) -> Reader:
             if place == 0 and not all(re.fullmatch(INDEX, cell) for cell in pair):
                 continue  # the heading
             rows.append([_index(cell, path, number) for cell in pair])
-        asked = _positions([row[0] for row in rows], queries, path, "query")
+        queried = _positions([row[0] for row in rows], queries, path, "query")
         known = _positions([row[1] for row in rows], references, path, "reference")
         found: list[set[int]] = [set() for _ in queries]
-        for one, true in zip(asked, known, strict=True):
+        for one, true in zip(queried, known, strict=True):
             found[one].update(range(max(0, true - tolerance), min(len(references), true + tolerance + 1)))
         return _truth(path, found)
 
@@ -105,7 +105,7 @@ def read_matrix(path: Path, queries: Sequence[Path], references: Sequence[Path])
 
 
 def truth_of_variables(variables: Mapping[str, Any], path: Path, queries: int, references: int) -> Truth:
-    """The truth of the first variable of a MATLAB file that fits so many queries and references.
+    """The truth of the first variable of a MATLAB file that fits the numbers of queries and references.
 
     Raises:
         InvalidGroundTruth: none fits.
@@ -140,17 +140,16 @@ def read_positions(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
     Raises:
         InvalidGroundTruth: the file cannot be read, or lacks one of them.
     """
-    asked, known = (np.asarray(_member(path, name), np.float64) for name in ("utmQ", "utmDb"))
+    queried, known = (np.asarray(_member(path, name), np.float64) for name in ("utmQ", "utmDb"))
     distance = np.asarray(_member(path, "posDistThr"), np.float64)
-    if any(one.ndim != 2 or one.shape[1] != 2 or not np.isfinite(one).all() for one in (asked, known)):
+    if any(one.ndim != 2 or one.shape[1] != 2 or not np.isfinite(one).all() for one in (queried, known)):
         raise InvalidGroundTruth(f"{path.name}: utmQ and utmDb are not rows of two finite numbers.")
     if distance.size != 1 or not np.isfinite(distance).all():
         raise InvalidGroundTruth(f"{path.name}: posDistThr is not a distance.")
-    return asked, known, float(distance.ravel()[0])
+    return queried, known, float(distance.ravel()[0])
 
 
 def _rows(path: Path) -> list[Any]:
-    """The rows of an array, each a list."""
     try:
         numbers = np.load(path, allow_pickle=False, mmap_mode="r")
     except OSError as error:

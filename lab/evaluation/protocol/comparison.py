@@ -62,7 +62,7 @@ class ScalePoint:
 
 @dataclass(frozen=True)
 class SizePoint:
-    """The verdicts of one system in maps of so many places, by the calibration that it ships.
+    """The verdicts of one system in maps of ``places`` places, by the calibration that it ships.
 
     known, strangers: queries whose place was in the map, and queries whose place was not.
     known_recognized: share of the known that are recognized and right.

@@ -89,11 +89,11 @@ def recall_at_full_precision(outcomes: Sequence[Outcome]) -> float | None:
 
     The best match of a true negative is a wrong one as well.
     """
-    asked = answerable(outcomes)
-    if not asked:
+    positives = answerable(outcomes)
+    if not positives:
         return None
     wrong = best_wrong_score(outcomes)
-    return sum(outcome.matched and (wrong is None or outcome.score > wrong) for outcome in asked) / len(asked)
+    return sum(outcome.matched and (wrong is None or outcome.score > wrong) for outcome in positives) / len(positives)
 
 
 def extended_precision(outcomes: Sequence[Outcome]) -> float | None:

@@ -53,7 +53,7 @@ def results_csv(outcomes: Sequence[Outcome]) -> str:
 
 
 def _digits(score: float) -> str:
-    """A score with as many digits as tell it from its neighbours: nine of a float32, more of a float64."""
+    """A score with the digits that distinguish it from its neighbours: nine of a float32, more of a float64."""
     with np.errstate(over="ignore"):
         single = float(np.float32(score)) == score
     return f"{score:.9g}" if single else repr(score)
@@ -76,7 +76,7 @@ def read_results(path: Path) -> Results:
 
 
 def summarize_results(name: str, results: Results) -> Evaluation:
-    """The figures that a file of results can tell.
+    """The figures that follow from a file of results.
 
     Args:
         name: stands where an encoder's identity would.
@@ -108,7 +108,7 @@ def read_similarity(path: Path, transposed: bool = False) -> NDArray[np.float64]
 
     Args:
         path: a plain numeric array with a row for each query and a column for each reference.
-        transposed: a row is a reference instead.  A square matrix does not tell which it is.
+        transposed: a row is a reference instead.  A square matrix does not show which it is.
 
     Raises:
         InvalidResults: it is no such file; a pickled one is never read, for reading it could run code.

@@ -22,7 +22,7 @@ from core.judgement.verdict import TOP_PLACES
 from lab.evaluation.protocol.outcomes import Outcome
 
 SAME_PLACE = 3
-"""References at most so many frames from the best match are no rivals of it; the default of maps."""
+"""References at most this number of frames from the best match are no rivals of it; the default of maps."""
 
 BELIEVED = 0.95
 """Probability from which on an answer counts as believed."""

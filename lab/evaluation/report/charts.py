@@ -1,6 +1,6 @@
 """Charts by Matplotlib: each an SVG for the page, in the page's own colours, and a PNG file beside it.
 
-Figures are made by Matplotlib's objects, without ``pyplot``: nothing is kept between charts, and the same comparison
+Figures are made by Matplotlib's objects, without ``pyplot``: no state remains between charts, and the same comparison
 gives the same bytes.
 """
 
@@ -41,7 +41,7 @@ class Chart:
     """A finished chart.
 
     name: of its file, without suffix.
-    alt: what it shows, for who cannot see it.
+    alt: the content in words, for people who cannot see it.
     svg: an element whose colours are variables of the page's style sheet.
     png: a file, on light paper.
     """

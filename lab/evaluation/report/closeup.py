@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Closeup:
-    """What the page shows of a run.
+    """The part of a run that the page shows.
 
     constants: of the system, as text.
     layers: addresses that hold the drawings of the matrix: heat, true references, best matches.
     size: their width and height in pixels.
     fates: the scores before and, where there is a threshold, after it.
     similarity: the matrix as a file.
-    stem: what the names of its files end in.
+    stem: the end of the names of its files.
     """
 
     run: Run
@@ -49,7 +49,7 @@ def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, thumbnails:
     """Everything about one run.
 
     Args:
-        stem: what the names of its files end in.
+        stem: the end of the names of its files.
     """
     drawn = layers(
         run.scores,

@@ -118,7 +118,7 @@ def plot_reliability(runs: Sequence[Run], cast: Cast) -> Chart | None:
 
 
 def height_for(lines: Sequence[object], least: int = 380) -> int:
-    """Pixels of the page that a chart of so many lines needs for its legend."""
+    """Pixels of the page that a chart with this number of lines needs for its legend."""
     return max(least, 16 * len(lines) + 90)
 
 

@@ -51,7 +51,7 @@ def wrong_first(outcomes: Sequence[Outcome], wrong: int, right: int) -> list[int
 
 
 def case(comparison: Comparison, run: Run, query: int) -> Case:
-    """What to show of a query.
+    """The view of a query in the gallery.
 
     Of a wrong match the best true reference, the one that was nearly chosen; of a right one the
     middle of the true ones, to see how far aside the match lies.
@@ -74,7 +74,7 @@ class Panel:
 
     what: it is.
     index: of the image; None where the query has no true reference.
-    remark: what is said of it.
+    remark: the text about it.
     name: of its file; "" where there is none.
     picture: None where the file is gone or holds no image.
     boxes: regions of interest as x, y, width, height in pixels of the picture.

@@ -1,4 +1,4 @@
-"""The page of a comparison: what it is made from, and the files beside it; ``page.html`` says how it reads."""
+"""The page of a comparison: its sources, and the files beside it; ``page.html`` says how it reads."""
 
 from __future__ import annotations
 

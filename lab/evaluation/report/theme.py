@@ -118,7 +118,7 @@ class Mark:
 class Cast:
     """The marks of all systems of a page, by run and by name.
 
-    Two runs of one title (the same encoder trained twice, say) are told apart by their names, and
+    Two runs of one title (the same encoder trained twice, say) are distinguished by their names, and
     those of one name too by a number.
     """
 
@@ -148,5 +148,5 @@ def _told_apart(titles: list[str], names: list[str]) -> list[str]:
 
 
 def short(mark: Mark, letters: int = 22) -> Mark:
-    """The mark with a label of at most so many letters, for where there is little room."""
+    """The mark with a label of limited length, for where there is little room."""
     return mark if len(mark.label) <= letters else replace(mark, label=mark.label[: letters - 1].rstrip() + "…")

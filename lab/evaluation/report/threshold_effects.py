@@ -1,4 +1,4 @@
-"""What becomes of the queries, before and after a threshold on the score (thesis, section 3.4.3, Figure 3.17)."""
+"""The fate of the queries before and after a threshold on the score (thesis, section 3.4.3, Figure 3.17)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def plot_fates(name: str, system: str, outcomes: Sequence[Outcome], threshold: f
 
 @dataclass(frozen=True)
 class Frame:
-    """What the two plots share: most queries of one fate, lowest and highest score shown, the threshold."""
+    """The scales that the two plots share: most queries of one fate, lowest and highest score shown, the threshold."""
 
     longest: int
     low: float

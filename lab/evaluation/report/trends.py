@@ -77,13 +77,13 @@ def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Chart]:
         system: sorted((point for point in points if point.system == system), key=lambda point: point.references)
         for system in systems
     }
-    asked: list[tuple[str, str, str, Callable[[ScalePoint], float | None]]] = [
+    charts: list[tuple[str, str, str, Callable[[ScalePoint], float | None]]] = [
         ("scalability-auc-pr", "Accuracy as the map grows", "AUC-PR", lambda point: point.auc_pr),
         ("scalability-recall", "Recall@1 as the map grows", "recall@1", lambda point: point.recall_at_1),
         ("scalability-time", "Matching time as the map grows", "milliseconds", lambda point: point.milliseconds),
     ]
     plots = []
-    for name, title, what, value in asked:
+    for name, title, what, value in charts:
         lines = [
             Line(cast.named(system), [float(x) for x, _ in known], [y for _, y in known])
             for system, some in of_system.items()
@@ -98,7 +98,7 @@ def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Chart]:
 
 def plot_map_sizes(points: Sequence[SizePoint], cast: Cast) -> list[Chart]:
     """The verdicts of the shipped calibrations, and the error of their probabilities, by size of map."""
-    asked: list[tuple[str, str, str, Callable[[SizePoint], float | None]]] = [
+    charts: list[tuple[str, str, str, Callable[[SizePoint], float | None]]] = [
         ("sizes-error", "Probabilities by size of map", "calibration error", lambda point: point.calibration_error),
         ("sizes-known", "Known places by size of map", "recognized, right", lambda point: point.known_recognized),
         ("sizes-strangers", "Strangers by size of map", "recognized", lambda point: point.strangers_recognized),
@@ -107,7 +107,7 @@ def plot_map_sizes(points: Sequence[SizePoint], cast: Cast) -> list[Chart]:
         ("verified-strangers", "Strangers, verified", "recognized", lambda point: point.verified_strangers),
     ]
     plots = []
-    for name, title, what, value in asked:
+    for name, title, what, value in charts:
         found: dict[str, list[tuple[float, float]]] = {}
         for point in points:
             if (y := value(point)) is not None:

@@ -1,1 +1,1 @@
-"""What training draws of photographs: disturbed crops, pairs of displaced views, and pairs of neighbouring frames."""
+"""Training examples from photographs: disturbed crops, pairs of displaced views, and pairs of neighbouring frames."""

@@ -1,7 +1,7 @@
 """Pairs of views of two neighbouring frames of one walk or drive, and which cells of the two show the same spot.
 
 Between such frames the camera has moved on, as it has between traverses and not between two views of one photograph.
-Which cells show the same is told by the third stage: the keypoints of the undisturbed views are matched, and a match
+Cells that show the same are found by the third stage: the keypoints of the undisturbed views are matched, and a match
 that fits the geometry says which cells answer each other.
 """
 
@@ -37,7 +37,7 @@ LEAST_INLIERS, LEAST_EVIDENCE = 15, 5.0
 
 
 def neighbouring_views(photographs: Path, side: int, count: int, seed: int) -> Iterator[DisplacedViews]:
-    """Draw so many pairs from the training photographs and give those whose geometry is believed.
+    """Draw pairs from the training photographs and give those whose geometry is believed.
 
     The same seed draws the same ones.  There are none without walks.
     """
@@ -54,10 +54,10 @@ def neighbouring_views(photographs: Path, side: int, count: int, seed: int) -> I
     for _ in range(count):
         chosen = generator.permutation(pairs[int(generator.integers(len(pairs)))]).tolist()
         first, second, _ = displaced([read(paths[one]) for one in chosen], side, generator)
-        shown, asked = find_keypoints(network, first), find_keypoints(network, second)
-        found = verify(asked, [shown])[0]
+        shown, queried = find_keypoints(network, first), find_keypoints(network, second)
+        found = verify(queried, [shown])[0]
         if found.inlier_count >= LEAST_INLIERS and found.evidence > LEAST_EVIDENCE:
-            answers = matched_cells(found, shown.shares(), asked.shares(), side)
+            answers = matched_cells(found, shown.shares(), queried.shares(), side)
             if generator.random() < DISTURBED:
                 second = augment(second, generator)
             yield DisplacedViews(first, second, Displacement(answers, chosen[0], "neighbours", ""))
@@ -71,7 +71,7 @@ def matched_cells(
     Of several matches from one cell, that counts which is nearest to the middles of its cells.
 
     Args:
-        found: what the geometry of the second view as the query and the first as the candidate says.
+        found: the verification of the second view as the query and the first as the candidate.
         first, second: where the keypoints are, as shares of the views' sides, float [k, 2].
         side: of the views, in pixels.
     """

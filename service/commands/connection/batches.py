@@ -24,7 +24,7 @@ PATIENCE = 120.0
 class FrameToSend:
     """One frame to enrol.
 
-    taken: as the recording tells it.
+    taken: as the recording has it.
     sequence: the name of the traverse.
     camera: the camera of the map that took it; None for none.
     """
@@ -40,15 +40,16 @@ class FrameToSend:
 
     @property
     def name(self) -> str:
-        """What a message calls it."""
+        """The name in messages."""
         return self.taken.name
 
     def parameters(self, data: bytes) -> dict[str, str]:
-        """What goes into the query string beside the frame's bytes ``data``."""
-        told = self.taken.described(data)
-        given = {} if told.pose is None else {name: repr(value) for name, value in told.pose if value is not None}
-        if told.timestamp is not None:
-            given["timestamp"] = told.timestamp.isoformat()
+        """The parameters of the query string beside the frame's bytes ``data``."""
+        described = self.taken.described(data)
+        pose = () if described.pose is None else described.pose
+        given = {name: repr(value) for name, value in pose if value is not None}
+        if described.timestamp is not None:
+            given["timestamp"] = described.timestamp.isoformat()
         if self.camera is not None:
             given["camera"] = self.camera
         return {**given, "sequence": self.sequence}
@@ -71,14 +72,14 @@ async def enrol_frames(
     frames: Sequence[FrameToSend],
     known: frozenset[str],
     encoder: str | None,
-    tell: Callable[[SendingOutcome], None],
+    report: Callable[[SendingOutcome], None],
 ) -> None:
     """Enrol frames in their order.
 
     Args:
-        known: ids that the map already has; for these frames the service is first asked whether it has their bytes.
+        known: ids that the map already has; for these frames a first request finds out whether it has their bytes.
         encoder: the encoder that the map must have; None for any.
-        tell: is called with the outcome of each frame as soon as it is known.
+        report: called with the outcome of each frame as soon as it is known.
 
     Raises:
         Refused: the service refuses a request for a reason that concerns no single frame.
@@ -90,7 +91,7 @@ async def enrol_frames(
     with failures():
         async with aclosing(lab.enrol_each(places, known=known, encoder=encoder)) as outcomes:
             async for outcome in outcomes:
-                tell(_outcome(by_id[outcome.place.id], outcome))
+                report(_outcome(by_id[outcome.place.id], outcome))
 
 
 def _load(frame: FrameToSend) -> bytes:

@@ -81,7 +81,7 @@ class Service:
         self.client = client
 
     def patient(self, seconds: float) -> AsyncClient:
-        """The client with so many seconds in which a request is repeated while the service is overloaded."""
+        """The client that repeats requests for this time in seconds while the service is overloaded."""
         return self.client.patient(Retry(seconds, FIRST_PAUSE, LONGEST_PAUSE))
 
     async def request(

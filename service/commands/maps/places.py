@@ -86,8 +86,8 @@ def edit_place(
     given = {name: value for name, value in given.items() if value is not None}
     if any(value is not None for value in pose.values()):
         # With --clear pose the new pose may be in another frame of reference.
-        kept = {name: value for name, value in pose.items() if value is not None}
-        given["pose"] = dict.fromkeys(COORDINATES) | kept if "pose" in cleared else kept
+        given_pose = {name: value for name, value in pose.items() if value is not None}
+        given["pose"] = dict.fromkeys(COORDINATES) | given_pose if "pose" in cleared else given_pose
     if metadata is not None:
         given["metadata"] = _object(metadata)
     changes = {**cleared, **given}
@@ -107,7 +107,7 @@ def delete_places(
 ) -> None:
     """Delete places: all of them, or none if the map lacks one. This cannot be undone."""
     for place_id in place_ids:
-        path_of(place_id)  # refuses what is no name before it is asked about
+        path_of(place_id)  # refuses an invalid name before the request
     path = path_of("maps", map_id, "places") + ":delete"
 
     async def work() -> None:

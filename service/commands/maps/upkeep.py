@@ -28,8 +28,8 @@ def health(
     as_json: AsJson = False,
 ) -> None:
     """Report how well a map works: places that never match or match too often, gaps, drift, stretches to redo."""
-    asked = {"limit": limit, "seconds": seconds}
-    report = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "health"), params=asked).json()
+    params = {"limit": limit, "seconds": seconds}
+    report = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "health"), params=params).json()
     if as_json:
         show_json(report)
         return

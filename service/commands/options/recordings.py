@@ -123,8 +123,8 @@ class RecordingOptions:
         """The frames that are taken: the keyframes that the options ask for, or all.
 
         Args:
-            encoder: name or identity of that whose descriptors tell how much a frame has changed; None for the default.
-            mask: what to ignore in the frames.
+            encoder: name or identity of that whose descriptors show how much a frame has changed; None for the default.
+            mask: the areas to ignore in the frames.
 
         Raises:
             Failure: no frame can be judged by the options.
@@ -160,7 +160,7 @@ def without_standing(
     The frames of a folder all stay, for somebody chose them.
 
     Args:
-        mask: what to ignore in the frames.
+        mask: the areas to ignore in the frames.
     """
     if not recording.continuous:
         return frames
@@ -189,7 +189,7 @@ def without_standing(
 
 
 def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
-    """What describes frames by an encoder that is installed here; frames that cannot be used have no descriptor."""
+    """A function that describes frames by an encoder installed here; unusable frames have no descriptor."""
     import numpy as np
     from numpy.typing import NDArray
 

@@ -45,7 +45,7 @@ def medians(runs: Mapping[str, Callable[[], object]], rounds: int, warm_up: int 
 def forward_passes(encoder: Encoder, pixels: Pixels) -> dict[str, Callable[[], object]]:
     """The bare forward pass: the encoder's module, eager float32, batch of one, in two memory layouts.
 
-    The module and its input are copied into the layout beforehand: what is measured is the pass.  A network that is no
+    The module and its input are copied into the layout beforehand: only the pass is measured.  A network that is no
     torch module has one pass, its own.
     """
     backbone = encoder.extractor.backbone
@@ -92,7 +92,7 @@ def encode_batch(encoder: Encoder, frames: Sequence[bytes]) -> list[Encoding]:
 def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
     """A run that answers an encoded query as the service does: both stages, verdict, look-up of the matches.
 
-    The map has so many sample places and lies in a temporary folder until the block ends.
+    The map has ``places`` sample places and lies in a temporary folder until the block ends.
     """
     query = Query(encoder.encode(sample_frame(0)), Question(MATCHES))
     with tempfile.TemporaryDirectory() as folder:

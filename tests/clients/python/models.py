@@ -101,7 +101,7 @@ def models() -> str:
     """The module of the models of all answers."""
     lines = [
         REMARK.format(
-            "What the service answers with: a model for each schema of its interface, under the same name."
+            "Models of the answers of the service: one for each schema of its interface, under the same name."
         ).replace("from __future__ import annotations\n", ""),  # pydantic would evaluate each, which takes time
         "from datetime import date, datetime",
         "from typing import Any, Literal",

@@ -125,14 +125,14 @@ def test_a_service_that_is_not_there(error: Exception, message: str) -> None:
         ask(handle)
 
 
-def test_another_service_is_told_apart() -> None:
+def test_another_service_is_recognized() -> None:
     handle, _ = in_turn(httpx.Response(404, content=b"<html>"))
     with pytest.raises(UnexpectedAnswer, match=r"answered 404\. Is it a placerec service") as answered:
         ask(handle)
     assert answered.value.status == 404
 
 
-def test_a_url_with_a_path_too_many_is_told(url: str, lab: Map) -> None:
+def test_a_url_with_a_path_too_many_is_explained(url: str, lab: Map) -> None:
     hint = rf"{re.escape(url)}/v1 may not be the URL of a service: give {re.escape(url)}, without /v1\.$"
     with Client(f"{url}/v1/") as client:
         there = client.maps[lab.id]
@@ -248,7 +248,7 @@ def test_the_key_is_sent() -> None:
 # Deadlines
 
 
-def test_the_service_is_told_the_deadline(server: Server) -> None:
+def test_the_service_gets_the_deadline(server: Server) -> None:
     with Client(str(server.client.base_url)) as client:
         with pytest.raises(DeadlineExceeded):
             client.maps["no-map"].query(jpeg(0), deadline=1e-4)
@@ -389,7 +389,7 @@ def refuse(listening: socket.socket) -> bytes:
 
 
 @pytest.mark.parametrize("proxy", ["gopher://127.0.0.1:70", "127.0.0.1:65536"])
-def test_a_proxy_that_is_none_is_told(proxy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_proxy_that_is_none_is_explained(proxy: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", proxy)
     with pytest.raises(ConnectionFailed, match="a proxy that is none"):
         Client("http://robot.invalid")

@@ -306,7 +306,7 @@ def test_a_frame_whose_turn_does_not_come_in_time() -> None:
 
 
 @pytest.mark.parametrize("streamed", [False, True])
-def test_the_last_number_is_asked_for_within_the_deadline(streamed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_last_number_is_requested_within_the_deadline(streamed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     moments = Moments(monkeypatch)
 
     def refuse(_: httpx.Request) -> httpx.Response:

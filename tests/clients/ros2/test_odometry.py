@@ -59,7 +59,7 @@ def test_messages_out_of_order_are_sorted_and_a_clock_that_is_set_back_begins_an
     assert at(odometer, 5.0) is None, "another frame is another odometry"
 
 
-def test_what_is_kept_is_bounded() -> None:
+def test_stored_readings_are_bounded() -> None:
     odometer = Odometer()
     for number in range(3 * MOST_KEPT // 2):
         odometer.add(odometry(100 + number * 1e-4, 0.0, 0.0))
@@ -81,7 +81,7 @@ def test_a_pose_that_is_none_is_refused(broken: tuple[float, float, float]) -> N
 
 def told(odometer: Odometer, seconds: float, camera_yaw: float = 0.0) -> OdometryPose:
     """What the service makes of what the node tells."""
-    found = odometer.told(round(seconds * NANOSECONDS), camera_yaw)
+    found = odometer.odometry(round(seconds * NANOSECONDS), camera_yaw)
     assert found is not None
     covariance = None if found.covariance is None else tuple(found.covariance)
     return OdometryPose(found.x, found.y, math.radians(found.heading), covariance, found.origin)
@@ -94,7 +94,7 @@ def test_the_motion_is_that_of_the_robot_or_of_a_camera_that_looks_aside() -> No
     for camera, forward, left in ((0.0, 2.0, 0.0), (math.radians(90), 0.0, -2.0)):
         moved = told(odometer, 10.4, camera).since(told(odometer, 10.0, camera))
         assert (moved.forward, moved.left, math.degrees(moved.turn)) == pytest.approx((forward, left, 30.0))
-    assert odometer.told(12 * NANOSECONDS) is None
+    assert odometer.odometry(12 * NANOSECONDS) is None
 
 
 def test_the_covariance_is_that_of_the_plane() -> None:
@@ -110,7 +110,7 @@ def test_the_covariance_is_that_of_the_plane() -> None:
         assert told(odometer, 11.0 + number).covariance is None
 
 
-def test_odometry_that_begins_anew_is_told_as_another() -> None:
+def test_odometry_that_begins_anew_has_another_origin() -> None:
     odometer = Odometer()
     origins = []
     for stamp, x, yaw, frame in (

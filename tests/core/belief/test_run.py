@@ -116,7 +116,7 @@ def test_a_second_look_from_the_same_spot_is_no_second_witness() -> None:
     )
 
 
-def test_places_that_die_between_two_frames_are_not_told() -> None:
+def test_places_that_die_between_two_frames_are_not_reported() -> None:
     graph = graph_of(walk(30))
     run = Run(DEFAULT, graph)
     for number in range(5):
@@ -245,7 +245,7 @@ def test_of_two_places_that_look_the_same_none_is_recognized() -> None:
         assert told.verdict == "ambiguous" and told.unknown < 0.1
 
 
-def test_the_place_of_some_frames_ago_is_told_better_later() -> None:
+def test_the_place_of_some_frames_ago_is_estimated_better_later() -> None:
     graph = graph_of(walk(40))
     run = Run(RunOptions(lag=3, stride=Stride()), graph)
     verdicts = []

@@ -108,7 +108,7 @@ def test_rows_that_come_while_blocks_are_joined_stay() -> None:
     assert best(after, second_looks(ROWS[350:351]))[0][0] == 350
 
 
-def test_joining_is_told_and_may_be_stopped() -> None:
+def test_joining_reports_progress_and_may_be_stopped() -> None:
     told = []
 
     def stop(done: int, total: int) -> None:

@@ -106,10 +106,10 @@ def test_too_few_frames_are_refused(frames: int) -> None:
         fit_map_calibration(drawn(frames), BASE, PRECISE, "map")
 
 
-def test_a_map_whose_answers_tell_nothing_is_refused() -> None:
+def test_a_map_whose_answers_show_nothing_is_refused() -> None:
     trials = drawn(300)
     noise = np.random.default_rng(1).random(len(trials))
-    with pytest.raises(CalibrationImpossible, match="hardly be told"):
+    with pytest.raises(CalibrationImpossible, match="hardly be distinguished"):
         fit_map_calibration(
             Trials(noise, trials.margin, trials.known, trials.right, trials.frame), BASE, PRECISE, "map"
         )
@@ -157,7 +157,7 @@ def test_the_points_say_what_each_threshold_does() -> None:
         assert point.false_accept_rate == pytest.approx(passed[~known].mean())
 
 
-def test_a_long_curve_is_told_in_few_points() -> None:
+def test_a_long_curve_has_few_points() -> None:
     points = fit_map_calibration(drawn(1000), BASE, PRECISE, "map").measurement.points
     assert len(points) == MOST_POINTS
     assert points[0].false_accept_rate == 1.0

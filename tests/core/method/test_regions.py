@@ -17,7 +17,7 @@ def test_many_regions_of_one_energy_keep_the_order_of_maps_and_rows() -> None:
 
 
 @pytest.mark.parametrize("largest", [1e6, 1e30])
-def test_levels_beyond_any_histogram_are_told_apart(largest: float) -> None:
+def test_levels_beyond_any_histogram_are_distinguished(largest: float) -> None:
     activations = np.zeros((4, 4, 1), np.float32)
     activations[0, 0], activations[0, 1], activations[3, 3] = largest, largest * 0.5, largest
     made = extract_regions([activations], [1.0], 10)

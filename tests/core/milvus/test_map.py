@@ -154,7 +154,7 @@ def test_what_was_left_over_is_deleted(store: MilvusStore, monkeypatch: pytest.M
     assert len(scope.snapshot.whereabouts_at(rows)) == 2
     monkeypatch.setattr("core.milvus.ledger.LEFT_SECONDS", 0)
     lab.enrol([frame("c")])
-    assert lab.snapshot().leavings == ()
+    assert lab.snapshot().orphans == ()
     assert len(lab.snapshot()) == 2
 
 

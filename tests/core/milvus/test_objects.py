@@ -17,8 +17,8 @@ from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.maps import MapSettings, ReviewSetting
 from core.milvus import Bucket, ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.kept import StoredObject
 from core.milvus.pictures.objects import Objects
+from core.milvus.pictures.stored import StoredObject
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
 from tests.core.maps.review import check_pages_are_of_one_moment
@@ -110,7 +110,7 @@ def test_old_pictures_stay_where_they_are(store: MilvusStore, lab: MilvusMap, se
     lab.enrol([frame("new"), frame("replaced", "something else")])
     assert lab.picture("replaced") == image_of("something else") and where(lab, "new").size == len(image_of("new"))
     assert before.picture("old") == image_of("old")
-    with pytest.raises(StorageFailure, match="told of none"):
+    with pytest.raises(StorageFailure, match="configured without one"):
         before.picture("new")
     assert store.verify("lab").ok
     without.close()
@@ -135,7 +135,7 @@ def test_a_page_for_review_is_of_one_moment(store: MilvusStore, lab: MilvusMap) 
     check_pages_are_of_one_moment(lab.review, store.get("lab").review)
 
 
-def test_what_is_lost_or_damaged_is_told(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
+def test_lost_and_damaged_objects_are_reported(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
     lab.enrol([frame(name) for name in ("whole", "lost", "damaged")])
     objects.delete([where(lab, "lost").name])
     objects.put({where(lab, "damaged").name: b"image of daMaged"})

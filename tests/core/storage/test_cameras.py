@@ -32,7 +32,7 @@ def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -
         lab.cameras.mask("front")
 
 
-def test_intrinsics_are_kept_beside_the_mask(directory: Path, atlas: Atlas, lab: Map) -> None:
+def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Atlas, lab: Map) -> None:
     lab.cameras.put("front", MASK, INTRINSICS)
     lab.cameras.put("back", None)
     atlas.close()
@@ -69,7 +69,7 @@ def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, mo
     assert lab.cameras.mask("back") == MASK
 
 
-def test_what_was_read_before_a_change_is_not_kept(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reading_before_a_change_is_not_cached(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.cameras.put("front", None)
     reading = lab.cameras._reading
 

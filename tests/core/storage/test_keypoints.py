@@ -130,7 +130,7 @@ def test_damaged_ones_are_not_used_but_reported_and_found_again(
         write.connection.execute(damage.replace("WHERE place = 1", "") + " WHERE place = 1")
     with caplog.at_level(logging.ERROR):
         assert kept(lab, "a") is None
-    assert "keypoints kept of place 'a'" in caplog.text
+    assert "stored keypoints of place 'a'" in caplog.text
     assert same(kept(lab, "b"), keypoints_of("b"))
     report = lab.verify()
     assert not report.ok and any("the keypoints of place 'a'" in problem for problem in report.problems)

@@ -340,7 +340,7 @@ def photograph() -> bytes:
     return encode_png(cv2.blur(pixels, (31, 31)).astype(np.uint8))
 
 
-def test_what_is_kept_of_a_frame(atlas: Atlas) -> None:
+def test_the_stored_picture_of_a_frame(atlas: Atlas) -> None:
     hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     hall.enrol([frame("a")])
     assert hall.place("a").picture == "none"
@@ -435,7 +435,7 @@ ENDLESS = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + (1 << 20).to_bytes(4, "big") * 2 
 @pytest.mark.parametrize(
     ("content", "why"), [(ENDLESS, "1048576x1048576 pixels"), (b"<script>", "not those of an image")]
 )
-def test_a_kept_picture_that_cannot_be_shown_is_no_thumbnail(lab: Map, content: bytes, why: str) -> None:
+def test_a_stored_picture_that_cannot_be_shown_is_no_thumbnail(lab: Map, content: bytes, why: str) -> None:
     lab.edit({"keep": "image"})
     lab.enrol([replace(frame("p"), image=content)])
     with pytest.raises(NoThumbnail, match=why):

@@ -25,7 +25,7 @@ def frames_at(folder: Path) -> ReviewFrames:
     return ReviewFrames(folder / FILE, lambda: None)
 
 
-def test_a_frame_is_kept_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
+def test_a_frame_is_stored_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
     assert review.page(None, 10) == ReviewPage([], 0, 0) and not (tmp_path / FILE).exists()
     assert review.keep(b"one", ANSWER, SETTING) and review.keep(b"two", {"verdict": "ambiguous"}, SETTING)
@@ -49,7 +49,7 @@ def test_a_page_is_of_one_moment(tmp_path: Path) -> None:
     review.close()
 
 
-def test_a_frame_that_is_not_kept_is_named(tmp_path: Path) -> None:
+def test_a_frame_that_is_not_stored_is_named(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
     for action in (review.find, review.picture, review.discard, lambda number: review.label(number, {})):
         with pytest.raises(UnknownFrame):
@@ -83,7 +83,7 @@ def test_the_oldest_go_first_and_those_with_a_label_last(
     review.close()
 
 
-def test_a_frame_larger_than_all_may_be_is_not_kept(tmp_path: Path) -> None:
+def test_a_frame_larger_than_all_may_be_is_not_stored(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
     review.keep(b"one", ANSWER, SETTING)
     assert not review.keep(bytes(SETTING.most_bytes + 1), ANSWER, SETTING)

@@ -79,7 +79,7 @@ def test_all_or_none(hall: Map) -> None:
     assert hall.verify().ok
 
 
-def test_two_states_of_a_place_are_told_apart() -> None:
+def test_two_states_of_a_place_are_distinguished() -> None:
     one = Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2026")
     assert one.same_as(Outline(9, "a", 7, b"d", "none", None, "monday", 3, "2026")), "numbers and rows are a map's own"
     for other in (

@@ -35,7 +35,7 @@ def test_a_drift_is_found() -> None:
     assert rising is not None and rising.significant and rising.per_week == pytest.approx(0.05, abs=0.01)
 
 
-def test_chance_is_rarely_told_as_drift() -> None:
+def test_chance_is_rarely_reported_as_drift() -> None:
     told = 0
     for seed in range(60):
         found = weeks([0.5] * 12, [0.2] * 12, 60, seed)

@@ -82,7 +82,7 @@ def scene(seed: int) -> Pixels:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["cross-region-vlad", "cross-region-bow-2.6k"])
-def test_places_are_told_apart_after_training(name: str) -> None:
+def test_places_are_distinguished_after_training(name: str) -> None:
     system = build(name, models=EncoderCatalogue())
     assert isinstance(system, CrossRegion) and isinstance(system, CrossRegionBow | CrossRegionVlad)
     with pytest.raises(InvalidModel, match="train it"):

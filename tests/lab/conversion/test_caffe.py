@@ -103,7 +103,7 @@ def test_weights_and_description_are_taken_exactly(imported: Any) -> None:
     np.testing.assert_array_equal(weights["conv5.bias"].numpy(), np.zeros(6))
 
 
-def test_an_imported_network_can_be_kept_as_a_file(imported: Any, tmp_path: Path) -> None:
+def test_an_imported_network_can_be_stored_as_a_file(imported: Any, tmp_path: Path) -> None:
     definition, weights = imported(caffemodel(small_network() + HEAD, start=input_dim(1, 3, 47, 61)))
     save_network(tmp_path / "small.network.safetensors", definition, weights)
     network = load_network(tmp_path / "small.network.safetensors", ["conv3"])

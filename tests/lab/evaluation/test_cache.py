@@ -45,18 +45,18 @@ def test_any_changed_byte_or_missing_end_counts_as_absent(tmp_path: Path) -> Non
     assert cache.load("a") is not None
 
 
-def test_objects_are_never_kept(tmp_path: Path) -> None:
+def test_objects_are_never_cached(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="allow_pickle"):
         EvaluationCache(tmp_path).store("a", CacheEntry({}, {"scores": np.array([{}], dtype=object)}))
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
+def test_without_a_folder_nothing_is_cached() -> None:
     cache = EvaluationCache(None)
     cache.store("a", ENTRY)
     assert cache.load("a") is None and cache.writable
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     cache = EvaluationCache(tmp_path / "file")
     cache.store("a", ENTRY)

@@ -40,7 +40,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> TraversePair:
 
 
 @pytest.mark.thorough
-def test_known_places_and_strangers_are_asked_in_maps_of_every_size(walk: TraversePair, tmp_path: Path) -> None:
+def test_known_places_and_strangers_query_maps_of_every_size(walk: TraversePair, tmp_path: Path) -> None:
     system = build("m-region-vlad", models=EncoderCatalogue())
     cache = EvaluationCache(tmp_path)
     points = map_sizes(Subject(system, walk, Training([], "nothing"), read), cache)

@@ -78,7 +78,7 @@ def test_a_run_by_hand(few: TraversePair) -> None:
     assert not result.cached
 
 
-def test_stages_of_a_system_of_its_own_are_told(few: TraversePair) -> None:
+def test_stages_of_a_system_of_its_own_are_reported(few: TraversePair) -> None:
     measured = measure(subject(few, Lookup(table(), stages=("hog", "forward"))))
     assert list(measured.milliseconds) == ["forward", "regions", "vlad", "match", "hog"]
     assert (measured.milliseconds["hog"], measured.milliseconds["vlad"]) == (2.0, None)

@@ -54,7 +54,7 @@ def test_a_query_counts_where_a_true_reference_is_kept(tmp_path: Path) -> None:
     assert points[0].recall_at_1 == 6 / 8  # references 4 to 11; queries 10 and 11 look like 9
 
 
-def test_points_are_kept(tmp_path: Path) -> None:
+def test_points_are_cached(tmp_path: Path) -> None:
     pair, table = made(tmp_path)
     cache = EvaluationCache(tmp_path / "cache")
     first = scalability(Subject(Lookup(table), pair, Training([], "nothing"), load), cache)

@@ -52,7 +52,7 @@ def test_a_curve_by_hand(tmp_path: Path) -> None:
     assert severity_steps(subject, [DIMMER]) == 2 * 3 + 3 * 3  # described, and compared
 
 
-def test_curves_are_kept(tmp_path: Path) -> None:
+def test_curves_are_cached(tmp_path: Path) -> None:
     pair, cache = made(tmp_path), EvaluationCache(tmp_path / "cache")
     first = severity(Subject(by_value(), pair, Training([], "nothing"), load), cache, [DIMMER])
     system = by_value()

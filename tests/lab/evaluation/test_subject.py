@@ -28,7 +28,7 @@ def lessons(pair: TraversePair) -> Training:
     return Training(pair.references[:2], "two images", seed=1)
 
 
-def test_nothing_is_described_before_it_is_asked_for_and_then_once(pair: TraversePair) -> None:
+def test_nothing_is_described_before_it_is_requested_and_then_once(pair: TraversePair) -> None:
     system = Lookup(TABLE)
     seen: list[None] = []
     subject = Subject(system, pair, lessons(pair), load, lambda: seen.append(None))
@@ -70,7 +70,7 @@ class Counted:
         return self.inner.score(queries)
 
 
-def test_one_query_is_asked_at_a_time(pair: TraversePair) -> None:
+def test_queries_run_one_at_a_time(pair: TraversePair) -> None:
     system = Counting([])
     subject = Subject(system, pair, lessons(pair), load)
     scored = subject.score(system.index(subject.references.descriptions), subject.queries.descriptions)

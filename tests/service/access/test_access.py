@@ -113,7 +113,7 @@ async def test_every_endpoint_asks_for_the_key_that_its_row_says(guarded: tuple[
 
 
 @pytest.mark.anyio
-async def test_without_a_key_nothing_is_told_of_what_is_here(guarded: tuple[FastAPI, dict[str, str]]) -> None:
+async def test_without_a_key_no_answer_shows_the_content(guarded: tuple[FastAPI, dict[str, str]]) -> None:
     app, tokens = guarded
     async with asking(app) as client:
         for method, path in (
@@ -134,7 +134,7 @@ async def test_without_a_key_nothing_is_told_of_what_is_here(guarded: tuple[Fast
 
 
 @pytest.mark.anyio
-async def test_under_a_path_of_a_proxy_the_same_is_asked(tmp_path: Path) -> None:
+async def test_under_a_path_of_a_proxy_the_same_key_is_needed(tmp_path: Path) -> None:
     KeyStore(tmp_path).create("ann", "admin")
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path, root_path="/placerec"))
     with app.state.gate.keyring:
@@ -354,7 +354,7 @@ def test_a_key_counts_and_ends_beside_a_running_service(keyed: Keyed) -> None:
         assert_problem(answers[-1], 401, "key-refused")
 
 
-def test_every_change_is_told_with_who_made_it(keyed: Keyed) -> None:
+def test_every_change_is_logged_with_its_caller(keyed: Keyed) -> None:
     with keyed.as_(keyed.enrol) as operator:
         asked = {"X-Request-Id": "an-edit", "traceparent": "00-" + "ab" * 16 + "-" + "cd" * 8 + "-01"}
         edited = operator.patch("/v1/maps/lab/places/p1", json={"metadata": {"secret": "door"}}, headers=asked)
@@ -394,7 +394,7 @@ def test_every_change_is_told_with_who_made_it(keyed: Keyed) -> None:
     assert 'placerec_problems_total{type="role-too-low"}' in counted
 
 
-def test_which_maps_are_damaged_is_told_to_those_who_may_know(keyed: Keyed) -> None:
+def test_damaged_maps_are_listed_for_those_who_may_know(keyed: Keyed) -> None:
     assert httpx.get(f"http://127.0.0.1:{keyed.server.port}/readyz").json()["quarantined"] == []
     assert OPERATIONS["check_readiness"].maps == "shown"
 

@@ -44,7 +44,7 @@ def test_a_request_that_changed_nothing_is_no_change(caplog: pytest.LogCaptureFi
     ]
 
 
-def test_a_job_tells_at_its_end_who_asked_for_it_over_a_restart(
+def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = Jobs(tmp_path)
@@ -74,7 +74,7 @@ def test_a_job_tells_at_its_end_who_asked_for_it_over_a_restart(
     assert lines[job.id, "job succeeded"]["dry_run"] is False
 
 
-def test_a_refusal_that_repeats_is_told_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repeated_refusal_is_logged_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     refusals = Refusals()
     for _ in range(100):
         refusals.note(EVE, {"map": "lab"}, 403, "role-too-low")
@@ -85,7 +85,7 @@ def test_a_refusal_that_repeats_is_told_once(caplog: pytest.LogCaptureFixture, m
     assert caplog.records[-1].__dict__["before"] == 99
     for number in range(2 * audit.MOST_REFUSALS):
         refusals.note(Asker("nobody", client=str(number)), {}, 401, "key-needed")
-    assert len(refusals._told) == audit.MOST_REFUSALS
+    assert len(refusals._logged) == audit.MOST_REFUSALS
 
 
 def test_a_file_of_its_own(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def ring(store: KeyStore, wall: Clock | None = None, monotonic: Clock | None = N
 # The file
 
 
-def test_a_key_is_kept_without_its_secret(store: KeyStore, tmp_path: Path) -> None:
+def test_a_key_is_stored_without_its_secret(store: KeyStore, tmp_path: Path) -> None:
     assert not store.exists() and store.all() == []
     until = datetime.now(UTC) + timedelta(days=30)
     key, token = store.create("robot-7", "query", ["lab", "yard"], until)
@@ -91,7 +91,7 @@ def test_a_name_is_free_again_when_its_key_is_revoked(store: KeyStore) -> None:
             store.revoke(unknown)
 
 
-def test_first_keys_at_one_moment_are_all_kept(store: KeyStore) -> None:
+def test_first_keys_at_one_moment_are_all_stored(store: KeyStore) -> None:
     threads = [threading.Thread(target=store.create, args=(f"key-{number}", "query")) for number in range(8)]
     for thread in threads:
         thread.start()

@@ -66,7 +66,7 @@ def test_what_counts_as_one_caller() -> None:
 
 
 @pytest.mark.anyio
-async def test_a_key_over_its_rate_is_told_when_to_come_again(tmp_path: Path) -> None:
+async def test_a_key_over_its_rate_learns_when_to_come_again(tmp_path: Path) -> None:
     store = KeyStore(tmp_path)
     (_, first), (_, second) = store.create("ann", "query"), store.create("bob", "query")
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path, rate_per_key=0.25, rate_burst=3))

@@ -45,7 +45,7 @@ def asking(server: Server, token: str) -> httpx.Client:
     return httpx.Client(base_url=server.client.base_url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
 
 
-def test_a_new_key_works_at_once_and_its_secret_is_told_once(keyed: Server) -> None:
+def test_a_new_key_works_at_once_and_its_secret_is_shown_once(keyed: Server) -> None:
     made = created(keyed, "robot-1", maps=["lab"], expires_at="2099-01-31T00:00:00+01:00")
     assert TOKEN.fullmatch(made["key"]) and made["key"].startswith(f"placerec_{made['id']}_")
     assert made["expires_at"] == "2099-01-30T23:00:00Z" and made["state"] == "in force" and made["maps"] == ["lab"]

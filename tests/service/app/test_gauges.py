@@ -12,7 +12,7 @@ from tests.service.wire import get, opened, post, rest
 
 
 @pytest.mark.thorough
-def test_what_is_held_is_told(strict: Server) -> None:
+def test_held_memory_is_reported(strict: Server) -> None:
     strict.create_map("gauged")
     assert strict.enrol("gauged", "p", jpeg(1)).status_code == 201
     assert strict.client.post("/v1/maps/gauged/sessions", json={}).status_code == 201

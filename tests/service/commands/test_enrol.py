@@ -112,7 +112,7 @@ def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, mo
 
 
 @pytest.mark.thorough
-def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
+def test_a_map_is_made_only_on_request(placerec: Placerec, monday: Path) -> None:
     refused = placerec("enrol", monday, "--map", "lab", status=1)
     assert "There is no map 'lab'. Give --create to create it." in refused.stderr
     placerec("enrol", monday, "--map", "lab", "--create", "--encoder", "region-vlad", "--keep", "none")

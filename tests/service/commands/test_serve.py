@@ -43,7 +43,7 @@ def test_a_wrong_setting_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_it_stops_when_told_and_gives_the_data_back(tmp_path: Path) -> None:
+def test_it_stops_on_a_signal_and_gives_the_data_back(tmp_path: Path) -> None:
     first = Server(tmp_path)
     first.wait("/livez")
     assert first.stop() == 0

@@ -120,7 +120,7 @@ def test_the_first_key_is_not_lost_with_the_page_that_made_it(
         assert server.stop() == 0
 
 
-def test_a_key_is_asked_for_and_a_wrong_one_refused(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
+def test_a_key_is_requested_and_a_wrong_one_refused(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
     operator = visit(None)
     operator.foresee("401")
     page = operator.page
@@ -167,7 +167,7 @@ def test_a_key_can_be_typed_again_after_the_service_refused_to_look_at_it(
     page.get_by_role("link", name=LAB, exact=True).wait_for()
 
 
-def test_a_key_that_is_revoked_meanwhile_is_asked_for_again(visit: Visit, keyed: Server) -> None:
+def test_another_key_is_requested_after_a_revocation(visit: Visit, keyed: Server) -> None:
     key, text = KeyStore(keyed.data_dir).create("soon-gone", "query")
     operator = visit(None)
     operator.foresee("401")

@@ -29,7 +29,7 @@ def pictures(tmp_path: Path) -> Path:
 
 
 @pytest.mark.thorough
-def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Path) -> None:
+def test_a_picture_is_queried_and_the_answer_explained(visit: Visit, pictures: Path) -> None:
     page = visit("query").go(f"maps/{LAB}/try")
     page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
     answer = page.get_by_role("region", name="Answer")
@@ -50,7 +50,7 @@ def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Pat
 
 
 @pytest.mark.thorough
-def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alone(
+def test_several_pictures_are_queried_one_after_the_other_and_a_bad_one_fails_alone(
     admin: Operator, pictures: Path
 ) -> None:
     page = admin.go(f"maps/{LAB}/try")
@@ -101,7 +101,7 @@ def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str]
 
 
 @pytest.mark.thorough
-def test_the_webcam_is_asked(admin: Operator) -> None:
+def test_frames_of_the_webcam_are_queried(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/try")
     page.get_by_role("button", name="Use the webcam").click()
     page.get_by_role("button", name="Ask with this frame").click()

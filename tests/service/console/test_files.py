@@ -55,7 +55,7 @@ def test_nothing_is_inline() -> None:
     assert not re.search(r"<script(?![^>]* src=)|<style|\sstyle=|\son\w+=", page)
 
 
-def test_a_file_is_kept_for_good_and_the_page_asked_for_each_time(client: httpx.Client) -> None:
+def test_a_file_is_cached_for_good_and_the_page_requested_each_time(client: httpx.Client) -> None:
     build = console_files().build
     assert "immutable" in client.get(f"/console/{build}/start.js").headers["cache-control"]
     for path in ("/console", f"/console/{build}/start.js"):

@@ -71,7 +71,7 @@ def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> 
 
 
 @pytest.mark.thorough
-def test_an_edit_of_what_somebody_else_changed_is_refused_and_told(admin: Operator, keyed: Server, spare: str) -> None:
+def test_an_edit_over_another_change_is_refused_and_explained(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go("maps")
     page.get_by_role("button", name=f"Edit {spare}").click()
     page.get_by_role("dialog").get_by_label("Description").fill("mine")
@@ -184,7 +184,7 @@ def test_a_place_is_edited_and_the_edit_undone(admin: Operator, keyed: Server, s
 
 
 @pytest.mark.thorough
-def test_metadata_that_is_no_json_is_told_before_it_is_sent(admin: Operator, spare: str) -> None:
+def test_metadata_that_is_no_json_is_refused_before_it_is_sent(admin: Operator, spare: str) -> None:
     page = admin.go(f"maps/{spare}/places/p1")
     page.get_by_role("button", name="Edit").click()
     page.get_by_label("Metadata").fill("{floor: 2")

@@ -201,7 +201,7 @@ def kept(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Oper
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("field", KEPT)
-def test_texts_of_kept_frames(kept: Operator, field: str) -> None:
+def test_texts_of_stored_frames(kept: Operator, field: str) -> None:
     kept.page.get_by_role("button", name=f"Frame {KEPT.index(field)}", exact=True).click()
     expect(kept.page.get_by_role("region", name="Frame to be labelled")).to_contain_text(MARKUP)
     check_plain(kept)

@@ -37,7 +37,7 @@ def doubtful(keyed: Server, request: pytest.FixtureRequest) -> str:
     return name
 
 
-def test_an_admin_says_which_frames_are_kept(admin: Operator, keyed: Server) -> None:
+def test_an_admin_says_which_frames_are_stored(admin: Operator, keyed: Server) -> None:
     keyed.create_map("keeping")
     page = admin.go("maps/keeping/review")
     page.get_by_text("This map stores no frames for review now.").wait_for()

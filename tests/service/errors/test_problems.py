@@ -34,7 +34,7 @@ def test_every_error_class_is_mapped(cls: type[Exception]) -> None:
     assert kind.title and kind.slug == kind.slug.lower().replace(" ", "-")
 
 
-def test_problem_types_are_told_apart() -> None:
+def test_problem_types_are_distinguished() -> None:
     slugs = [kind.slug for kind in [*KINDS.values(), *BY_STATUS.values()]]
     assert len(set(slugs)) == len(slugs)
 

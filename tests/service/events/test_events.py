@@ -51,7 +51,7 @@ def lab(quick: Server, request: pytest.FixtureRequest) -> str:
 
 
 @pytest.mark.thorough
-def test_a_query_is_told_as_it_was_answered(quick: Server, lab: str) -> None:
+def test_the_event_of_a_query_has_its_answer(quick: Server, lab: str) -> None:
     assert quick.client.put(f"/v1/maps/{lab}/cameras/front", json={}).is_success
     with listening(quick, lab) as ear:
         response = quick.client.post(
@@ -68,7 +68,7 @@ def test_a_query_is_told_as_it_was_answered(quick: Server, lab: str) -> None:
     assert event.data["pose"] == answer["pose"] and "picture" not in event.data
 
 
-def test_all_ways_of_asking_are_told(quick: Server, lab: str) -> None:
+def test_all_kinds_of_queries_have_events(quick: Server, lab: str) -> None:
     session = quick.client.post(f"/v1/maps/{lab}/sessions", json={}).json()["id"]
     frames = f"/v1/maps/{lab}/sessions/{session}"
     with listening(quick, lab, parameters={"kinds": "query"}) as ear:
@@ -92,7 +92,7 @@ def test_all_ways_of_asking_are_told(quick: Server, lab: str) -> None:
     assert all(one.data["milliseconds"] for one in told) and all(one.data.keys() > EVERYTHING for one in told)
 
 
-def test_a_session_is_told_from_its_beginning_to_its_end(quick: Server, lab: str) -> None:
+def test_a_session_has_events_from_its_beginning_to_its_end(quick: Server, lab: str) -> None:
     with listening(quick, lab, parameters={"kinds": "session"}) as ear:
         session = quick.client.post(f"/v1/maps/{lab}/sessions", json={}).json()["id"]
         frames = f"/v1/maps/{lab}/sessions/{session}"
@@ -122,7 +122,7 @@ def test_a_session_that_expires_was_ended_by_nobody(quick: Server, lab: str) -> 
     assert event.data["request_id"] is None
 
 
-def test_enrolments_are_told_by_commit(quick: Server, lab: str) -> None:
+def test_enrolments_have_an_event_for_each_commit(quick: Server, lab: str) -> None:
     entries = [{"id": f"b{n}", "file": f"b{n}", "sequence": "tuesday"} for n in range(3)]
     form: dict[str, Any] = {"places": (None, json.dumps(entries), "application/json")}
     form |= {f"b{n}": (f"b{n}", jpeg(10 + n), "image/jpeg") for n in range(3)}
@@ -164,7 +164,7 @@ def test_enrolments_are_told_by_commit(quick: Server, lab: str) -> None:
     assert {one.data["job"] for one in ear.heard if one.name == "job"} == {bulk["id"]}
 
 
-def test_changes_of_the_map_and_its_end_are_told(quick: Server, lab: str) -> None:
+def test_changes_of_the_map_and_its_end_have_events(quick: Server, lab: str) -> None:
     with listening(quick, lab, parameters={"kinds": "map"}) as ear:
         quick.client.patch(f"/v1/maps/{lab}", json={"description": "changed", "same_place_radius": 3.0})
         quick.client.patch(f"/v1/maps/{lab}", json={"calibration": {"threshold": 0.3}})
@@ -179,7 +179,7 @@ def test_changes_of_the_map_and_its_end_are_told(quick: Server, lab: str) -> Non
     assert_problem(quick.client.get(f"/v1/maps/{lab}/events"), 404, "unknown-map")
 
 
-def test_a_job_over_two_maps_is_told_to_both(quick: Server, lab: str) -> None:
+def test_a_job_over_two_maps_has_events_in_both(quick: Server, lab: str) -> None:
     quick.create_map("merged")
     quick.enrol("merged", "m1", jpeg(50))
     with listening(quick, lab) as ear, listening(quick, "merged", parameters={"kinds": "job"}) as other:
@@ -288,7 +288,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
     assert made.server.stop() == 0
 
 
-def test_a_robot_sees_its_map_and_not_who_asked(keyed: Keyed) -> None:
+def test_a_robot_sees_its_map_and_not_the_callers(keyed: Keyed) -> None:
     there = {"Authorization": f"Bearer {keyed.robot}"}
     get = keyed.server.client.get
     assert_problem(get("/v1/maps/yard/events", headers=there), 403, "map-forbidden")
@@ -305,7 +305,7 @@ def test_a_robot_sees_its_map_and_not_who_asked(keyed: Keyed) -> None:
     assert all_.keys() - seen.keys() == {"key", "explanation", "picture"}
 
 
-def test_a_job_that_names_a_map_of_others_is_not_told(keyed: Keyed) -> None:
+def test_a_job_that_names_a_map_of_others_is_hidden(keyed: Keyed) -> None:
     with (
         listening(keyed.server, "lab", keyed.operator, parameters={"kinds": "job"}) as operator,
         listening(keyed.server, "lab", keyed.admin, parameters={"kinds": "job"}) as admin,
@@ -352,7 +352,7 @@ def test_listeners_do_not_keep_the_service_from_stopping(tmp_path: Path) -> None
 
 
 @pytest.mark.thorough
-def test_two_hundred_queries_from_eight_callers_are_each_told_once(quick: Server, lab: str) -> None:
+def test_two_hundred_queries_from_eight_callers_have_one_event_each(quick: Server, lab: str) -> None:
     with listening(quick, lab, parameters={"kinds": "query", "pictures": "true"}) as ear:
 
         def ask(caller: int) -> None:

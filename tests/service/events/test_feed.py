@@ -17,7 +17,7 @@ from service.errors.faults import TooManyListeners
 from service.events import events as module
 from service.events import feed as feeds
 from service.events.events import LINGER_SECONDS, Events
-from service.events.feed import Feed, Kept, Listener
+from service.events.feed import Feed, FeedEvent, Listener
 from service.events.schemas import MapEvent, QueryEvent
 from tests.service.scenes import jpeg
 
@@ -29,7 +29,7 @@ def add(feed: Feed, count: int = 1, size: int = 10) -> None:
     for _ in range(count):
         text = json.dumps({"number": feed.number + 1, "filler": "x" * size})
         with feed.lock:
-            feed.add(Kept(0, "map", None, frozenset({"lab"}), text, text, None))
+            feed.add(FeedEvent(0, "map", None, frozenset({"lab"}), text, text, None))
 
 
 def numbers(listener: Listener, most: int = 100) -> tuple[int | None, list[int]]:
@@ -68,30 +68,30 @@ async def test_an_id_that_is_not_known_is_answered_with_an_unknown_count(strange
 
 
 async def test_the_oldest_events_go_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feeds, "MOST_KEPT", 10)
+    monkeypatch.setattr(feeds, "MOST_EVENTS", 10)
     monkeypatch.setattr(feeds, "MOST_BYTES", 2000)
     feed = Feed(threading.Lock())
     listener = Listener(feed, None, False)
     add(feed, 25)
     assert numbers(listener) == (15, list(range(16, 26)))
     add(feed, 4, size=400)
-    assert feed.size <= 2000 and feed.size == sum(event.size for event in feed.kept)
+    assert feed.size <= 2000 and feed.size == sum(event.size for event in feed.latest)
     add(feed, 1, size=5000)
-    assert len(feed.kept) == 1, "an event that is larger than the limit is told all the same"
+    assert len(feed.latest) == 1, "an event that is larger than the limit is told all the same"
     assert numbers(listener) == (4, [30])
 
 
 @given(
     st.lists(st.one_of(st.tuples(st.just("add"), st.integers(1, 30)), st.tuples(st.just("read"), st.integers(1, 12))))
 )
-def test_whatever_the_pace_nothing_is_told_twice_or_lost_without_a_count(steps: list[tuple[str, int]]) -> None:
+def test_whatever_the_pace_no_event_is_sent_twice_or_lost_without_a_count(steps: list[tuple[str, int]]) -> None:
     async def run() -> None:
         feed = Feed(threading.Lock())
         add(feed, 3)
         listener = Listener(feed, None, False)
         expected = 4  # the number of the next event
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(feeds, "MOST_KEPT", 17)
+            patched.setattr(feeds, "MOST_EVENTS", 17)
             for what, amount in [*steps, ("read", 1000)]:
                 if what == "add":
                     add(feed, amount)
@@ -109,7 +109,7 @@ def edited(map_id: str = "lab") -> MapEvent:
     return MapEvent.now(map_id, change="edited", revision=2)
 
 
-async def test_nothing_is_kept_of_a_map_without_listeners() -> None:
+async def test_no_event_of_a_map_without_listeners_is_stored() -> None:
     events = Events()
     events.publish(edited())
     assert not events.heard("lab")
@@ -120,7 +120,7 @@ async def test_nothing_is_kept_of_a_map_without_listeners() -> None:
         assert numbers(listener) == (0, [1])
 
 
-async def test_events_are_kept_for_a_while_after_the_last_listener_has_left() -> None:
+async def test_events_are_stored_for_a_while_after_the_last_listener_has_left() -> None:
     now = 0.0
     events = Events(clock=lambda: now)
     with events.listening("lab") as listener:
@@ -237,7 +237,7 @@ async def test_frames_whose_pictures_are_being_made_are_bounded(monkeypatch: pyt
     events.stop_soon()
 
 
-async def test_who_asked_is_for_the_eyes_of_higher_roles() -> None:
+async def test_callers_are_for_the_eyes_of_higher_roles() -> None:
     events = Events()
     with events.listening("lab") as listener:
         events.publish(asked("front"))

@@ -8,7 +8,7 @@ import pytest
 
 from core.maps import MapSettings
 from service.access.roles import OWNER
-from service.events.feed import MOST_KEPT
+from service.events.feed import MOST_EVENTS
 from service.events.schemas import MapEvent
 from service.maps.event_routes import EventParameters, MapStream
 from tests.service.engines import ENCODER, runtime_at
@@ -23,17 +23,17 @@ async def test_a_listener_that_does_not_read_delays_nobody_and_learns_what_it_mi
         map_ = engine.maps.create("lab", ENCODER, 8, MapSettings())
         texts = MapStream(engine, map_, EventParameters(), lambda: OWNER).texts(None)
         heard = list(events_of((await anext(texts)).splitlines()))
-        for number in range(MOST_KEPT + 500):
+        for number in range(MOST_EVENTS + 500):
             engine.events.publish(MapEvent.now("lab", change="edited", revision=number))
         engine.events.end("lab")
         async for text in texts:
             heard += events_of(text.splitlines())
     names = [one.name for one in heard]
-    assert names == ["listening", "missed", *["map"] * MOST_KEPT]
+    assert names == ["listening", "missed", *["map"] * MOST_EVENTS]
     assert heard[1].data["count"] == 500
-    assert [one.data["revision"] for one in heard[2:]] == list(range(500, MOST_KEPT + 500))
+    assert [one.data["revision"] for one in heard[2:]] == list(range(500, MOST_EVENTS + 500))
     numbers = [int(one.id.rpartition("-")[2]) for one in heard]
-    assert numbers == [0, *range(500, MOST_KEPT + 501)], "who resumes after 'missed' misses nothing more"
+    assert numbers == [0, *range(500, MOST_EVENTS + 501)], "who resumes after 'missed' misses nothing more"
 
 
 async def test_every_event_is_one_line_of_json_whatever_it_says(tmp_path: Path) -> None:

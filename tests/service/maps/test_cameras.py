@@ -139,7 +139,7 @@ def test_the_camera_of_a_place_cannot_be_patched(server: Server, map_id: str) ->
         "everything",
     ],
 )
-def test_a_bad_mask_is_refused_and_nothing_is_kept(client: httpx.Client, map_id: str, mask: Any) -> None:
+def test_a_bad_mask_is_refused_and_nothing_is_stored(client: httpx.Client, map_id: str, mask: Any) -> None:
     assert_problem(put(client, map_id, "front", mask), 422, "invalid-request")
     assert client.get(f"/v1/maps/{map_id}/cameras").json()["items"] == []
 
@@ -174,7 +174,7 @@ def test_a_camera_keeps_its_intrinsics(client: httpx.Client, map_id: str) -> Non
         ({"skew": 0.1}, "skew"),
     ],
 )
-def test_impossible_intrinsics_are_refused_and_nothing_is_kept(
+def test_impossible_intrinsics_are_refused_and_nothing_is_stored(
     client: httpx.Client, map_id: str, change: dict[str, Any], told: str
 ) -> None:
     path = f"/v1/maps/{map_id}/cameras/front"

@@ -123,7 +123,7 @@ def _size(content: bytes) -> int:
     return int(content[124:135], 8)
 
 
-def test_an_export_that_is_not_kept(server: Server, source: str) -> None:
+def test_an_export_that_is_not_stored(server: Server, source: str) -> None:
     assert_problem(export(server, source, range="bytes=5-", if_match='"0123"'), 412, "export-gone")
     whole = export(server, source, range="bytes=5-", if_range='"0123"')
     assert whole.status_code == 200 and len(whole.content) == int(whole.headers["content-length"])

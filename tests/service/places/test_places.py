@@ -254,7 +254,7 @@ def test_thumbnails(server: Server) -> None:
     assert_problem(server.client.get(f"/v1/maps/{kept['none']}/places/p/thumbnail"), 404, "no-thumbnail")
 
 
-def test_headings_are_kept_within_a_turn(server: Server, map_id: str) -> None:
+def test_headings_are_normalized_to_a_turn(server: Server, map_id: str) -> None:
     pose = server.enrol(map_id, "p", jpeg(1), x=0, y=0, heading=-90).json()["pose"]
     assert math.isclose(pose["heading"], 270)
 

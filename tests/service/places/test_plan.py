@@ -106,12 +106,12 @@ def test_a_plan_that_is_too_long_names_a_step(
     made = plans.Plans()
     with pytest.raises(PlanTooLarge, match="step=3 "):
         made.make(lab, 1)
-    assert made.make(lab, 3) is made.kept(lab, 3)
+    assert made.make(lab, 3) is made.cached(lab, 3)
     monkeypatch.setattr(plans, "MOST_BYTES", len(made.make(lab, 3).compressed) + 1)
     made.make(lab, 4)
-    assert made.kept(lab, 3) is None and made.kept(lab, 4) is not None and made._bytes <= plans.MOST_BYTES
+    assert made.cached(lab, 3) is None and made.cached(lab, 4) is not None and made._bytes <= plans.MOST_BYTES
     lab.forget("p0")
-    assert made.kept(lab, 4) is None
+    assert made.cached(lab, 4) is None
     atlas.close()
     for wrong in ("0", "-1", "x"):
         assert_problem(server.client.get(f"/v1/maps/{map_id}/plan", params={"step": wrong}), 422, "invalid-request")
@@ -127,11 +127,11 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
     atlas.close()
 
 
-def test_only_the_plans_that_were_asked_for_last_are_kept(tmp_path: Path) -> None:
+def test_only_the_plans_that_were_requested_last_are_cached(tmp_path: Path) -> None:
     atlas = Atlas(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     made, steps = plans.Plans(), range(1, plans.MOST_KEPT + 3)
     for step in steps:
         made.make(lab, step)
-    assert [step for step in steps if made.kept(lab, step) is not None] == list(steps[2:])
+    assert [step for step in steps if made.cached(lab, step) is not None] == list(steps[2:])
     atlas.close()

@@ -67,7 +67,7 @@ def label(server: Server, map_id: str, frame: int, **order: Any) -> dict[str, An
 
 
 @pytest.mark.thorough
-def test_a_map_keeps_nothing_unless_it_was_told_to(reviewed: Server) -> None:
+def test_a_map_stores_no_frames_unless_it_is_set_to(reviewed: Server) -> None:
     made = reviewed.create_map("silent")
     assert made["review"] is None
     assert reviewed.query("silent", jpeg(1))["verdict"] == "unknown"
@@ -104,7 +104,7 @@ def test_the_setting_is_edited_field_by_field(reviewed: Server, lab: str) -> Non
     assert_problem(refused, 422, "invalid-request")
 
 
-def test_a_kept_frame_tells_how_it_was_answered(reviewed: Server, lab: str) -> None:
+def test_a_stored_frame_has_its_answer(reviewed: Server, lab: str) -> None:
     frame = encoded(seen_again(scene(2)))
     answer = reviewed.client.post(
         f"/v1/maps/{lab}/query", content=frame, headers={**typed(frame), "X-Request-Id": "q-1"}
@@ -186,7 +186,7 @@ def test_an_edit_that_is_stored_is_no_error_although_frames_stay(reviewed: Serve
     (reviewed.data_dir / "maps" / "unreadable" / "review.sqlite").mkdir()  # no file can be opened there
     edited = reviewed.client.patch("/v1/maps/unreadable", json={"review": {"most_frames": 1}})
     assert edited.status_code == 200 and edited.json()["review"]["most_frames"] == 1, edited.text
-    assert "kept frames beyond the new limits stay" in reviewed.log_file.read_text()
+    assert "frames stored beyond the new limits stay" in reviewed.log_file.read_text()
 
 
 def test_bad_labels_are_refused_and_change_nothing(reviewed: Server, lab: str) -> None:
@@ -207,7 +207,7 @@ def test_bad_labels_are_refused_and_change_nothing(reviewed: Server, lab: str) -
 
 
 @pytest.mark.thorough
-def test_sessions_and_batches_are_kept_too_and_survive_a_kill(tmp_path: Path) -> None:
+def test_frames_of_sessions_and_batches_are_stored_too_and_survive_a_kill(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
     server = Server(tmp_path, {"encoder": COARSE}).wait()
     server.create_map("lab", keep="none", review={"verdicts": ["unknown"]})

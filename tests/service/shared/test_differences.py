@@ -27,7 +27,7 @@ def test_all_that_should_be_alike_are_settings() -> None:
     assert set(COMMON) <= set(Settings.model_fields)
 
 
-def test_differences_are_told_until_they_end(database: SharedDatabase, tmp_path: Path) -> None:
+def test_differences_are_reported_until_they_end(database: SharedDatabase, tmp_path: Path) -> None:
     replicas, services = [], []
     for name, rate in (("one", 5.0), ("other", 7.0)):
         models = tmp_path / f"models-{name}"

@@ -63,7 +63,7 @@ def traits(key: Key) -> tuple[object, ...]:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(STEPS)
-def test_they_are_kept_as_in_a_file(
+def test_they_are_stored_as_in_a_file(
     database: SharedDatabase,
     tmp_path_factory: pytest.TempPathFactory,
     steps: list[tuple[str, str, str, frozenset[str] | None, bool]],

@@ -68,7 +68,7 @@ def test_each_refusal_is_said_and_ends_when_it_is_put_right(guarded: Guarded, tm
     guarded.execute("GRANT CREATE ON SCHEMA public TO robot", "GRANT CREATE ON DATABASE postgres TO robot")
     says("Milvus has a certificate that cannot be trusted")
     trusted[1].unlink()
-    says("Milvus cannot be asked")
+    says("Milvus cannot be reached")
     shutil.copy(guarded.authority, trusted[1])
     says("Milvus refuses the token")
     milvus.create_user("robot", TOKEN_PASSWORD)

@@ -27,7 +27,7 @@ os.write(2, b"as before\\n")
 
 
 @pytest.mark.thorough
-def test_lines_are_logged_cut_and_told_apart() -> None:
+def test_lines_are_logged_cut_and_distinguished() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, timeout=300, check=True)
     *said, last = done.stderr.decode().splitlines()
     said.remove("from Python")

@@ -62,7 +62,7 @@ def test_a_traceback_stays_on_one_line() -> None:
 
 
 @pytest.mark.parametrize("error", [RuntimeError("made\nup"), asyncio.CancelledError()])
-def test_a_defect_is_logged_once_with_its_traceback_and_a_request_given_up_is_told_so(
+def test_a_defect_is_logged_once_with_its_traceback_and_a_request_given_up_as_such(
     error: BaseException, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def broken(scope: Scope, receive: Receive, send: Send) -> None:

@@ -68,7 +68,7 @@ def test_it_is_answered_and_logged(server: Server) -> None:
     assert "traceresponse" not in other.headers and "trace_id" not in server.logged_request("untraced")
 
 
-def test_a_job_is_logged_with_the_trace_that_asked_for_it(server: Server) -> None:
+def test_a_job_is_logged_with_the_trace_of_its_caller(server: Server) -> None:
     server.create_map("traced")
     headers = {"traceparent": f"00-{TRACE}-{SPAN}-01", "X-Request-Id": "asks-for-a-job"}
     asked = server.client.post("/v1/maps/traced/prune", json={}, headers=headers)

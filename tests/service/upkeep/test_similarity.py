@@ -94,7 +94,7 @@ def test_the_way_and_the_truth_agree(compared: Server) -> None:
     assert short["truth"] is None and short["stretches"] == [] and short["rows"] == 2
 
 
-def test_what_alignment_stored_is_told(compared: Server) -> None:
+def test_the_result_of_alignment_is_shown(compared: Server) -> None:
     job = asked(compared, "lab", "align", sequence="monday", **{"with": ["tuesday"]})
     assert finished(compared, job)["state"] == "succeeded"
     about = similarity(compared)
@@ -133,7 +133,7 @@ class Plain:
 
 
 @pytest.mark.thorough
-def test_the_latest_matrices_are_kept_and_follow_the_traverses(tmp_path: Path) -> None:
+def test_the_latest_matrices_are_cached_and_follow_the_traverses(tmp_path: Path) -> None:
     plain = cast(Encoder, Plain())
     with runtime_at(tmp_path) as runtime:
         map_ = runtime.engine.maps.create("lab", ENCODER, DIMENSION)

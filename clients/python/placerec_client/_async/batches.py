@@ -24,10 +24,10 @@ Outcome = TypeVar("Outcome")
 
 
 class AsyncBatch(Generic[Item, Outcome]):
-    """A batch: what is known of some of its frames already, and the frames that are to be sent."""
+    """A batch: the outcomes that are already known, and the frames to send."""
 
-    def __init__(self, told: Sequence[Outcome], items: Sequence[Item]) -> None:
-        self.told, self.items = told, items
+    def __init__(self, known: Sequence[Outcome], items: Sequence[Item]) -> None:
+        self.known, self.items = known, items
 
 
 class AsyncSent(Generic[Outcome]):
@@ -97,14 +97,14 @@ class AsyncQueries(AsyncBatches[tuple[Frame, bytes], Located]):
 
     async def read(self) -> AsyncBatch[tuple[Frame, bytes], Located] | None:
         """Read frames until the batch is full; one that cannot be read ends it."""
-        told: list[Located] = []
-        items = await in_thread(self._read, told)
-        return AsyncBatch(told, items) if told or items else None
+        failed: list[Located] = []
+        items = await in_thread(self._read, failed)
+        return AsyncBatch(failed, items) if failed or items else None
 
-    def _read(self, told: list[Located]) -> list[tuple[Frame, bytes]]:
+    def _read(self, failed: list[Located]) -> list[tuple[Frame, bytes]]:
         items: list[tuple[Frame, bytes]] = []
         size = 0
-        while len(items) < self.pace.frames and size < BATCH_BYTES and not told:
+        while len(items) < self.pace.frames and size < BATCH_BYTES and not failed:
             try:
                 frame = next(self._frames)
             except StopIteration:
@@ -113,7 +113,7 @@ class AsyncQueries(AsyncBatches[tuple[Frame, bytes], Located]):
                 items.append((frame, frame_bytes(frame)))
                 size += len(items[-1][1])
             except InvalidFrame as error:
-                told.append(Located(frame, None, error))
+                failed.append(Located(frame, None, error))
         return items
 
     def begin(
@@ -122,7 +122,7 @@ class AsyncQueries(AsyncBatches[tuple[Frame, bytes], Located]):
         """Begin to send a batch."""
 
         async def send() -> list[Located]:
-            return [*await self._send(batch.items), *batch.told]
+            return [*await self._send(batch.items), *batch.known]
 
         return AsyncSent(len(batch.items), Task(send))
 

@@ -35,7 +35,7 @@ class AsyncClient:
         timeout: seconds to wait for one answer.
         retry: for how long a request is sent again while the service is overloaded, restarts or cannot be reached.
         transport: of httpx, to reach the service otherwise than by the network.
-        name: what errors call the service; its URL if left out.
+        name: of the service in errors; its URL if left out.
 
     Attributes:
         maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.

@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 
 async def sleep(seconds: float) -> None:
-    """Wait so long."""
+    """Wait for this time."""
     await asyncio.sleep(seconds)
 
 
@@ -30,7 +30,7 @@ async def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
 
 
 async def within(seconds: float, work: Callable[[], Awaitable[Result]]) -> Result:
-    """The result of work that is waited for so long.
+    """The result of work, awaited for a limited time.
 
     Raises:
         TimeoutError: there is none yet; the work is broken off.
@@ -116,7 +116,7 @@ class Task(Generic[Result]):
         self._task.cancel()
         await asyncio.wait({self._task})
         if not self._task.cancelled():
-            self._task.exception()  # seen, so that nobody is told that it was not
+            self._task.exception()  # retrieved, so that asyncio does not report it
 
 
 Lock = asyncio.Lock
@@ -126,7 +126,7 @@ async def acquire(lock: Lock, seconds: float | None) -> None:
     """Take a lock, which those who ask for it get in their order.
 
     Raises:
-        TimeoutError: it has not become free within so many seconds; None waits for any time.
+        TimeoutError: it has not become free within ``seconds``; None waits for any time.
     """
     async with asyncio.timeout(seconds):
         await lock.acquire()

@@ -41,7 +41,7 @@ class AsyncKeys(OldNames, revoke="delete"):
 
         Args:
             name: whose key it is.
-            role: what it may do.
+            role: of its holder.
             lock_out: whether it may be that nobody has the role admin afterwards.
             options: such as ``maps`` and ``expires_at``.
         """

@@ -24,7 +24,7 @@ class AsyncLanes(httpx.AsyncBaseTransport):
 
     Args:
         url: of the service.
-        idle: seconds for which a connection is kept without a request.
+        idle: seconds for which a connection stays open without a request.
     """
 
     def __init__(self, url: httpx.URL, idle: float) -> None:
@@ -96,7 +96,7 @@ def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     """The proxy that the environment names for a service, by the rules of httpx; None for none.
 
     Raises:
-        ConnectionFailed: what the environment names is no proxy.
+        ConnectionFailed: the environment names no usable proxy.
     """
     named = getproxies()
     found = named.get(url.scheme) or named.get("all")

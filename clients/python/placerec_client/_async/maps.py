@@ -172,7 +172,7 @@ class AsyncMap:
         return await self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
 
     async def compare(self, query: str, reference: str) -> models.SimilarityView:
-        """Compare two traverses frame by frame: what they share, and the size and scale of the matrix of scores."""
+        """Compare two traverses by frames: the shared stretches, and the size and scale of their matrix of scores."""
         params = {"query": query, "reference": reference}
         return await self.connection.ask(models.SimilarityView, "GET", self.path + "/similarity", params=params)
 
@@ -295,7 +295,7 @@ class AsyncMap:
         """Send many frames in one request, and return the job that enrols them.
 
         Args:
-            places: all are read twice; none of them is kept in memory.
+            places: all are read twice; none of them is held in memory.
             align: whether the job then finds which frames show places that the map had already.
             encoder: name or identity that the map must have.
 
@@ -455,7 +455,7 @@ class AsyncMap:
         Args:
             path: of the file; until it is complete and compared with its checksums, its name ends with ``.part``.
             overwrite: whether an existing file is replaced.
-            known: what an earlier call returned; nothing is downloaded if the map has not changed since.
+            known: the result of an earlier call; nothing is downloaded if the map has not changed since.
             progress: is called with the bytes that are there and their number.
 
         Returns:

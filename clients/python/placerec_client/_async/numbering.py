@@ -21,7 +21,7 @@ class AsyncNumbering:
     Args:
         connection: to the service.
         path: of the session.
-        first: the next number; None for a session that was begun elsewhere, which is asked for its last number.
+        first: the next number; None for a session that was begun elsewhere, whose last number is requested.
     """
 
     def __init__(self, connection: AsyncConnection, path: str, first: int | None) -> None:
@@ -30,7 +30,7 @@ class AsyncNumbering:
 
     @asynccontextmanager
     async def turn(self, deadline: float | None) -> AsyncIterator[Callable[[], float | None]]:
-        """Wait for the frames before; yield what tells the seconds that are left until the deadline, None without one.
+        """Wait for the frames before; yield a function: the seconds left until the deadline, or None.
 
         A frame that the service refuses within leaves the next number as it was.
 
@@ -50,7 +50,7 @@ class AsyncNumbering:
             yield lambda: None if deadline is None else max(deadline - round(time.monotonic() - began, 3), 0.0)
         except (Problem, InvalidParameter) as error:
             if isinstance(error, problems.FrameOutOfOrder) and self._next != before:
-                self._next = None  # another one has sent frames since: the service is asked how far it is
+                self._next = None  # another one has sent frames since: the service is queried for its last number
             elif (
                 getattr(error, "status", None) not in OVERLOADED
             ):  # before which an attempt may have been lost and counted
@@ -64,7 +64,7 @@ class AsyncNumbering:
 
         Raises:
             InvalidParameter: the caller's own is no whole number.
-            DeadlineExceeded: the service did not tell its last number within the seconds that were left.
+            DeadlineExceeded: the service did not send its last number within the seconds that were left.
         """
         given = options.get("frame")
         if given is None:

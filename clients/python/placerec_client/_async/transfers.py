@@ -21,7 +21,7 @@ PIECE_BYTES = 16 << 20
 
 CHUNK_BYTES = 1 << 20
 RESTARTS = 3
-"""How often a download begins again because the service no longer keeps the export of which a part is here."""
+"""How often a download begins again because the service no longer stores the partly downloaded export."""
 
 PARTIAL = ".part"
 Progress = Callable[[int, int], object]

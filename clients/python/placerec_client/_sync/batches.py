@@ -25,10 +25,10 @@ Outcome = TypeVar("Outcome")
 
 
 class Batch(Generic[Item, Outcome]):
-    """A batch: what is known of some of its frames already, and the frames that are to be sent."""
+    """A batch: the outcomes that are already known, and the frames to send."""
 
-    def __init__(self, told: Sequence[Outcome], items: Sequence[Item]) -> None:
-        self.told, self.items = told, items
+    def __init__(self, known: Sequence[Outcome], items: Sequence[Item]) -> None:
+        self.known, self.items = known, items
 
 
 class Sent(Generic[Outcome]):
@@ -96,14 +96,14 @@ class Queries(Batches[tuple[Frame, bytes], Located]):
 
     def read(self) -> Batch[tuple[Frame, bytes], Located] | None:
         """Read frames until the batch is full; one that cannot be read ends it."""
-        told: list[Located] = []
-        items = in_thread(self._read, told)
-        return Batch(told, items) if told or items else None
+        failed: list[Located] = []
+        items = in_thread(self._read, failed)
+        return Batch(failed, items) if failed or items else None
 
-    def _read(self, told: list[Located]) -> list[tuple[Frame, bytes]]:
+    def _read(self, failed: list[Located]) -> list[tuple[Frame, bytes]]:
         items: list[tuple[Frame, bytes]] = []
         size = 0
-        while len(items) < self.pace.frames and size < BATCH_BYTES and not told:
+        while len(items) < self.pace.frames and size < BATCH_BYTES and not failed:
             try:
                 frame = next(self._frames)
             except StopIteration:
@@ -112,14 +112,14 @@ class Queries(Batches[tuple[Frame, bytes], Located]):
                 items.append((frame, frame_bytes(frame)))
                 size += len(items[-1][1])
             except InvalidFrame as error:
-                told.append(Located(frame, None, error))
+                failed.append(Located(frame, None, error))
         return items
 
     def begin(self, batch: Batch[tuple[Frame, bytes], Located], before: Sent[Located] | None) -> Sent[Located]:
         """Begin to send a batch."""
 
         def send() -> list[Located]:
-            return [*self._send(batch.items), *batch.told]
+            return [*self._send(batch.items), *batch.known]
 
         return Sent(len(batch.items), Task(send))
 

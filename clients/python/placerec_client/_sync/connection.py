@@ -36,10 +36,10 @@ Content = bytes | Callable[[], Iterator[bytes]] | None
 
 CONNECT_SECONDS = 5.0
 IDLE_SECONDS = 30.0
-"""How long a connection is kept without a request; the service keeps it for longer."""
+"""How long a connection stays open without a request; the service's limit is longer."""
 
 SILENCE_SECONDS = 30.0
-"""After how long a stream without a byte is taken for lost; the service sends a comment every ten seconds."""
+"""After how long a stream without a byte counts as lost; the service sends a comment every ten seconds."""
 
 LEAST_SECONDS, MOST_SECONDS = 0.001, 3600.0
 """Bounds of X-Request-Timeout."""
@@ -50,7 +50,7 @@ PAGE = 500
 KNOWN_URLS = 1000
 
 HOST = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[^\s:/?#@\[\]]+)(:[0-9]+)?(/[^\s?#]*)?")
-"""What is taken for the URL of a service without its scheme: a host, perhaps with a port and a path."""
+"""The URL of a service without its scheme: a host, perhaps with a port and a path."""
 
 KEY = re.compile(r"[!-~]+")
 """The visible characters of ASCII, of which a header may be made."""
@@ -110,7 +110,7 @@ class Connection:
         return self.patient(replace(retry, patience=max(patience, retry.patience))) if retry.patience else self
 
     def close(self) -> None:
-        """Close all connections; what is asked afterwards is refused."""
+        """Close all connections; later requests are refused."""
         self._closed.set()
         self._transport.close()
 
@@ -142,7 +142,7 @@ class Connection:
             content: the body, or what makes its pieces anew for each attempt.
             json: a body instead, as JSON.
             media_type: of the body.
-            deadline: seconds from now after which an answer is of no use. The service is told, and drops the request
+            deadline: seconds from now after which an answer is of no use. The service gets it, and drops the request
                 when it is over. None: only ``timeout`` and the patience of ``retry`` hold.
             request_id: of all attempts; made if left out.
             final: slugs of problems after which the request is not sent again.
@@ -247,7 +247,7 @@ class Connection:
         return exceeded
 
     def url_of(self, path: str) -> httpx.URL:
-        """The URL of a path with its query string; parsing one takes time, so those that come again are kept."""
+        """The URL of a path with its query string; parsing one takes time, so they are cached."""
         found = self._urls.get(path)
         if found is None:
             if len(self._urls) >= KNOWN_URLS:

@@ -36,7 +36,7 @@ from placerec_client.frames import media_type
 from placerec_client.requests import Part, dumps, form, form_type, part_end, part_head
 
 Answered = list[tuple[Read, models.BatchResult | None, PlacerecError | None]]
-"""What the service says of each frame; nothing of one that could not be read and was not sent."""
+"""The service's answer for each frame; None for one that could not be read and was not sent."""
 
 
 class Enrolment(Batches[Read, Enrolled]):
@@ -44,8 +44,8 @@ class Enrolment(Batches[Read, Enrolled]):
 
     Args:
         path: of the places of the map.
-        places: what is to be enrolled; read in a thread, a batch ahead.
-        known: ids that the map has already; of these frames the service is first asked whether it has their bytes.
+        places: the frames to enrol; read in a thread, a batch ahead.
+        known: ids that the map has already; for these frames a first request finds out whether it has their bytes.
         options: of the request, such as ``encoder``.
     """
 
@@ -66,27 +66,27 @@ class Enrolment(Batches[Read, Enrolled]):
     def read(self) -> Batch[Read, Enrolled] | None:
         """Read the next frames; of known ones ask whether they have to be sent."""
         if not self._needed:
-            asked = in_thread(self._read_known)
-            if asked:
-                return Batch(self._ask(asked), [])
+            known = in_thread(self._read_known)
+            if known:
+                return Batch(self._ask(known), [])
         batch = in_thread(self._read_batch)
         return Batch([], batch) if batch else None
 
-    def _ask(self, asked: Sequence[Read]) -> list[Enrolled]:
+    def _ask(self, known: Sequence[Read]) -> list[Enrolled]:
         """Update the places that have these frames; keep those that have to be sent."""
-        told: list[Enrolled] = []
-        for read, item, error in self._post(asked, {}):
+        settled: list[Enrolled] = []
+        for read, item, error in self._post(known, {}):
             if isinstance(error, problems.FrameNeeded):
                 self._needed.append(read.place)
             else:
-                told.append(outcome_of(read, item, error, uploaded=False))
-        return told
+                settled.append(outcome_of(read, item, error, uploaded=False))
+        return settled
 
     def _read_known(self) -> list[Read]:
-        asked: list[Read] = []
-        while len(asked) < KNOWN_AT_ONCE and (place := self._peek()) is not None and self._knows(place):
-            asked.append(read_place(self._waiting.popleft(), digest=True))
-        return asked
+        known: list[Read] = []
+        while len(known) < KNOWN_AT_ONCE and (place := self._peek()) is not None and self._knows(place):
+            known.append(read_place(self._waiting.popleft(), digest=True))
+        return known
 
     def _read_batch(self) -> list[Read]:
         batch: list[Read] = []
@@ -118,7 +118,7 @@ class Enrolment(Batches[Read, Enrolled]):
         name = secrets.token_hex(8)
 
         def send() -> list[Enrolled]:
-            return [*batch.told, *self._send(batch.items, name, before)]
+            return [*batch.known, *self._send(batch.items, name, before)]
 
         sent = Named(len(batch.items), Task(send))
         sent.name = name

@@ -25,7 +25,7 @@ class Lanes(httpx.BaseTransport):
 
     Args:
         url: of the service.
-        idle: seconds for which a connection is kept without a request.
+        idle: seconds for which a connection stays open without a request.
     """
 
     def __init__(self, url: httpx.URL, idle: float) -> None:
@@ -97,7 +97,7 @@ def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     """The proxy that the environment names for a service, by the rules of httpx; None for none.
 
     Raises:
-        ConnectionFailed: what the environment names is no proxy.
+        ConnectionFailed: the environment names no usable proxy.
     """
     named = getproxies()
     found = named.get(url.scheme) or named.get("all")

@@ -77,7 +77,7 @@ def test_what_comes_back_is_what_was_there(
 def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
     with full._writing() as write:
         write.connection.execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE place = 1")
-    with pytest.raises(StorageFailure, match="The keypoints kept of place 'p0' do not match their checksum"):
+    with pytest.raises(StorageFailure, match="The stored keypoints of place 'p0' do not match their checksum"):
         full.exporter.write(tmp_path / "kept.tar")
     assert not (tmp_path / "kept.tar").exists()
 
@@ -245,7 +245,7 @@ def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, a
     shutil.rmtree(directory)
 
 
-def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_error_is_reported(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite ends some transactions by itself, when the disk fails."""
 
     def ended(connection: sqlite3.Connection) -> None:

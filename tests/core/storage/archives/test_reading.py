@@ -238,7 +238,7 @@ def test_a_manifest_as_long_as_they_come(content: bytes) -> None:
     assert read_manifest(written).groups == 2048
 
 
-def test_a_later_version_is_told_from_damage(content: bytes, tmp_path: Path) -> None:
+def test_a_later_version_is_distinguished_from_damage(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(manifest_with(version=VERSION + 1, novel={"field": 1})(content))
     with pytest.raises(ArchiveTooNew, match=f"format {VERSION + 1}, this one knows {VERSION}"), Archive(path):

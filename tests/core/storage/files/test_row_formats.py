@@ -25,7 +25,7 @@ def descriptors(count: int, dimension: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("dimension", [1, 16, BLOCK, BLOCK + 1, 1000])
-def test_what_is_kept_has_the_type_that_a_record_gives_it(precision: Precision, dimension: int) -> None:
+def test_stored_values_have_the_types_of_a_record(precision: Precision, dimension: int) -> None:
     kept = pack_descriptors(descriptors(3, dimension), precision)
     (dtype, shape), _ = resting_types(precision, dimension, (3, 5))
     assert (kept.dtype, kept.shape) == (np.dtype(dtype), (3, *shape))
@@ -66,7 +66,7 @@ def test_local_descriptors_come_back(precision: Precision, shape: tuple[int, int
         assert (np.abs(back.astype(int) - given) <= steps / 2 + 1).all()
 
 
-def test_small_local_values_are_kept_exactly() -> None:
+def test_small_local_values_are_stored_exactly() -> None:
     given = np.arange(-7, 8, dtype=np.int8).reshape(1, 3, 5)
     np.testing.assert_array_equal(unpack_local(pack_local(given, "compressed"), "compressed", (3, 5)), given)
 
@@ -74,7 +74,7 @@ def test_small_local_values_are_kept_exactly() -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("queries", [1, 7])
 @pytest.mark.parametrize("count", [0, 1, 40])
-def test_inner_products_are_those_of_what_is_kept(precision: Precision, queries: int, count: int) -> None:
+def test_inner_products_are_those_of_the_stored_values(precision: Precision, queries: int, count: int) -> None:
     asked = np.array([descriptor_of(f"query {i}", 300) for i in range(queries)])
     kept = pack_descriptors(descriptors(count, 300).reshape(count, 300), precision)
     expected = asked @ unpack_descriptors(kept, precision, 300).T

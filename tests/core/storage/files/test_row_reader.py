@@ -36,7 +36,7 @@ EVERY: list[Precision] = ["half", "compressed"]
 
 @pytest.mark.parametrize("precision", EVERY)
 @pytest.mark.parametrize("rows", [[0], [9, 0, 4, 4, 3], list(range(10)), []])
-def test_rows_come_in_the_order_asked_for(tmp_path: Path, precision: Precision, rows: list[int]) -> None:
+def test_rows_come_in_the_order_requested(tmp_path: Path, precision: Precision, rows: list[int]) -> None:
     reader, records = filled(tmp_path, precision)
     wanted, named = np.array(rows, np.int64), records["checksum"][rows] if rows else np.empty(0, np.uint32)
     layout = layout_of(precision)

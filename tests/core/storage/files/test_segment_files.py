@@ -84,7 +84,7 @@ def test_the_checksum_of_a_row_is_of_all_that_it_holds() -> None:
     assert checksum_of(LAYOUT, descriptor, cells, 7) == zlib.crc32(struct.pack("<II", *parts))
 
 
-def test_only_the_rows_asked_for_count(tmp_path: Path) -> None:
+def test_only_the_requested_rows_count(tmp_path: Path) -> None:
     checksums = write(tmp_path, 0, 3)
     with (tmp_path / segment_name(0)).open("ab") as file:
         file.write(b"half a record")

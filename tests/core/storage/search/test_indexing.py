@@ -296,7 +296,7 @@ def of_another_group(path: Path) -> None:
         ("codes-000003.index", garbage),
     ],
 )
-def test_a_file_that_is_no_good_is_told_and_made_again(
+def test_a_bad_file_is_logged_and_made_again(
     atlas: Atlas, directory: Path, folder: Path, name: str, spoil: Callable[[Path], None]
 ) -> None:
     make(atlas, index="compact")

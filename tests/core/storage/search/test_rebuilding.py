@@ -131,7 +131,7 @@ def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: py
     assert [type(error) for error in failed] == [UnknownMap]
 
 
-def test_what_cannot_be_built_is_told_and_tried_again(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_to_build_is_logged_and_tried_again(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = make(atlas)
 
     def fail(*_: object) -> None:

@@ -195,7 +195,7 @@ def test_a_second_run_takes_what_was_measured(placerec: Placerec, traverses: tup
     assert not mended["cached"] and rows_again == rows
 
 
-def test_a_cache_that_cannot_be_written_is_told(
+def test_a_cache_that_cannot_be_written_is_reported(
     placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")

@@ -37,7 +37,7 @@ def test_weights_are_parsed() -> None:
             parse_weights(wrong)
 
 
-def test_systems_come_once_in_the_order_asked() -> None:
+def test_systems_come_once_in_the_order_requested() -> None:
     built = build_systems(["seqslam", "hog", "seqslam"], False, {}, EncoderCatalogue())
     assert [system.about.name for system in built] == ["seqslam", "hog"]
 
@@ -52,7 +52,7 @@ def test_all_are_those_that_need_no_file() -> None:
     assert build_systems(["hog"], True, {}, models)[0].about.name == "hog"
 
 
-def test_missing_weights_are_told_in_a_sentence_before_anything_runs(placerec: Placerec, tmp_path: Path) -> None:
+def test_missing_weights_are_reported_in_a_sentence_before_anything_runs(placerec: Placerec, tmp_path: Path) -> None:
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / "0.jpg").write_bytes(jpeg(0))
     both = ("--reference", tmp_path / "r", "--query", tmp_path / "r", "--tolerance", 0, "--encoder", "hog")

@@ -221,7 +221,7 @@ def test_vpr_tutorial_leaves_the_neighbours_out(tmp_path: Path) -> None:
     assert [pair.truth[3].tolist(), pair.excluded[3].tolist(), pair.excluded[0].tolist()] == [[3], [2], []]
 
 
-def test_a_drive_is_asked_against_another_time(tmp_path: Path) -> None:
+def test_a_drive_queries_the_frames_of_another_time(tmp_path: Path) -> None:
     trees.kitti("07")(tmp_path)
     for folder in (tmp_path, tmp_path / "dataset", tmp_path / "dataset/sequences/07"):
         pair = open_dataset(find_dataset("kitti.07"), folder)

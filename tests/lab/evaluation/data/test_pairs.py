@@ -48,7 +48,7 @@ def test_the_seed_draws_and_the_same_seed_draws_the_same() -> None:
 @pytest.mark.thorough
 @settings(deadline=None)  # the processor may be busy
 @given(st.integers(2, 60), st.integers(0, 4), st.data())
-def test_as_many_are_kept_as_asked_for_in_two_runs(references: int, tolerance: int, data: st.DataObject) -> None:
+def test_as_many_are_kept_as_requested_in_two_runs(references: int, tolerance: int, data: st.DataObject) -> None:
     keep = data.draw(st.integers(1, references - 1))
     answerable = data.draw(st.integers(0, references))
     truth = tolerance_truth(references, references, tolerance)

@@ -63,7 +63,7 @@ def test_marks_of_thirty_two_systems_differ(tmp_path: Path) -> None:
     assert marks[8].linestyle == (0, marks[8].dashes)
 
 
-def test_systems_of_one_title_are_told_apart(tmp_path: Path) -> None:
+def test_systems_of_one_title_are_distinguished(tmp_path: Path) -> None:
     truth, kept, scores = tolerance_truth(2, 2, 0), np.arange(2), np.eye(2, dtype=np.float32)
     named = [("a", "Twin"), ("b", "Twin"), ("b", "Twin"), ("c", "Single")]
     runs = [make_run(name, scores, kept, truth, title=title) for name, title in named]

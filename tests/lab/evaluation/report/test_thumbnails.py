@@ -10,7 +10,7 @@ from lab.evaluation.report.thumbnails import LONGEST, Thumbnails
 from tests.lab.evaluation.report.comparisons import Written, write_images
 
 
-def test_an_image_is_kept_once_and_small(tmp_path: Path) -> None:
+def test_an_image_is_stored_once_and_small(tmp_path: Path) -> None:
     large = tmp_path / "large.png"
     large.write_bytes(cv2.imencode(".png", np.full((600, 1200, 3), (250, 120, 10), np.uint8))[1].tobytes())
     thumbnails = Thumbnails()

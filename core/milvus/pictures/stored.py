@@ -26,13 +26,13 @@ class StoredObject:
 
 
 class Reader(Protocol):
-    """What reads objects, one for each that is asked for; None: it is missing or damaged."""
+    """A reader of objects: the bytes of each in order; None: it is missing or damaged."""
 
-    def read(self, kept: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
+    def read(self, stored: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
 
 
-Kept = bytes | StoredObject | None
-"""A picture as its row has it: itself, or where it is; None: there is none."""
+StoredPicture = bytes | StoredObject | None
+"""A picture in its row: its bytes, or the object that has them; None: there is none."""
 
 
 def new_object(folder: str, key: int, picture: bytes) -> StoredObject:
@@ -57,26 +57,26 @@ def before_key(folder: str, key: int) -> str:
     return f"{folder}/{key:016x}"
 
 
-def size_of(kept: Kept) -> int:
+def size_of(picture: StoredPicture) -> int:
     """The bytes of a picture."""
-    return 0 if kept is None else kept.size if isinstance(kept, StoredObject) else len(kept)
+    return 0 if picture is None else picture.size if isinstance(picture, StoredObject) else len(picture)
 
 
-def digest_of(kept: bytes | StoredObject) -> bytes:
-    """The SHA-256 of a picture, 32 bytes; that of an object is the one of what was stored."""
-    return kept.digest if isinstance(kept, StoredObject) else hashlib.sha256(kept).digest()
+def digest_of(picture: bytes | StoredObject) -> bytes:
+    """The SHA-256 of a picture, 32 bytes; that of an object is the one recorded when it was stored."""
+    return picture.digest if isinstance(picture, StoredObject) else hashlib.sha256(picture).digest()
 
 
-def read_pictures(objects: Reader | None, kept: Mapping[int, Kept]) -> dict[int, bytes | None]:
+def read_pictures(objects: Reader | None, pictures: Mapping[int, StoredPicture]) -> dict[int, bytes | None]:
     """Pictures by row, wherever they are; those whose object is missing, or damaged, are left out.
 
     Raises:
         StorageFailure: one is in an object store, and none is known.
         StoreUnavailable: the object store cannot be reached, or refuses.
     """
-    far = {name: one for name, one in kept.items() if isinstance(one, StoredObject)}
+    far = {name: one for name, one in pictures.items() if isinstance(one, StoredObject)}
     if far and objects is None:
-        raise StorageFailure("The picture is in an object store, and this service was told of none.")
-    there = {name: one for name, one in kept.items() if not isinstance(one, StoredObject)}
+        raise StorageFailure("The picture is in an object store, and this service is configured without one.")
+    there = {name: one for name, one in pictures.items() if not isinstance(one, StoredObject)}
     found = zip(far, [] if objects is None else objects.read(list(far.values())), strict=True)
     return there | {name: picture for name, picture in found if picture is not None}
