@@ -64,23 +64,23 @@ def main(
     found: dict[str, list[float]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         client, _, _ = stack.enter_context(running(ROOT, Path(temporary) / "this"))
-        asked: dict[str, tuple[httpx.Client, str]] = {}
+        contestants: dict[str, tuple[httpx.Client, str]] = {}
         for number, name in enumerate(LISTENERS):
-            asked[name] = (client, f"map-{number}")
+            contestants[name] = (client, f"map-{number}")
         if other is not None:
             there, _, _ = stack.enter_context(running(other.resolve(), Path(temporary) / "other"))
-            asked["other checkout"] = (there, "lab")
-        for service, map_id in asked.values():
+            contestants["other checkout"] = (there, "lab")
+        for service, map_id in contestants.values():
             service.post("/v1/maps", json={"id": map_id, "keep": "thumbnail"}).raise_for_status()
             for first in range(0, places, BATCH):
                 enrol(service, map_id, frames, first, min(BATCH, places - first))
         for name, (count, pictures) in LISTENERS.items():
             for _ in range(count):
-                stack.enter_context(listener(client, asked[name][1], pictures))
-        names = list(asked)
+                stack.enter_context(listener(client, contestants[name][1], pictures))
+        names = list(contestants)
         for turn in range(-20, turns):
             for name in [*names[turn % len(names) :], *names[: turn % len(names)]]:
-                service, map_id = asked[name]
+                service, map_id = contestants[name]
                 frame = frames[turn % len(frames)]
                 began = time.perf_counter()
                 answer = service.post(f"/v1/maps/{map_id}/query", content=frame, headers={"Content-Type": "image/jpeg"})

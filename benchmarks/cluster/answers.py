@@ -106,7 +106,7 @@ def main(
             )
             print(f"    and {verdicts} verdicts differ")
     columns = ["traverse and store", "recall@1", "AUC-PR", "search, ms"]
-    report("cluster_answers", "the same queries asked of two stores", columns, rows, {"traverses": kept})
+    report("cluster_answers", "the same queries in two stores", columns, rows, {"traverses": kept})
     for what, value in bars:
         print(f"{what:<28} {value:.4f}   {verdict(float(value), MOST_APART)}")
 

@@ -72,7 +72,7 @@ def main(
     to: Annotated[Path | None, typer.Option("--json", help="A file for the figures.")] = None,
 ) -> None:
     """Drive, print the table, and keep the figures."""
-    asked = [SITUATIONS[name] for name in chosen(list(SITUATIONS), situations)]
+    selected = [SITUATIONS[name] for name in chosen(list(SITUATIONS), situations)]
     ways = {str(mode): mode for mode in MODES}
     wanted = [ways[name] for name in chosen(list(ways), modes)]
     driven = WALKS[chosen(list(WALKS), walk)[0]](datasets)
@@ -82,7 +82,7 @@ def main(
         station.start()
         try:
             made: set[str] = set()
-            for situation in asked:
+            for situation in selected:
                 way = list(moments(situation, driven, SHORT if short else 1.0))
                 for mode in wanted:
                     map_id = f"{situation.map}-{mode.size}"

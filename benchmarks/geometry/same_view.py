@@ -199,8 +199,8 @@ def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Com
         near = np.convolve(truth[query], np.ones(2 * FAR + 1), "same") > 0
         far = np.flatnonzero(~near)
         pairs += [(query, int(place)) for place in random.choice(far, min(REFERENCES, len(far)), replace=False)]
-    asked, shown = sorted({query for query, _ in pairs}), sorted({place for _, place in pairs})
-    ours = dict(zip(asked, _keypoints(network, [task.queries[one] for one in asked]), strict=True))
+    queried, shown = sorted({query for query, _ in pairs}), sorted({place for _, place in pairs})
+    ours = dict(zip(queried, _keypoints(network, [task.queries[one] for one in queried]), strict=True))
     theirs = dict(zip(shown, _keypoints(network, [task.references[one] for one in shown]), strict=True))
     return each(lambda p: compared(name, f"{p[0]} and {p[1]}", ours[p[0]], theirs[p[1]]), pairs, cores())
 
@@ -249,12 +249,12 @@ def report_views(made: Sequence[Comparison], count: int) -> None:
     """Print and write the table of views, and every comparison that fails."""
     rows: list[tuple[object, ...]] = []
     for name in [*VIEWS, ""]:
-        asked = [one for one in made if one.counts and name in ("", one.kind)]
-        failed = sum(one.fails(one.inliers) for one in asked)
-        before = sum(one.fails(one.before) for one in asked)
-        bar = "" if name else verdict(failed / max(1, len(asked)), FAILURES)
-        share = float(np.mean([one.inliers / one.matches for one in asked])) if asked else 0.0
-        rows.append((name or "all", len(asked), share, before, failed, bar))
+        counted = [one for one in made if one.counts and name in ("", one.kind)]
+        failed = sum(one.fails(one.inliers) for one in counted)
+        before = sum(one.fails(one.before) for one in counted)
+        bar = "" if name else verdict(failed / max(1, len(counted)), FAILURES)
+        share = float(np.mean([one.inliers / one.matches for one in counted])) if counted else 0.0
+        rows.append((name or "all", len(counted), share, before, failed, bar))
     failures = [one for one in made if one.fails(one.inliers)]
     title = f"{count} pictures; comparisons with {ENOUGH_MATCHES} matches or more, of which fewer than half are inliers"
     columns = ["", "comparisons", "mean share", "matrix alone", "fail", ""]
@@ -268,10 +268,10 @@ def report_strangers(made: Sequence[Comparison]) -> None:
     """Print and write the table of strangers."""
     rows: list[tuple[object, ...]] = []
     for name in [*dict.fromkeys(one.kind for one in made), ""]:
-        asked = [one for one in made if name in ("", one.kind)]
-        found, before = (np.array([getattr(one, part) for one in asked]) for part in ("evidence", "evidence_before"))
+        counted = [one for one in made if name in ("", one.kind)]
+        found, before = (np.array([getattr(one, part) for one in counted]) for part in ("evidence", "evidence_before"))
         at = [float(np.quantile(values, 0.99)) for values in (before, found)]
-        rows.append((name or "all", len(asked), *at, int((found != before).sum()), verdict(at[1], at[0])))
+        rows.append((name or "all", len(counted), *at, int((found != before).sum()), verdict(at[1], at[0])))
     columns = ["", "pairs", "matrix alone", "evidence", "differ", ""]
     report("geometry_strangers", "99th percentile of the evidence of strangers", columns, rows, {"rows": rows})
 

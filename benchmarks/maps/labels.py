@@ -147,15 +147,15 @@ def measure(client: httpx.Client, of: Walk, other: Walk) -> list[dict[str, Any]]
     """The figures of a data set by what was labelled, how the map was calibrated, and which half was held out."""
     found: list[dict[str, Any]] = []
     parts = halves(of, other)
-    for turn, (asked, held_out) in enumerate((parts, parts[::-1])):
+    for turn, (queried, held_out) in enumerate((parts, parts[::-1])):
         map_id = f"{of.name}-{turn}"
         make_map(client, map_id, of)
-        for frame in asked:
+        for frame in queried:
             query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
         for kept, verdicts in KEPT.items():
-            labels = label_kept(client, map_id, asked, verdicts)
+            labels = label_kept(client, map_id, queried, verdicts)
             for order, body in (LABELLED if labels else UNLABELLED).items():
                 client.patch(f"/v1/maps/{map_id}", json={"calibration": None}).raise_for_status()
                 done = {"map": of.name, "kept": kept, "labels": labels, "half": turn, "order": order}

@@ -145,7 +145,7 @@ def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) 
     first = list(evidences(encoder, describe(encoder, queried), references, where))
     answers = {"single": [(best, False) for best, _ in first]}
     answers["session"] = followed(first, views, graph, RunOptions())
-    answers["session, told the pace"] = followed(first, views, graph, RunOptions(Stride()))
+    answers["session, given the pace"] = followed(first, views, graph, RunOptions(Stride()))
     return {
         truth: {"queries": len(queried)} | {how: judged(right, best, where) for how, best in answers.items()}
         for truth, right in truths(name, folder, queried, known).items()
@@ -208,7 +208,7 @@ def main(
         figures["recall"][name] = recalls(chosen, name, data)
         for truth, counts in figures["recall"][name].items():
             queries, single = counts["queries"], counts["single"]["wrong"]
-            for how in ("single", "session", "session, told the pace"):
+            for how in ("single", "session", "session, given the pace"):
                 wrong, held = counts[how]["wrong"], ""
                 if how == "session" and truth == "put right":
                     held = "errors " + verdict(wrong / single, HALVED)

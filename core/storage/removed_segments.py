@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 class RemovedSegments:
     """The removed segments of one map whose files are still there, because a snapshot may read them.
 
-    Only the thread that writes may use this, except for :meth:`kept`.
+    Only the thread that writes may use this, except for :meth:`retained`.
     """
 
     def __init__(self, folder: Path, layout: Layout) -> None:
@@ -39,7 +39,7 @@ class RemovedSegments:
         self._lock, self._keepers = threading.Lock(), 0
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
+    def retained(self) -> Iterator[None]:
         """Keep all files during the block, so that a transaction in it finds them.  Any thread may use this."""
         with self._lock:
             self._keepers += 1

@@ -17,9 +17,9 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the evaluation images
 def test_a_stretch_of_railway_in_another_season() -> None:
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     (counts,) = recalls(encoder, "nordland_tiny", DATA, frames=500).values()
-    single, learnt, told = (counts[how]["wrong"] for how in ("single", "session", "session, told the pace"))
+    single, learnt, given = (counts[how]["wrong"] for how in ("single", "session", "session, given the pace"))
     assert single > 0.1 * counts["queries"], "or there would be nothing to gain"
-    assert told <= 0.6 * single, "the whole run is held to more below"
+    assert given <= 0.6 * single, "the whole run is held to more below"
     assert learnt <= 0.6 * single, "one that has to learn the pace"
 
 

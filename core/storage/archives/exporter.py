@@ -81,7 +81,7 @@ class Exporter:
     def _files_kept(self) -> AbstractContextManager[None]:
         """No segment file is deleted during the block."""
         opened = self._opened()
-        return nullcontext() if opened is None else opened.removed_segments.kept()
+        return nullcontext() if opened is None else opened.removed_segments.retained()
 
     def _expect_there(self) -> None:
         if self._opened() is None:

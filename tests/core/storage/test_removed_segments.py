@@ -169,7 +169,7 @@ def test_places_are_never_given_up_for_a_flipped_bit(three: Map, atlas: Atlas, d
 def test_no_file_goes_while_somebody_links_them(three: Map, directory: Path) -> None:
     opened = three._opened
     assert opened is not None
-    with opened.removed_segments.kept():
+    with opened.removed_segments.retained():
         forget(three, 0, 1, 2, 3)
         three.enrol([frame("new")])
         assert files(directory) == names(0, 1, 2)
