@@ -131,7 +131,7 @@ def _with_chunk_of_mcap(whole: bytes, packed: bytes) -> bytes:
     place = 8
     for record in StreamReader(stream, emit_chunks=True).records:
         if isinstance(record, Chunk):
-            builder = RecordBuilder()
+            builder: Any = RecordBuilder()
             Chunk(record.compression, packed, 0, 0, 0, 1000).write(builder)
             return whole[:place] + bytes(builder.end())
         place = stream.tell()

@@ -83,6 +83,7 @@ def parsed(kind: int, data: bytes) -> Any:
     try:
         if kind == _MESSAGE:
             return Message.read(stream, len(data))
-        return {_SCHEMA: Schema, _CHANNEL: Channel, McapStorage.CHUNK: Chunk}[kind].read(stream)
+        kinds: dict[int, Any] = {_SCHEMA: Schema, _CHANNEL: Channel, McapStorage.CHUNK: Chunk}
+        return kinds[kind].read(stream)
     except (McapError, struct.error, ValueError, OverflowError) as error:  # ValueError: text that is none
         raise InvalidRecording(f"A record is damaged: {type(error).__name__}.") from error
