@@ -57,13 +57,13 @@ class McapStorage(ChunkedStorage):
             channel = self._connections.get(told.channel_id)
             self._note(told.channel_id, told.log_time, told.data, channel and channel.coding, key)
 
-    def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str]:
+    def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str, int]:
         try:
             chunk = parsed(record.kind, data)
         except InvalidRecording as error:
             self.problem = self.problem or f"has a damaged chunk ({error})"
-            return b"", ""
-        return chunk.data, chunk.compression
+            return b"", "", 0
+        return chunk.data, chunk.compression, chunk.uncompressed_size
 
     def _message(self, data: bytes) -> bytes:
         return data[_HEAD:]

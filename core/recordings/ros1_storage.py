@@ -46,8 +46,9 @@ class Ros1Storage(ChunkedStorage):
             )
             self._connections[number] = Connection(topic, type_name(kind), "ros1")
 
-    def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str]:
-        return data, record.fields.get("compression", b"none").decode(errors="replace")
+    def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str, int]:
+        packing = record.fields.get("compression", b"none").decode(errors="replace")
+        return data, packing, _number(record.fields, "size")
 
     def _message(self, data: bytes) -> bytes:
         return data
