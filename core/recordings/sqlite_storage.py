@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from core.errors import InvalidRecording
-from core.recordings.messages import STAMP_BYTES, Coding, stamp_of, type_name
-from core.recordings.storage import MOST_UNPACKED, Entry, Key, Topic
+from core.recordings.messages import STAMP_BYTES, Coding, type_name
+from core.recordings.storage import Connection, Key, Storage, unpacked
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """A message that the recorder has compressed begins so; one in CDR cannot."""
@@ -18,50 +17,44 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 CODINGS: dict[str, Coding] = {"cdr": "cdr", "ros1": "ros1"}
 
 
-class SqliteStorage:
+class SqliteStorage(Storage):
     """An SQLite database of messages, read by their row numbers; a file that is cut short is read up to the cut."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file.
+        """Open the file and read it through.
 
         Raises:
             InvalidRecording: it is no such database.
         """
-        self.problem: str | None = None
-        uri = f"{path.resolve().as_uri()}?mode=ro"
+        super().__init__()
         try:
-            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
             try:
                 # Without this SQLite refuses a file that is shorter than its header says.
                 self._database.execute("PRAGMA writable_schema = ON")
-                self._topics = {
-                    row: (name, type_name(kind), CODINGS.get(coding))
-                    for row, name, kind, coding in self._database.execute(
-                        "SELECT id, coalesce(CAST(name AS TEXT), ''), coalesce(CAST(type AS TEXT), ''), "
-                        "serialization_format FROM topics ORDER BY id"
-                    )
-                }
-                counts = Counter(topic for (topic,) in self._rows("SELECT topic_id FROM messages ORDER BY id"))
+                self._read()
             except BaseException:
                 self._database.close()
                 raise
         except sqlite3.Error as error:
             raise InvalidRecording(f"{path} is not the database of a bag, or is damaged: {error}.") from error
-        self.topics = {name: Topic(kind, counts[row], coding) for row, (name, kind, coding) in self._topics.items()}
 
-    def entries(self, topic: str) -> Iterator[Entry]:
-        ids = {row: coding for row, (name, _, coding) in self._topics.items() if name == topic}
-        # All topics are read, for there is no index by topic, and behind a damage no index helps.
+    def _read(self) -> None:
         # A column of SQLite may hold anything, whatever its type.
-        rows = self._rows(
+        for number, name, kind, coding in self._database.execute(
+            "SELECT id, coalesce(CAST(name AS TEXT), ''), coalesce(CAST(type AS TEXT), ''), serialization_format "
+            "FROM topics ORDER BY id"
+        ):
+            self._connections[number] = Connection(name, type_name(kind), CODINGS.get(coding))
+        # There is no index by topic, and behind a damage no index helps.
+        for number, row, received, start in self._rows(
             "SELECT topic_id, id, coalesce(CAST(timestamp AS INTEGER), 0), "
             f"coalesce(CAST(substr(data, 1, {STAMP_BYTES}) AS BLOB), x'') FROM messages ORDER BY id"
-        )
-        for number, row, received, start in rows:
-            coding = ids.get(number)
-            if coding is not None:
-                head = self.read((row,)) if start.startswith(ZSTD) else start
-                yield Entry(received, stamp_of(head, coding), (row,))
+        ):
+            if number in self._connections:
+                packed = start.startswith(ZSTD) and self._wanted(number)
+                head = self.read((row, 0)) if packed else start
+                self._note(number, received, head, self._connections[number].coding, (row, 0))
 
     def _rows(self, statement: str) -> Iterator[Any]:
         """The rows of a statement, up to a damage."""
@@ -78,23 +71,14 @@ class SqliteStorage:
 
     def read(self, key: Key) -> bytes:
         try:
-            found = self._database.execute("SELECT CAST(data AS BLOB) FROM messages WHERE id = ?", key).fetchone()
+            found = self._database.execute("SELECT CAST(data AS BLOB) FROM messages WHERE id = ?", key[:1]).fetchone()
         except sqlite3.DatabaseError as error:
             raise InvalidRecording(f"A message cannot be read: {error}.") from error
         data = bytes(found[0] or b"") if found is not None else b""
-        return _unpacked(data) if data.startswith(ZSTD) else data
+        data, problem = unpacked(data, "zstd" if data.startswith(ZSTD) else "")
+        if problem is not None:
+            raise InvalidRecording(f"A compressed message is damaged: {problem}.")
+        return data
 
     def close(self) -> None:
         self._database.close()
-
-
-def _unpacked(data: bytes) -> bytes:
-    import zstandard
-
-    try:
-        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MOST_UNPACKED + 1)
-    except zstandard.ZstdError as error:
-        raise InvalidRecording(f"A compressed message is damaged: {error}.") from error
-    if len(unpacked) > MOST_UNPACKED:
-        raise InvalidRecording("A compressed message is too large.")
-    return unpacked

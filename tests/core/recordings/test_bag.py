@@ -15,8 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
+from benchmarks.maps.damaged_bags import by_recordings, damaged, hostile, tried
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnknownTopic
 from core.recordings import Poses, RecordedFrame, open_recording
+from core.recordings.bag import STORAGES
 from tests.core.recordings.bags import (
     CAMERA,
     ODOMETRY,
@@ -185,8 +187,7 @@ def test_a_time_that_no_clock_tells_spoils_no_other(tmp_path: Path) -> None:
 
 
 def test_no_more_is_unpacked_than_a_chunk_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("ros1_storage", "mcap_storage", "sqlite_storage"):
-        monkeypatch.setattr(f"core.recordings.{module}.MOST_UNPACKED", 20_000)
+    monkeypatch.setattr("core.recordings.storage.MOST_UNPACKED", 20_000)
     said = [compressed(START + index * SECOND, bytes(15_000)) for index in range(4)]
     for writer in ("ros1-bz2", "ros1-lz4", "mcap-zstd", "mcap-lz4"):
         (tmp_path / writer).mkdir()
@@ -196,6 +197,30 @@ def test_no_more_is_unpacked_than_a_chunk_may_have(tmp_path: Path, monkeypatch: 
     large = write_rosbag2(tmp_path / "large", [compressed(START, bytes(30_000))], packed="message")
     with pytest.raises(InvalidRecording, match="too large"):
         open_recording(large)
+
+
+def test_of_a_chunk_that_unpacks_to_more_than_it_says_the_beginning_is_read(tmp_path: Path) -> None:
+    for kind, path in hostile(tmp_path, 100_000).items():
+        storage = STORAGES[path.suffix](path)
+        assert "bytes only the beginning is read" in str(storage.problem), kind
+        storage.close()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "writer", ["sqlite-file-alone", "mcap-zstd", "mcap-plain", "mcap-no-chunks", "ros1", "ros1-lz4"]
+)
+def test_a_bag_with_a_bit_turned_over_loses_few_frames_or_is_refused(writer: str, tmp_path: Path) -> None:
+    path = WRITERS[writer](tmp_path, walk(12))
+    whole, written = path.read_bytes(), {jpeg(index) for index in range(12)}
+    kept = []
+    for _, data in damaged(whole, cuts=5, flips=40):
+        path.write_bytes(data)
+        found = tried(by_recordings, path, written)
+        assert not found["other errors"]
+        kept.append(found["frames"])
+    assert sum(kept[5:]) >= 0.9 * 40 * 12  # one bit spoils a frame, or those of a chunk
+    assert all(one >= 12 * (number + 1) / 6 - 6 for number, one in enumerate(kept[:5]))
 
 
 def test_a_recorder_that_was_killed_leaves_a_database_without_metadata(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ class Hostile:
 @pytest.mark.parametrize("old", [False, True], ids=["numpy", "python-2"])
 def test_nothing_in_a_file_is_run(tmp_path: Path, old: bool) -> None:
     objects(tmp_path / "t.npy", [[0], Hostile(tmp_path), [2]], old=old)
-    with pytest.raises(InvalidGroundTruth, match=r"it holds a call of \w+.system, which no list of references does"):
+    with pytest.raises(InvalidGroundTruth, match=r"it holds a call of \w+.system, as no list of references does"):
         read_array(tmp_path / "t.npy", QUERIES, REFERENCES)
     objects(tmp_path / "t.npy", [[0], Path("a"), [2]], old=old)
     with pytest.raises(InvalidGroundTruth, match="it holds a call of pathlib"):
