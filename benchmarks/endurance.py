@@ -27,7 +27,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.fleet import Fleet, Plan, Scene, Seen
+from benchmarks.fleet import Fleet, Scene, Seen, Workload
 from benchmarks.process import service
 from benchmarks.report import report, verdict
 from service.commands.timing.samples import jpeg, sample_frame
@@ -41,7 +41,7 @@ MORE_LIMIT = 2
 """Threads and open files more in the last third than in the first, medians."""
 
 
-class Watch(threading.Thread):
+class ProcessWatch(threading.Thread):
     """Looks at a process and a folder from outside."""
 
     def __init__(self, pid: int, folder: Path, fleet: Fleet) -> None:
@@ -194,9 +194,9 @@ def main(
         client.post("/v1/maps", json={"id": MAP}).raise_for_status()
         enrol_fixed(client, scenes[:places])
         exports = "/v1/maps/{map}/export" in client.get("/openapi.json").json()["paths"]
-        plan = Plan(str(client.base_url), MAP, scenes, strangers, fixed, robots, operators, rate, enrol_rate)
+        plan = Workload(str(client.base_url), MAP, scenes, strangers, fixed, robots, operators, rate, enrol_rate)
         fleet = Fleet(plan)
-        watch = Watch(process.pid, Path(text) / "data", fleet)
+        watch = ProcessWatch(process.pid, Path(text) / "data", fleet)
 
         async def run() -> tuple[float, float]:
             await fleet.fill()

@@ -30,7 +30,7 @@ NEVER = float("inf")
 
 
 @dataclass
-class Enrolled:
+class PlaceHistory:
     """The known history of one place: when its enrolment was acknowledged, its deletion begun and acknowledged."""
 
     scene: int
@@ -40,7 +40,7 @@ class Enrolled:
 
 
 @dataclass
-class Traverse:
+class EnrolledTraverse:
     """Places that one operator enrolled one after the other."""
 
     name: str
@@ -57,7 +57,7 @@ class Scene:
 
 
 @dataclass
-class Plan:
+class Workload:
     """The work of the fleet, and its means.
 
     rate: frames a second of each robot; 0: the next as soon as the last is answered.
@@ -94,7 +94,7 @@ class Seen:
         return status in expected
 
 
-class Connection:
+class PersistentConnection:
     """One persistent connection, opened again when the other end has closed it between two requests."""
 
     def __init__(self, url: str) -> None:
@@ -162,16 +162,16 @@ async def _chunks(reader: asyncio.StreamReader, keep: bool) -> bytes:
 class Fleet:
     """All who work on the map."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Workload) -> None:
         """Nobody works yet."""
         self.plan, self.seen = plan, Seen()
-        self.places = {place: Enrolled(scene, since=0.0) for place, scene in plan.fixed.items()}
+        self.places = {place: PlaceHistory(scene, since=0.0) for place, scene in plan.fixed.items()}
         self.of_scene: dict[int, str] = {scene: place for place, scene in plan.fixed.items()}
         self.until = NEVER
         self.unsent = 0
         """Frames that were due and could not be sent in time."""
         self._free = deque(n for n in range(len(plan.scenes)) if n not in self.of_scene)
-        self._traverses: dict[int, list[Traverse]] = {n: [] for n in range(plan.operators)}
+        self._traverses: dict[int, list[EnrolledTraverse]] = {n: [] for n in range(plan.operators)}
         self._serial = count()
         self._root = f"/v1/maps/{plan.map_id}"
 
@@ -182,7 +182,7 @@ class Fleet:
     async def fill(self) -> None:
         """The traverses that each operator keeps, at once."""
         for number in range(self.plan.operators):
-            line = Connection(self.plan.url)
+            line = PersistentConnection(self.plan.url)
             for _ in range(KEPT_TRAVERSES * PLACES_OF_A_TRAVERSE // BATCH):
                 await self._enrol_many(line, number, BATCH, time.perf_counter())
             line.close()
@@ -195,9 +195,11 @@ class Fleet:
         hands += [self._guarded("delete", self._deleter, 0), self._guarded("keep", self._keeper, int(exports))]
         await asyncio.gather(*hands)
 
-    async def _guarded(self, kind: str, hand: Callable[[Connection, int], Awaitable[None]], number: int) -> None:
+    async def _guarded(
+        self, kind: str, hand: Callable[[PersistentConnection, int], Awaitable[None]], number: int
+    ) -> None:
         while time.perf_counter() < self.until:
-            line = Connection(self.plan.url)
+            line = PersistentConnection(self.plan.url)
             try:
                 await hand(line, number)
             except (OSError, EOFError) as error:
@@ -213,7 +215,7 @@ class Fleet:
 
     # Robots
 
-    async def _robot(self, line: Connection, number: int) -> None:
+    async def _robot(self, line: PersistentConnection, number: int) -> None:
         plan, began = self.plan, time.perf_counter()
         for turn in count():
             due = time.perf_counter()
@@ -229,7 +231,7 @@ class Fleet:
             else:
                 await self._ask(line, due, None, plan.strangers[choice - len(plan.scenes)])
 
-    async def _ask(self, line: Connection, due: float, scene: int | None, data: bytes) -> None:
+    async def _ask(self, line: PersistentConnection, due: float, scene: int | None, data: bytes) -> None:
         sent = time.perf_counter()
         wanted = None if scene is None else self.of_scene.get(scene)
         status, body = await line.request("POST", f"{self._root}/query?k=5", data)
@@ -250,7 +252,7 @@ class Fleet:
 
     # Operators
 
-    async def _operator(self, line: Connection, number: int) -> None:
+    async def _operator(self, line: PersistentConnection, number: int) -> None:
         size = 1 if number % 2 == 0 else BATCH  # one place after the other, or in forms
         began = time.perf_counter()
         for turn in count(1):
@@ -265,9 +267,9 @@ class Fleet:
         traverses = self._traverses[number]
         if not traverses or len(traverses[-1].places) == PLACES_OF_A_TRAVERSE:
             index = 0 if not traverses else traverses[-1].index + 1
-            traverses.append(Traverse(f"operator-{number}-{index}", index))
+            traverses.append(EnrolledTraverse(f"operator-{number}-{index}", index))
         place = f"o{number}-{next(self._serial):07d}"
-        self.places[place] = Enrolled(self._free.popleft())
+        self.places[place] = PlaceHistory(self._free.popleft())
         traverses[-1].places.append(place)
         return place, traverses[-1].name
 
@@ -280,7 +282,7 @@ class Fleet:
         self.places[place].since = time.perf_counter()
         self.of_scene[self.places[place].scene] = place
 
-    async def _enrol_one(self, line: Connection, number: int, due: float) -> None:
+    async def _enrol_one(self, line: PersistentConnection, number: int, due: float) -> None:
         place, sequence = self._next_place(number)
         status, body = await line.request(
             "PUT", f"{self._root}/places/{place}?sequence={sequence}", self._scene_of(place)
@@ -288,7 +290,7 @@ class Fleet:
         if self.seen.note("enrol one", due, status, (201,), body):
             self._is_in(place)
 
-    async def _enrol_many(self, line: Connection, number: int, size: int, due: float) -> None:
+    async def _enrol_many(self, line: PersistentConnection, number: int, size: int, due: float) -> None:
         new = [self._next_place(number) for _ in range(size)]
         entries = [{"id": place, "file": place, "sequence": sequence} for place, sequence in new]
         parts = [_part("places", "application/json", json.dumps(entries).encode())]
@@ -306,7 +308,7 @@ class Fleet:
 
     # The one who deletes
 
-    async def _deleter(self, line: Connection, _number: int) -> None:
+    async def _deleter(self, line: PersistentConnection, _number: int) -> None:
         while time.perf_counter() < self.until:
             old = [traverses for traverses in self._traverses.values() if len(traverses) > KEPT_TRAVERSES]
             if not old:
@@ -320,7 +322,7 @@ class Fleet:
                         await self._delete(line, f"places/{place}", "delete place", [place])
                         await asyncio.sleep(0.1 if len(traverses) <= KEPT_TRAVERSES else 0)
 
-    async def _delete(self, line: Connection, path: str, kind: str, places: list[str]) -> None:
+    async def _delete(self, line: PersistentConnection, path: str, kind: str, places: list[str]) -> None:
         due = time.perf_counter()
         known = [self.places[place] for place in places if self.places[place].since < NEVER]
         for one in known:
@@ -333,7 +335,7 @@ class Fleet:
 
     # Housekeeping
 
-    async def _keeper(self, line: Connection, exports: int) -> None:
+    async def _keeper(self, line: PersistentConnection, exports: int) -> None:
         """Looks after the map, and asks for some errors."""
         chores = [
             ("list", "GET", "places?limit=500", b"", (200,)),

@@ -57,7 +57,7 @@ class Times:
 
 
 @dataclass(frozen=True)
-class Index:
+class IndexCost:
     """Milvus's memory of a place, in bytes, and the share of its exact time that a search takes."""
 
     name: str
@@ -66,8 +66,8 @@ class Index:
 
 
 INDEXES = (
-    Index("exact", SINGLE, 1.0),
-    Index("codes", CODES, 1 / 16),
+    IndexCost("exact", SINGLE, 1.0),
+    IndexCost("codes", CODES, 1 / 16),
 )
 """FLAT of float32, as measured; IVF_RABITQ with halves on disk, not tried: its time is foretold by the bytes read."""
 
@@ -107,7 +107,9 @@ def foretold(measured: dict[str, Any]) -> list[list[object]]:
     return rows
 
 
-def sized(robots: int, places: int, rate: float, most: int, wait: float, times: Times, index: Index) -> dict[str, Any]:
+def sized(
+    robots: int, places: int, rate: float, most: int, wait: float, times: Times, index: IndexCost
+) -> dict[str, Any]:
     """Servers of each part, memory and disk, and what a query takes."""
     arrivals, searched = robots * rate, min(places, most)
     parts, seconds = {}, 0.0

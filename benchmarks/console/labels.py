@@ -21,7 +21,7 @@ import httpx
 import typer
 from playwright.sync_api import Page, expect, sync_playwright
 
-from benchmarks.maps.labels import FOLDERS, KEPT, Frame, Walk, ask, halves, make_map, query, walk
+from benchmarks.maps.labels import FOLDERS, KEPT, LabelledFrame, LabelledWalk, ask, halves, make_map, query, walk
 from benchmarks.process import service
 from benchmarks.report import report
 
@@ -38,7 +38,9 @@ def kept_frames(client: httpx.Client, map_id: str) -> dict[int, str]:
     return found
 
 
-def label_by_clicks(page: Page, console: str, map_id: str, frames: dict[int, str], queried: Sequence[Frame]) -> None:
+def label_by_clicks(
+    page: Page, console: str, map_id: str, frames: dict[int, str], queried: Sequence[LabelledFrame]
+) -> None:
     """Label frames in the view Review, as a person would who knows the way."""
     shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in queried}
     page.goto(f"{console}#/maps/{map_id}/review")
@@ -72,7 +74,7 @@ def calibrate_by_clicks(page: Page, console: str, map_id: str) -> None:
     page.get_by_text("labels: ", exact=False).wait_for()
 
 
-def measure(client: httpx.Client, page: Page, of: Walk, other: Walk) -> list[dict[str, Any]]:
+def measure(client: httpx.Client, page: Page, of: LabelledWalk, other: LabelledWalk) -> list[dict[str, Any]]:
     """The figures of a data set by the half that was held out."""
     console, found = f"{client.base_url}/console", []
     parts = halves(of, other)

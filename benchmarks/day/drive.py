@@ -33,7 +33,7 @@ NEAR = MapSettings().same_place_radius
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveOutcomes:
     """The outcome of each frame.
 
     again: seconds from the first frame after a disturbance until one is recognized and right, the longest of them;
@@ -53,7 +53,7 @@ class Drive:
         return "".join(LETTERS[one] for one in self.outcomes)
 
 
-def drive(url: str, map_id: str, mode: Mode, way: Iterable[Moment], restart: Callable[[], None]) -> Drive:
+def drive(url: str, map_id: str, mode: Mode, way: Iterable[Moment], restart: Callable[[], None]) -> DriveOutcomes:
     """Let a robot go its way.
 
     Args:
@@ -87,7 +87,7 @@ def drive(url: str, map_id: str, mode: Mode, way: Iterable[Moment], restart: Cal
                 waited.append(moment.second - since)
                 since = None
     waited += [np.inf] if since is not None else []
-    return Drive(tuple(outcomes), max(waited, default=None))
+    return DriveOutcomes(tuple(outcomes), max(waited, default=None))
 
 
 def _outcome(answer: RobotAnswer, moment: Moment, enrolled: dict[str, Moment]) -> Outcome:

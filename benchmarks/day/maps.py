@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from benchmarks.day.pictures import another_look, file
-from benchmarks.day.walks import Pose, Walk, pixels
+from benchmarks.day.walks import PlanarPose, WalkPair, pixels
 from placerec_client import Client, NewPlace
 
 Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike"]
@@ -25,14 +25,14 @@ TRAVERSE = 400
 """Frames of a traverse of other pictures."""
 
 
-def fields(pose: Pose | None, sequence: str) -> dict[str, object]:
+def fields(pose: PlanarPose | None, sequence: str) -> dict[str, object]:
     """The fields of a place."""
     if pose is None:
         return {"sequence": sequence}
     return {"sequence": sequence, "x": pose.x, "y": pose.y, "heading": float(np.degrees(pose.heading))}
 
 
-def places(walk: Walk, change: Change, size: Size, others: Sequence[bytes]) -> Iterator[NewPlace]:
+def places(walk: WalkPair, change: Change, size: Size, others: Sequence[bytes]) -> Iterator[NewPlace]:
     """The places of a map; their ids end with the number of the reference that they show, those of others with none."""
     random = np.random.default_rng(3)
     count = len(walk.references)
@@ -70,7 +70,7 @@ def shown_by(place_id: str) -> int | None:
     return int(number) if number.isdigit() else None
 
 
-def make_map(client: Client, map_id: str, walk: Walk, change: Change, size: Size, others: Sequence[bytes]) -> None:
+def make_map(client: Client, map_id: str, walk: WalkPair, change: Change, size: Size, others: Sequence[bytes]) -> None:
     """Enrol a map.
 
     Raises:

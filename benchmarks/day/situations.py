@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.day import pictures
 from benchmarks.day.maps import STOOD, Change
 from benchmarks.day.pictures import UPRIGHT, Look, Random, another_look
-from benchmarks.day.walks import Pose, Walk, pixels
+from benchmarks.day.walks import PlanarPose, WalkPair, pixels
 
 Fate = Literal["answered", "lost", "unanswered"]
 """Of a frame: its answer comes, it does not reach the service, or the service takes it in and its answer is lost."""
@@ -32,7 +32,7 @@ LONGEST = 150
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SteadyStretch:
     """Some seconds in which nothing changes.
 
     pace: frames of the walk a second; negative backwards, facing ahead.
@@ -69,7 +69,7 @@ class Situation:
     """
 
     name: str
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[SteadyStretch, ...]
     rate: float = 1.0
     start: float = 0.1
     map: Change = "plain"
@@ -91,15 +91,15 @@ class Moment:
     at: float
     aside: float
     picture: bytes
-    pose: Pose
-    wheels: Pose
+    pose: PlanarPose
+    wheels: PlanarPose
     right: frozenset[int]
     fate: Fate
     restart: bool
     again: bool
 
 
-def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Moment]:
+def moments(situation: Situation, walk: WalkPair, scale: float = 1.0) -> Iterator[Moment]:
     """The frames of a situation on a walk, the same ones each time.
 
     Args:
@@ -110,7 +110,7 @@ def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Mo
     at, aside, second, sent = situation.start * last, 0.0, 0.0, 0
     at = float(round(at))
     pose = walk.pose(walk.where(at))
-    wheels = Pose(0.0, 0.0, 0.0)
+    wheels = PlanarPose(0.0, 0.0, 0.0)
     before: tuple[float, float] | None = None
     for stretch in situation.stretches:
         carried = stretch.start is not None
@@ -143,7 +143,9 @@ def moments(situation: Situation, walk: Walk, scale: float = 1.0) -> Iterator[Mo
             aside += stretch.aside / situation.rate
 
 
-def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float, same: bool, random: Random) -> bytes:
+def _picture(
+    stretch: SteadyStretch, walk: WalkPair, at: float, number: int, aside: float, same: bool, random: Random
+) -> bytes:
     """The camera's picture; a view that is between two frames of the walk, or stays, is drawn anew each time."""
     nearest, out = round(at), abs(aside) > 1e-9
     if out:
@@ -163,23 +165,23 @@ def _picture(stretch: Stretch, walk: Walk, at: float, number: int, aside: float,
     return pictures.file(view, stretch.orientation)
 
 
-def _measured(wheels: Pose, old: Pose, new: Pose, random: Random) -> Pose:
+def _measured(wheels: PlanarPose, old: PlanarPose, new: PlanarPose, random: Random) -> PlanarPose:
     """The odometry after a motion: the motion with its errors, on top of what it said before."""
     way = (new.x - old.x) + 1j * (new.y - old.y)
     length = abs(way)
     slipped = way * np.exp(1j * (wheels.heading - old.heading)) * (1 + SLIP * random.normal())
     turn = new.heading - old.heading + SPIN * np.sqrt(length) * random.normal()
-    return Pose(wheels.x + float(slipped.real), wheels.y + float(slipped.imag), wheels.heading + float(turn))
+    return PlanarPose(wheels.x + float(slipped.real), wheels.y + float(slipped.imag), wheels.heading + float(turn))
 
 
-def _disturbed(name: str, stretch: Stretch, **options: object) -> Situation:
+def _disturbed(name: str, stretch: SteadyStretch, **options: object) -> Situation:
     """Ten seconds of an undisturbed walk, the stretch, and twelve undisturbed seconds."""
-    return replace(Situation(name, (Stretch(10), stretch, Stretch(12, again=True))), **options)  # type: ignore[arg-type]
+    return replace(Situation(name, (SteadyStretch(10), stretch, SteadyStretch(12, again=True))), **options)  # type: ignore[arg-type]
 
 
 def _throughout(name: str, look: Look | None, orientation: int = UPRIGHT) -> Situation:
     """A walk on which every picture is changed in one way."""
-    return Situation(name, (Stretch(30, look=look, orientation=orientation),))
+    return Situation(name, (SteadyStretch(30, look=look, orientation=orientation),))
 
 
 PACES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.5, 2.0, 3.0, 5.0, 10.0)
@@ -187,29 +189,38 @@ PACES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.5, 2.0, 3.0, 5.0, 10.0)
 SITUATIONS: dict[str, Situation] = {
     one.name: one
     for one in (
-        Situation("passing", (Stretch(40),)),
-        _disturbed("standing", Stretch(30, pace=0)),
-        _disturbed("standing on a mapped view", Stretch(20, pace=0, own=True)),
-        Situation("standing where the map stood", (Stretch(20, pace=0), Stretch(12)), start=STOOD, map="stood"),
-        Situation("passing where the map stood", (Stretch(30),), start=STOOD - 0.15, map="stood"),
-        *(Situation(f"pace {pace:g}", (Stretch(40, pace=pace),)) for pace in PACES),
-        Situation("reverse", (Stretch(10), Stretch(16, pace=-1, again=True)), start=0.3),
-        Situation("stop and go", tuple(Stretch(5, pace=one % 2, again=one == 1) for one in (1, 0, 1, 0, 1, 0, 1, 0))),
-        _disturbed("people passing", Stretch(12, look=pictures.people)),
-        _disturbed("people passing while standing", Stretch(25, pace=0, look=pictures.people)),
-        _disturbed("hand over the camera", Stretch(8, look=pictures.hand)),
-        _disturbed("frames lost", Stretch(8, fate="lost")),
-        _disturbed("every second frame lost", Stretch(16, fate="lost", whole=False)),
-        _disturbed("answers lost", Stretch(6, fate="unanswered")),
-        _disturbed("every second answer lost", Stretch(16, fate="unanswered", whole=False)),
-        Situation("restart", (Stretch(12), Stretch(12, restart=True, again=True))),
-        Situation("carried off", (Stretch(14), Stretch(20, start=0.7, again=True))),
+        Situation("passing", (SteadyStretch(40),)),
+        _disturbed("standing", SteadyStretch(30, pace=0)),
+        _disturbed("standing on a mapped view", SteadyStretch(20, pace=0, own=True)),
+        Situation(
+            "standing where the map stood", (SteadyStretch(20, pace=0), SteadyStretch(12)), start=STOOD, map="stood"
+        ),
+        Situation("passing where the map stood", (SteadyStretch(30),), start=STOOD - 0.15, map="stood"),
+        *(Situation(f"pace {pace:g}", (SteadyStretch(40, pace=pace),)) for pace in PACES),
+        Situation("reverse", (SteadyStretch(10), SteadyStretch(16, pace=-1, again=True)), start=0.3),
+        Situation(
+            "stop and go", tuple(SteadyStretch(5, pace=one % 2, again=one == 1) for one in (1, 0, 1, 0, 1, 0, 1, 0))
+        ),
+        _disturbed("people passing", SteadyStretch(12, look=pictures.people)),
+        _disturbed("people passing while standing", SteadyStretch(25, pace=0, look=pictures.people)),
+        _disturbed("hand over the camera", SteadyStretch(8, look=pictures.hand)),
+        _disturbed("frames lost", SteadyStretch(8, fate="lost")),
+        _disturbed("every second frame lost", SteadyStretch(16, fate="lost", whole=False)),
+        _disturbed("answers lost", SteadyStretch(6, fate="unanswered")),
+        _disturbed("every second answer lost", SteadyStretch(16, fate="unanswered", whole=False)),
+        Situation("restart", (SteadyStretch(12), SteadyStretch(12, restart=True, again=True))),
+        Situation("carried off", (SteadyStretch(14), SteadyStretch(20, start=0.7, again=True))),
         Situation(
             "leaving and coming back",
-            (Stretch(10), Stretch(8, 0, aside=2), Stretch(8, 0, aside=-2), Stretch(12, again=True)),
+            (
+                SteadyStretch(10),
+                SteadyStretch(8, 0, aside=2),
+                SteadyStretch(8, 0, aside=-2),
+                SteadyStretch(12, again=True),
+            ),
         ),
-        Situation("map enrolled twice", (Stretch(30),), map="twice"),
-        Situation("look-alike stretch", (Stretch(40),), start=0.25, map="look-alike"),
+        Situation("map enrolled twice", (SteadyStretch(30),), map="twice"),
+        Situation("look-alike stretch", (SteadyStretch(40),), start=0.25, map="look-alike"),
         _throughout("on its side", pictures.on_its_side),
         _throughout("on its side, with EXIF", pictures.on_its_side, pictures.ON_ITS_SIDE),
         _throughout("upside down", pictures.upside_down),
@@ -217,7 +228,7 @@ SITUATIONS: dict[str, Situation] = {
         _throughout("half the lens dirty", pictures.dirty),
         _throughout("exposure jumps", pictures.exposure),
         _throughout("longer lens", pictures.narrower),
-        Situation("5 frames a second", (Stretch(12),), rate=5.0),
-        Situation("60 frames a second", (Stretch(2),), rate=60.0),
+        Situation("5 frames a second", (SteadyStretch(12),), rate=5.0),
+        Situation("60 frames a second", (SteadyStretch(2),), rate=60.0),
     )
 }

@@ -29,7 +29,7 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.maps.sequences import SAME_PLACE
-from benchmarks.maps.sessions import Look, Truth, Walk
+from benchmarks.maps.sessions import FrameEvidence, SequenceMap, Truth
 from benchmarks.report import report, verdict
 from core.belief import PlaceGraph, Run, RunOptions, Step, Stride, place_graph
 from core.frames.preprocessing import Pixels
@@ -50,13 +50,13 @@ SPOTS, STANDS, WAY = 5, 60, 12
 
 
 @dataclass(frozen=True)
-class Drive:
+class PacedDrive:
     """Frames of one robot; the first ``uncounted`` lead to where it is judged.
 
     advance: by how many of the map's frames it goes on from one to the next; below 0 in reverse.
     """
 
-    looks: Sequence[Look]
+    looks: Sequence[FrameEvidence]
     advance: float
     uncounted: int = 0
 
@@ -112,22 +112,22 @@ def people_passing(pixels: Pixels, count: int, random: np.random.Generator) -> l
     return frames
 
 
-def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[Drive]]]:
+def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[PacedDrive]]]:
     """By the name of each situation: the robots in it."""
     queries, references = describe(encoder, task.queries), describe(encoder, task.references)
-    walk = Walk(encoder, references)
+    walk = SequenceMap(encoder, references)
     looks = walk.looks(task.queries, queries, task.truth)
     count = len(looks)
-    yield "rate 0.1", [Drive(looks[start::10], 10.0) for start in range(0, 10, 2)]
-    yield "rate 0.3", [Drive(looks[start::3], 3.0) for start in range(3)]
-    yield "rate 1", [Drive(looks, 1.0)]
-    yield "reverse", [Drive(looks[::-1], -1.0)]
-    yield "reverse, rate 0.3", [Drive(looks[::-1][start::3], -3.0) for start in range(3)]
+    yield "rate 0.1", [PacedDrive(looks[start::10], 10.0) for start in range(0, 10, 2)]
+    yield "rate 0.3", [PacedDrive(looks[start::3], 3.0) for start in range(3)]
+    yield "rate 1", [PacedDrive(looks, 1.0)]
+    yield "reverse", [PacedDrive(looks[::-1], -1.0)]
+    yield "reverse, rate 0.3", [PacedDrive(looks[::-1][start::3], -3.0) for start in range(3)]
 
     kept = np.arange(0, task.truth.shape[1], 3)
-    sparse = Walk(encoder, references.at(kept)).looks(task.queries, queries, _around(task.truth, kept))
-    yield "rate 3", [Drive(sparse, 1 / 3)]
-    yield "reverse, rate 3", [Drive(sparse[::-1], -1 / 3)]
+    sparse = SequenceMap(encoder, references.at(kept)).looks(task.queries, queries, _around(task.truth, kept))
+    yield "rate 3", [PacedDrive(sparse, 1 / 3)]
+    yield "reverse, rate 3", [PacedDrive(sparse[::-1], -1 / 3)]
 
     random, fast = np.random.default_rng(5), []
     for begin in (count * np.arange(1, 1 + STRETCHES) // (STRETCHES + 1)).tolist():
@@ -136,17 +136,17 @@ def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[Dri
             drawn = drawn_between(task.queries[number], task.queries[number + 1], DRAWN)
             pictures += [taken(frame, random) for frame in drawn]
             truth += [task.truth[number] | task.truth[number + 1]] * DRAWN
-        fast.append(Drive(walk.looks(pictures, describe(encoder, pictures), np.stack(truth)), 1 / DRAWN))
+        fast.append(PacedDrive(walk.looks(pictures, describe(encoder, pictures), np.stack(truth)), 1 / DRAWN))
     yield "rate 10", fast
-    yield "reverse, rate 10", [Drive(one.looks[::-1], -one.advance) for one in fast]
+    yield "reverse, rate 10", [PacedDrive(one.looks[::-1], -one.advance) for one in fast]
 
     warm, cold = [], []
     for spot in (count * np.arange(1, 1 + SPOTS) // (SPOTS + 1)).tolist():
         pictures = people_passing(task.queries[spot], STANDS, random)
         stands = walk.looks(pictures, describe(encoder, pictures), np.repeat(task.truth[[spot]], STANDS, axis=0))
         before, after = looks[max(0, spot - WAY) : spot], looks[spot + 1 : spot + 1 + WAY]
-        warm.append(Drive([*before, *stands, *after], 0.0, len(before)))
-        cold.append(Drive(stands, 0.0))
+        warm.append(PacedDrive([*before, *stands, *after], 0.0, len(before)))
+        cold.append(PacedDrive(stands, 0.0))
     yield "stands, people pass", warm
     yield "stands, people pass, cold", cold
 
@@ -164,13 +164,13 @@ def walked(places: int) -> PlaceGraph:
     return place_graph(Whereabouts.along_sequence(np.arange(places)), np.arange(places), places, SAME_PLACE)
 
 
-def singles(drive: Drive) -> tuple[int, int]:
+def singles(drive: PacedDrive) -> tuple[int, int]:
     """How many frames are recognized alone, rightly and wrongly."""
     found = [bool(look.right[look.best]) for look in drive.looks[drive.uncounted :] if look.verdict == "recognized"]
     return sum(found), len(found) - sum(found)
 
 
-def followed(drive: Drive, options: RunOptions) -> tuple[int, int]:
+def followed(drive: PacedDrive, options: RunOptions) -> tuple[int, int]:
     """How many frames a session recognizes, rightly and wrongly."""
     graph = walked(len(drive.looks[0].right))
     run, alive, found = Run(options, graph), np.ones(len(graph), np.bool_), []

@@ -92,7 +92,7 @@ class Questions:
     passing: list[list[int]]
 
 
-class Camera:
+class ShotEncoder:
     """Encodes frames and finds their keypoints."""
 
     def __init__(self, encoder: Encoder) -> None:
@@ -188,18 +188,18 @@ def recognized(shots: Sequence[Shot], answers: Sequence[Answer]) -> int:
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionOutcomes:
     """The outcomes of a session's frames: whether each was recognized rightly (``right``) or wrongly (``wrong``)."""
 
     right: list[bool]
     wrong: list[bool]
 
 
-def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Session:
+def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> SessionOutcomes:
     """A session over the answers to frames."""
     snapshot, neighborhood = map_.snapshot(), neighborhood_of(map_)
     graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood)
-    run, session = Run(RunOptions(), graph), Session([], [])
+    run, session = Run(RunOptions(), graph), SessionOutcomes([], [])
     for shot, answer in zip(shots, answers, strict=True):
         run.advance(evidence_of(answer, neighborhood), Step(), shot.view)
         found = run.estimate(1, snapshot.alive)
@@ -215,18 +215,18 @@ def followed(map_: Map, shots: Sequence[Shot], answers: Sequence[Answer]) -> Ses
 
 def each_of(
     map_: Map, shots: Sequence[Shot], answers: Sequence[Answer], parts: Sequence[Sequence[int]]
-) -> list[Session]:
+) -> list[SessionOutcomes]:
     """A session of its own for each part of the frames, by their positions."""
     return [followed(map_, [shots[at] for at in own], [answers[at] for at in own]) for own in parts if own]
 
 
-def held(sessions: Sequence[Session]) -> str:
+def held(sessions: Sequence[SessionOutcomes]) -> str:
     """How many spots are held, of how many, and how many frames of their sessions are wrong."""
     wrong = sum(sum(one.wrong) for one in sessions)
     return f"{sum(one.right[-1] for one in sessions)} of {len(sessions)}, {wrong}"
 
 
-def questions(camera: Camera, name: str, task: TraverseTask, elsewhere: TraverseTask) -> Questions:
+def questions(camera: ShotEncoder, name: str, task: TraverseTask, elsewhere: TraverseTask) -> Questions:
     """The queries of the maps of a traverse."""
     random, first = np.random.default_rng(11), FROM[name]
     window = np.arange(first, first + PLACES)
@@ -268,7 +268,7 @@ def stretches(numbers: Sequence[int], positions: Sequence[int]) -> list[list[int
 
 
 def maps_of(
-    camera: Camera, name: Environment, task: TraverseTask, kinds: Sequence[str]
+    camera: ShotEncoder, name: Environment, task: TraverseTask, kinds: Sequence[str]
 ) -> dict[str, list[tuple[int, Shot]]]:
     """The frames of each kind of map, and the reference that each shows."""
     random, first = np.random.default_rng(5), FROM[name]
@@ -331,7 +331,7 @@ def main(
     """One table: the share recognized rightly, by environment, poses, mode and looks at a spot; of all, or of some."""
     kinds = chosen(KINDS, looks)
     share_cores(cores())
-    camera = Camera(EncoderCatalogue().get(encoder))
+    camera = ShotEncoder(EncoderCatalogue().get(encoder))
     tasks = dict(corridor_and_lip6(datasets))
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {"encoder": camera.encoder.identity, "columns": COLUMNS, "rows": rows}

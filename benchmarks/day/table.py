@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.day.drive import LETTERS, Drive, Outcome
+from benchmarks.day.drive import LETTERS, DriveOutcomes, Outcome
 from benchmarks.day.robots import Mode
 from benchmarks.report import report
 
@@ -27,7 +27,7 @@ class Row:
 
     situation: str
     mode: Mode
-    drive: Drive
+    drive: DriveOutcomes
 
     def cell(self) -> str:
         """As it is shown: right/wrong/ambiguous/unknown, what else there is, and the seconds until right again."""

@@ -28,7 +28,7 @@ BEND, BEND_METRES = 0.6, 40.0
 """The made-up curve winds: its heading is BEND · sin(metres / BEND_METRES), in radians."""
 
 
-class Pose(NamedTuple):
+class PlanarPose(NamedTuple):
     """Metres, and radians counter-clockwise from +x."""
 
     x: float
@@ -37,7 +37,7 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Walk:
+class WalkPair:
     """Two traverses of the same places.
 
     references: files of the traverse that the map is made of.
@@ -77,12 +77,12 @@ class Walk:
         along = np.arange(0, 3 * self.spacing * len(self.references) + 1000, 0.1)
         return along, np.cumsum(0.1 * np.exp(1j * BEND * np.sin(along / BEND_METRES)))
 
-    def pose(self, metres: float, aside: float = 0.0) -> Pose:
+    def pose(self, metres: float, aside: float = 0.0) -> PlanarPose:
         """The pose at ``metres`` along the curve, ``aside`` metres to its left."""
         along, points = self._curve
         heading = BEND * float(np.sin(metres / BEND_METRES))
         x, y = (float(np.interp(metres, along, part)) for part in (points.real, points.imag))
-        return Pose(x - aside * np.sin(heading), y + aside * np.cos(heading), heading)
+        return PlanarPose(x - aside * np.sin(heading), y + aside * np.cos(heading), heading)
 
 
 def pixels(data: bytes) -> Pixels:
@@ -101,15 +101,15 @@ def _stated(folder: Path, frames: int, references: int) -> NDArray[np.bool_]:
     return shown
 
 
-def corridor(datasets: Path) -> Walk:
+def corridor(datasets: Path) -> WalkPair:
     """A corridor indoors, twice; two frames are tolerated."""
     folder = datasets / "eval/corridor"
     frames, references = _files(folder / "query"), _files(folder / "ref")
     shown = _stated(folder, len(frames), len(references))
-    return Walk("corridor", references, frames, shown, _files(datasets / "eval/lip6_outdoor/query", 60))
+    return WalkPair("corridor", references, frames, shown, _files(datasets / "eval/lip6_outdoor/query", 60))
 
 
-def lip6(datasets: Path) -> Walk:
+def lip6(datasets: Path) -> WalkPair:
     """Streets of Paris, the part of them that was walked once in each loop; the truth put right by local features."""
     folder = datasets / "eval/lip6_outdoor"
     frames, references = _files(folder / "query", 110), _files(folder / "reference")
@@ -117,18 +117,18 @@ def lip6(datasets: Path) -> Walk:
     stated = _stated(folder, 455, len(references))[: len(frames), kept]
     references = references[kept]
     shown = corrected_truth([decode(one) for one in frames], [decode(one) for one in references], stated)
-    return Walk("lip6", references, frames, shown, _files(datasets / "eval/corridor/query", 60))
+    return WalkPair("lip6", references, frames, shown, _files(datasets / "eval/corridor/query", 60))
 
 
-def nordland(datasets: Path, frames: int = 1500) -> Walk:
+def nordland(datasets: Path, frames: int = 1500) -> WalkPair:
     """A railway in summer and in winter, 64 x 32 pixels; fifteen frames are tolerated, as is customary."""
     folder = datasets / "eval/nordland_tiny"
     shown = np.abs(np.arange(frames)[:, None] - np.arange(frames)) <= 15
     summer, winter = (_files(folder / season, frames) for season in ("summer", "winter"))
-    return Walk("nordland", summer, winter, shown, _files(datasets / "eval/corridor/query", 60))
+    return WalkPair("nordland", summer, winter, shown, _files(datasets / "eval/corridor/query", 60))
 
 
-def night(datasets: Path) -> Walk:
+def night(datasets: Path) -> WalkPair:
     """Fixed cameras, one place each, in one order: the map by day, the robot by night."""
     folder = datasets / "train/day_night"
     cameras = sorted(one for one in folder.iterdir() if one.is_dir() and one.name not in MIXED_CAMERAS)
@@ -136,10 +136,10 @@ def night(datasets: Path) -> Walk:
     both = [(day[0], dark[0]) for day, dark in zip(by_day, by_night, strict=True) if day and dark]
     references, frames = ([path.read_bytes() for path in side] for side in zip(*both, strict=True))
     shown = np.eye(len(both), dtype=np.bool_)
-    return Walk("night", references, frames, shown, _files(datasets / "eval/corridor/query", 60), spacing=20.0)
+    return WalkPair("night", references, frames, shown, _files(datasets / "eval/corridor/query", 60), spacing=20.0)
 
 
-def drawn(_datasets: Path = Path()) -> Walk:
+def drawn(_datasets: Path = Path()) -> WalkPair:
     """The two walks that the examples draw; it needs no data. A frame shows its step and the two on either side."""
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
@@ -157,10 +157,10 @@ def drawn(_datasets: Path = Path()) -> Walk:
     at = np.array([ids.index(row["place"].removeprefix("monday-")) for row in known])
     columns = np.arange(len(references))
     shown = np.abs(at[:, None] - columns) <= 2
-    return Walk("drawn", references, frames, shown, strangers)
+    return WalkPair("drawn", references, frames, shown, strangers)
 
 
-WALKS: dict[str, Callable[[Path], Walk]] = {
+WALKS: dict[str, Callable[[Path], WalkPair]] = {
     "corridor": corridor,
     "lip6": lip6,
     "nordland": nordland,

@@ -211,7 +211,7 @@ def hall(pictures: Sequence[Pixels], random: np.random.Generator) -> Hall:
 
 
 @dataclass(frozen=True)
-class Traverse:
+class PosedTraverse:
     """Places and queries with their pictures and poses; x, y and heading in degrees, [n, 3]."""
 
     places: list[Pixels]
@@ -221,7 +221,7 @@ class Traverse:
     camera: Intrinsics | None
 
 
-def hall_traverse(pictures: Sequence[Pixels], random: np.random.Generator) -> Traverse:
+def hall_traverse(pictures: Sequence[Pixels], random: np.random.Generator) -> PosedTraverse:
     """Places along the middle of a hall, and queries aside of it, turned and dimmed."""
     made = hall(pictures, random)
     eye = made.height / 2
@@ -232,12 +232,12 @@ def hall_traverse(pictures: Sequence[Pixels], random: np.random.Generator) -> Tr
         tilt = random.normal(0, 1, 2)
         return made.seen(np.array([pose[0], pose[1], eye]), rotation(pose[2], tilt[0], tilt[1]))
 
-    return Traverse(
+    return PosedTraverse(
         [look(pose) for pose in places], places, [augment(look(pose), random) for pose in queries], queries, CAMERA
     )
 
 
-def frames_traverse(folder: Path) -> Traverse:
+def frames_traverse(folder: Path) -> PosedTraverse:
     """A traverse of frames that are a metre apart."""
     names = ("query", "reference") if (folder / "reference").is_dir() else ("query", "ref")
     queries, places = (
@@ -248,13 +248,13 @@ def frames_traverse(folder: Path) -> Traverse:
     queried = [number for number, references in enumerate(truth) if len(references)][:: max(1, len(queries) // 110)]
     true = np.array([(float(np.mean(truth[number])), np.nan, np.nan) for number in queried])
     poses = np.array([(number, 0, 0) for number in range(len(places))], np.float64)
-    return Traverse(places, poses, [queries[number] for number in queried], true, None)
+    return PosedTraverse(places, poses, [queries[number] for number in queried], true, None)
 
 
 Found = tuple[Array, PoseEstimate, PoseEstimate | None, PoseEstimate | None]
 
 
-def estimates(encoder: Encoder, network: XFeat, traverse: Traverse) -> Iterator[Found]:
+def estimates(encoder: Encoder, network: XFeat, traverse: PosedTraverse) -> Iterator[Found]:
     """The true pose, and the estimates without views, with views of unknown cameras, and with intrinsics, of each query
     that is recognized near where it was taken."""
     keypoints = [find_keypoints(network, frame) for frame in traverse.places]
@@ -292,7 +292,7 @@ def estimates(encoder: Encoder, network: XFeat, traverse: Traverse) -> Iterator[
         atlas.close()
 
 
-def poses(encoder: Encoder, network: XFeat, traverses: Sequence[Traverse]) -> dict[str, tuple[Errors, Errors]]:
+def poses(encoder: Encoder, network: XFeat, traverses: Sequence[PosedTraverse]) -> dict[str, tuple[Errors, Errors]]:
     """Errors of positions in metres (normalized: of x and y, or of x alone), and of headings in degrees."""
     names = ("places", "field of view", "intrinsics")
     found = {name: (Errors([], [], []), Errors([], [], [])) for name in names}

@@ -117,7 +117,7 @@ def _warped(frame: Pixels, homography: Array) -> Pixels:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparedPictures:
     """Two pictures compared.
 
     kind: the view, or the group of strangers.
@@ -144,7 +144,7 @@ class Comparison:
         return self.counts and 2 * inliers < self.matches
 
 
-def compared(kind: str, picture: str, query: Keypoints, place: Keypoints) -> Comparison:
+def compared(kind: str, picture: str, query: Keypoints, place: Keypoints) -> ComparedPictures:
     """Verify a place, and by a fundamental matrix alone."""
     (found,) = verify(query, [place])
     matches, before = len(found.matches), 0
@@ -152,7 +152,7 @@ def compared(kind: str, picture: str, query: Keypoints, place: Keypoints) -> Com
         ours, theirs = points_of(query)[found.matches[:, 0]], points_of(place)[found.matches[:, 1]]
         before = int(fitting_scene(ours, theirs).sum())
     evidence_before = evidence(matches, before, max(chance_of(query), chance_of(place)))
-    return Comparison(kind, picture, matches, found.inlier_count, before, found.evidence, evidence_before)
+    return ComparedPictures(kind, picture, matches, found.inlier_count, before, found.evidence, evidence_before)
 
 
 def pictures(datasets: Path, most: int = 0) -> list[Path]:
@@ -167,7 +167,9 @@ def thinned(found: Sequence[Path], most: int) -> list[Path]:
     return [found[at] for at in np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int)]
 
 
-def same_views(network: XFeat, frame: Pixels, picture: str, views: Sequence[str] = tuple(VIEWS)) -> list[Comparison]:
+def same_views(
+    network: XFeat, frame: Pixels, picture: str, views: Sequence[str] = tuple(VIEWS)
+) -> list[ComparedPictures]:
     """A picture compared with views of itself; its name is the seed of what is drawn at random."""
     place = find_keypoints(network, frame)
     made = []
@@ -184,7 +186,7 @@ def views_in_turn(number: int, copies: int) -> tuple[str, ...]:
     return same, *(others[(number * copies + one) % len(others)] for one in range(min(copies, len(others))))
 
 
-def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Comparison]:
+def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[ComparedPictures]:
     """Queries of a traverse, at most ``most``, and references that are far from all true ones."""
     task = load_traverses(datasets / "eval" / name, *TRAVERSES[name])
     truth = task.truth.copy()
@@ -205,14 +207,14 @@ def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Com
     return each(lambda p: compared(name, f"{p[0]} and {p[1]}", ours[p[0]], theirs[p[1]]), pairs, cores())
 
 
-def across_sets(network: XFeat, datasets: Path, most: int) -> list[Comparison]:
+def across_sets(network: XFeat, datasets: Path, most: int) -> list[ComparedPictures]:
     """Each of some pictures, and one of another set."""
     chosen = pictures(datasets, most)
     kept = dict(zip(chosen, _keypoints(network, [read(path) for path in chosen]), strict=True))
     set_of = {path: path.relative_to(datasets).parts[1] for path in chosen}
     random = np.random.default_rng(0)
 
-    def against_another(path: Path, seed: int) -> Comparison:
+    def against_another(path: Path, seed: int) -> ComparedPictures:
         others = [other for other in chosen if set_of[other] != set_of[path]]
         other = others[seed % len(others)]
         return compared("two sets", f"{path.name} and {other.name}", kept[path], kept[other])
@@ -234,7 +236,7 @@ def main(
     share_cores(cores())
     network, chosen = load_xfeat(), pictures(datasets, most)
 
-    def of_picture(number: int) -> list[Comparison]:
+    def of_picture(number: int) -> list[ComparedPictures]:
         path = chosen[number]
         views = views_in_turn(number, copies) if copies else tuple(VIEWS)
         return same_views(network, read(path), path.relative_to(datasets).as_posix(), views)
@@ -245,7 +247,7 @@ def main(
     report_strangers(strangers + across_sets(network, datasets, most))
 
 
-def report_views(made: Sequence[Comparison], count: int) -> None:
+def report_views(made: Sequence[ComparedPictures], count: int) -> None:
     """Print and write the table of views, and every comparison that fails."""
     rows: list[tuple[object, ...]] = []
     for name in [*VIEWS, ""]:
@@ -264,7 +266,7 @@ def report_views(made: Sequence[Comparison], count: int) -> None:
         print(f"{one.picture}, {one.kind}: {one.inliers} inliers of {one.matches} matches")
 
 
-def report_strangers(made: Sequence[Comparison]) -> None:
+def report_strangers(made: Sequence[ComparedPictures]) -> None:
     """Print and write the table of strangers."""
     rows: list[tuple[object, ...]] = []
     for name in [*dict.fromkeys(one.kind for one in made), ""]:

@@ -17,7 +17,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.geometry.verification import Camera, Task, traverses
+from benchmarks.geometry.verification import PictureEncoder, Task, traverses
 from benchmarks.report import report
 from core.geometry.verification import verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -82,7 +82,7 @@ def main(
     chosen = EncoderCatalogue().get(encoder)
     rows: list[tuple[object, ...]] = []
     figures: dict[str, dict[int, dict[int, tuple[float, float]]]] = {}
-    for task in traverses(Camera(chosen), datasets / "eval"):
+    for task in traverses(PictureEncoder(chosen), datasets / "eval"):
         ours, theirs = task.queries.encodings, task.references.encodings
         scores = score_matrix(chosen, ours.descriptors @ theirs.descriptors.T, ours.local, theirs.local)
         figures[task.name] = {}

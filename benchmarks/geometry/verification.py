@@ -100,7 +100,7 @@ class Task:
     fitted: bool
 
 
-class Camera:
+class PictureEncoder:
     """Turns frames into what a task needs, with one encoder and one network of keypoints."""
 
     def __init__(self, encoder: Encoder) -> None:
@@ -125,7 +125,7 @@ def zoomed(pixels: Pixels, most: float, size: tuple[int, int], generator: np.ran
     return augment(np.asarray(part, np.uint8), generator)
 
 
-def nights(camera: Camera, train: Path, distractors: Pictures, held_out: bool) -> list[Task]:
+def nights(camera: PictureEncoder, train: Path, distractors: Pictures, held_out: bool) -> list[Task]:
     """One day of each fixed camera and distractors against its nights: whole, and cut by 10 to 25 % on one side."""
     generator = np.random.default_rng(0)
     kept_out = set(split_photographs(train).held_out)
@@ -149,7 +149,7 @@ def nights(camera: Camera, train: Path, distractors: Pictures, held_out: bool) -
     ]
 
 
-def hallways(camera: Camera, train: Path) -> Task:
+def hallways(camera: PictureEncoder, train: Path) -> Task:
     """Hallways of 25 floors that look alike, at 160 x 120; every third frame is queried again, cut and disturbed."""
     generator = np.random.default_rng(1)
     paths = [path for path in find_photographs(train / "tower") if "hallway" in path.name]
@@ -162,7 +162,7 @@ def hallways(camera: Camera, train: Path) -> Task:
     return Task("hallways", queries, camera.take(shown), np.array(truth), MapSettings().same_place_frames, True)
 
 
-def drive(camera: Camera, train: Path) -> Task:
+def drive(camera: PictureEncoder, train: Path) -> Task:
     """Every second frame of a drive against the frames between, which are cut and disturbed."""
     generator = np.random.default_rng(2)
     paths = find_photographs(train / "camvid")
@@ -174,7 +174,7 @@ def drive(camera: Camera, train: Path) -> Task:
     return Task("drive", queries, references, np.array(truth), MapSettings().same_place_frames, True)
 
 
-def webcams(camera: Camera, folder: Path, distractors: Pictures) -> list[Task]:
+def webcams(camera: PictureEncoder, folder: Path, distractors: Pictures) -> list[Task]:
     """One daytime picture of each fixed camera and distractors; three times, with different pictures."""
     paths = find_photographs(folder)
     frames = [read(path) for path in paths]
@@ -193,7 +193,7 @@ def webcams(camera: Camera, folder: Path, distractors: Pictures) -> list[Task]:
     return tasks
 
 
-def traverses(camera: Camera, evaluation: Path) -> tuple[Task, Task]:
+def traverses(camera: PictureEncoder, evaluation: Path) -> tuple[Task, Task]:
     """The streets of lip6_outdoor, and corridor."""
     frames = MapSettings().same_place_frames
     walk = with_corrected_truth(load_traverses(evaluation / "lip6_outdoor", "query", "reference"))
@@ -202,7 +202,7 @@ def traverses(camera: Camera, evaluation: Path) -> tuple[Task, Task]:
     return street, Task("corridor", camera.take(walk.queries), camera.take(walk.references), walk.truth, frames, False)
 
 
-def load_tasks(camera: Camera, datasets: Path) -> list[Task]:
+def load_tasks(camera: PictureEncoder, datasets: Path) -> list[Task]:
     """All tasks, those to fit on first."""
     train, evaluation = datasets / "train", datasets / "eval"
     scenes = camera.take([read(path) for path in find_photographs(train / "scenes15")[::9]])
@@ -409,7 +409,7 @@ def main(
     chosen = EncoderCatalogue().get(encoder)
     found: list[Verified] = []
     parts: list[Verified] = []
-    for task in load_tasks(Camera(chosen), datasets):
+    for task in load_tasks(PictureEncoder(chosen), datasets):
         store: Store = {}
         found.append(verified(chosen, task, np.arange(len(task.references)), store))
         parts += halves(chosen, task, store)

@@ -42,7 +42,7 @@ SAMPLE = 1500
 INNER_PRODUCT = faiss.METRIC_INNER_PRODUCT
 
 
-class Stage:
+class FirstStage:
     """A FAISS index of rotated descriptors; ``size``: bytes of a place in memory."""
 
     def __init__(self, name: str, make: Callable[[int], Any], size: float, parameters: Any = None) -> None:
@@ -148,20 +148,20 @@ def refined(base: Callable[[int], Any], candidates: float) -> Callable[[int], An
     return make
 
 
-def stages(dimension: int) -> list[Stage | Table]:
+def stages(dimension: int) -> list[FirstStage | Table]:
     """All that are compared, the exact search first."""
     code = dimension / 8 + 8
     return [
-        Stage("IndexFlatIP, float32", faiss.IndexFlatIP, 4 * dimension),
-        Stage("IndexRaBitQ", rabitq, code),
-        Stage("IndexRaBitQFastScan", all_fast, code),
-        Stage("IndexIVFRaBitQ, 6 of 64 lists", lists, code + 8),
-        Stage("IndexHNSWRaBitQ, Euclidean", graph, code + 136),
-        Stage("IndexIVFRaBitQFastScan, 2 048 values", heads(2048), 2048 / 8 + 16),
-        Stage("IndexRefine(the same, RaBitQ), k_factor 8", refined(heads(2048), CANDIDATES), code + 2048 / 8 + 16),
-        Stage("IndexRefine(… 1 024 values, RaBitQ), 20", refined(heads(1024), 20), code + 1024 / 8 + 16),
-        Stage("IndexRefine(PCA 512, PQ 256×4, RaBitQ), 40", refined(principal, 40), code + 128 + 8),
-        Stage("IndexRefine(PQ 256×4, RaBitQ), 20", refined(products, 20), code + 128 + 8),
+        FirstStage("IndexFlatIP, float32", faiss.IndexFlatIP, 4 * dimension),
+        FirstStage("IndexRaBitQ", rabitq, code),
+        FirstStage("IndexRaBitQFastScan", all_fast, code),
+        FirstStage("IndexIVFRaBitQ, 6 of 64 lists", lists, code + 8),
+        FirstStage("IndexHNSWRaBitQ, Euclidean", graph, code + 136),
+        FirstStage("IndexIVFRaBitQFastScan, 2 048 values", heads(2048), 2048 / 8 + 16),
+        FirstStage("IndexRefine(the same, RaBitQ), k_factor 8", refined(heads(2048), CANDIDATES), code + 2048 / 8 + 16),
+        FirstStage("IndexRefine(… 1 024 values, RaBitQ), 20", refined(heads(1024), 20), code + 1024 / 8 + 16),
+        FirstStage("IndexRefine(PCA 512, PQ 256×4, RaBitQ), 40", refined(principal, 40), code + 128 + 8),
+        FirstStage("IndexRefine(PQ 256×4, RaBitQ), 20", refined(products, 20), code + 128 + 8),
         Table(),
     ]
 
@@ -237,7 +237,7 @@ def main(
     report("first-stages", f"one query against {places:,} places, {level}", columns, table, figures)
 
 
-def _timed(chosen: Sequence[Stage | Table], questions: dict[str, Array], rounds: int) -> list[tuple[float, float]]:
+def _timed(chosen: Sequence[FirstStage | Table], questions: dict[str, Array], rounds: int) -> list[tuple[float, float]]:
     """Median milliseconds of one query, and of each of eight."""
     times: list[tuple[list[float], list[float]]] = [([], []) for _ in chosen]
     for turn in range(rounds + 1):

@@ -47,7 +47,7 @@ LABELLED: Mapping[str, Mapping[str, str] | None] = {
 
 
 @dataclass(frozen=True)
-class Frame:
+class LabelledFrame:
     """A query frame, with the ids of the places that it shows; none of a stranger."""
 
     data: bytes
@@ -55,42 +55,42 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Walk:
+class LabelledWalk:
     """A data set: the frames of the map, and the query frames, in their order."""
 
     name: str
     references: Sequence[bytes]
-    queries: Sequence[Frame]
+    queries: Sequence[LabelledFrame]
 
 
-def walk(name: str, folder: Path, most: int) -> Walk:
+def walk(name: str, folder: Path, most: int) -> LabelledWalk:
     """A data set from its folder, with a limited number of queries."""
     pair = open_dataset(find_dataset(name), folder / FOLDERS[name])
     queries = [
-        Frame(path.read_bytes(), tuple(place_id(int(row)) for row in true))
+        LabelledFrame(path.read_bytes(), tuple(place_id(int(row)) for row in true))
         for path, true in zip(pair.queries, pair.truth, strict=True)
     ]
     chosen = np.unique(np.linspace(0, len(queries) - 1, min(most, len(queries))).astype(int))
     queries = [queries[index] for index in chosen]
-    return Walk(name, [path.read_bytes() for path in pair.references], queries)
+    return LabelledWalk(name, [path.read_bytes() for path in pair.references], queries)
 
 
 def place_id(row: int) -> str:
     return f"p{row:05d}"
 
 
-def halves(of: Walk, other: Walk) -> tuple[list[Frame], list[Frame]]:
+def halves(of: LabelledWalk, other: LabelledWalk) -> tuple[list[LabelledFrame], list[LabelledFrame]]:
     """The two halves of a map's queries: of the walk, and half as many strangers, evenly taken from another."""
     middle, count = len(of.queries) // 2, len(of.queries) // 2
     chosen = np.linspace(0, len(other.queries) - 1, count).astype(int)
-    strangers = [Frame(other.queries[index].data, ()) for index in chosen]
+    strangers = [LabelledFrame(other.queries[index].data, ()) for index in chosen]
     return (
         [*of.queries[:middle], *strangers[: count // 2]],
         [*of.queries[middle:], *strangers[count // 2 :]],
     )
 
 
-def ask(client: httpx.Client, map_id: str, frames: Sequence[Frame]) -> dict[str, float]:
+def ask(client: httpx.Client, map_id: str, frames: Sequence[LabelledFrame]) -> dict[str, float]:
     """The Brier score of a map's answers to frames, and the shares that are recognized and rightly so."""
     squares, recognized, right = [], 0, 0
     for frame in frames:
@@ -116,7 +116,7 @@ def query(client: httpx.Client, map_id: str, data: bytes) -> dict[str, Any]:
     return answer
 
 
-def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str] = KEPT["all"]) -> None:
+def make_map(client: httpx.Client, map_id: str, of: LabelledWalk, verdicts: Sequence[str] = KEPT["all"]) -> None:
     """A map of a walk that keeps the frames with some verdicts for review."""
     review = {"verdicts": list(verdicts), "most_frames": 10_000}
     client.post("/v1/maps", json={"id": map_id, "keep": "none", "review": review}).raise_for_status()
@@ -126,7 +126,7 @@ def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str
         client.put(path, content=data, headers={"Content-Type": kind}).raise_for_status()
 
 
-def label_kept(client: httpx.Client, map_id: str, frames: Sequence[Frame], verdicts: Sequence[str]) -> int:
+def label_kept(client: httpx.Client, map_id: str, frames: Sequence[LabelledFrame], verdicts: Sequence[str]) -> int:
     """Label the stored frames with these verdicts by the truth; returns how many there are."""
     shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in frames}
     items: list[dict[str, Any]] = []
@@ -143,7 +143,7 @@ def label_kept(client: httpx.Client, map_id: str, frames: Sequence[Frame], verdi
     return len(items)
 
 
-def measure(client: httpx.Client, of: Walk, other: Walk) -> list[dict[str, Any]]:
+def measure(client: httpx.Client, of: LabelledWalk, other: LabelledWalk) -> list[dict[str, Any]]:
     """The figures of a data set by what was labelled, how the map was calibrated, and which half was held out."""
     found: list[dict[str, Any]] = []
     parts = halves(of, other)

@@ -42,7 +42,7 @@ from lab.training.map_sizes import (
     SMALL,
     Cut,
     Judged,
-    Traverse,
+    ScoredTraverse,
     Verify,
     corridor_and_lip6,
     fitting_traverses,
@@ -62,7 +62,7 @@ RECALL = {"corridor": 0.95, "lip6": 0.87}
 MODES: tuple[Verify, ...] = ("never", "auto", "always")
 
 
-def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool) -> dict[str, Traverse]:
+def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool) -> dict[str, ScoredTraverse]:
     """The traverses by name, from the cache if they are there."""
     kept = None if cache is None else cache / f"{encoder.identity.replace('@', '-')}{'-fitted' if fitted else ''}.npz"
     if kept is not None and kept.is_file():
@@ -70,7 +70,7 @@ def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool
             names = sorted({name.rsplit(":", 1)[0] for name in read.files})
             columns = {name: {part: read[f"{name}:{part}"] for part in PARTS} for name in names}
             return {
-                name: Traverse(**columns[name], candidates=encoder.candidates, screened=encoder.screened)
+                name: ScoredTraverse(**columns[name], candidates=encoder.candidates, screened=encoder.screened)
                 for name in names
             }
     made = {
@@ -88,7 +88,7 @@ def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool
     return made
 
 
-def with_pairs(made: dict[str, Traverse], datasets: Path, cache: Path | None) -> dict[str, Traverse]:
+def with_pairs(made: dict[str, ScoredTraverse], datasets: Path, cache: Path | None) -> dict[str, ScoredTraverse]:
     """The traverses that are judged, with keypoints, from the cache if they are there; others as they are."""
     found = dict(made)
     for name, task in corridor_and_lip6(datasets):
@@ -106,7 +106,7 @@ def with_pairs(made: dict[str, Traverse], datasets: Path, cache: Path | None) ->
     return found
 
 
-def keep_pairs(made: dict[str, Traverse], cache: Path) -> None:
+def keep_pairs(made: dict[str, ScoredTraverse], cache: Path) -> None:
     """Write keypoints, and what was found of their pairs."""
     for name, pairs in ((name, traverse.pairs) for name, traverse in made.items()):
         if pairs is not None:
@@ -134,7 +134,7 @@ def share(flags: NDArray[np.bool_]) -> float | None:
 
 
 def of_size(
-    traverse: Traverse, size: int, how: Cut, calibration: Calibration, repeats: int, verify: Verify
+    traverse: ScoredTraverse, size: int, how: Cut, calibration: Calibration, repeats: int, verify: Verify
 ) -> dict[str, Any]:
     """The figures of maps of one size."""
     trials, judged = trials_of_size(traverse, size, how, calibration, repeats, verify=verify)
@@ -159,7 +159,7 @@ def of_size(
     }
 
 
-def halves(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
+def halves(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
     """Known against unknown, with either half of the references left out."""
     trials, judged = trials_of_halves(traverse, calibration, verify)
     probabilities = trials.probabilities(calibration)
@@ -176,7 +176,7 @@ def halves(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict
     }
 
 
-def whole(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
+def whole(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
     """All references: recall@1, and the verdicts."""
     kept = np.arange(traverse.truth.shape[1])
     queried = np.flatnonzero(traverse.truth.any(axis=1)).tolist()
@@ -192,7 +192,7 @@ def whole(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict[
 
 
 def verdicts(
-    traverse: Traverse,
+    traverse: ScoredTraverse,
     kept: NDArray[np.int64],
     sequence: NDArray[np.int64],
     calibration: Calibration,
@@ -204,7 +204,7 @@ def verdicts(
     return {name: found.count(name) / len(found) for name in ("recognized", "ambiguous", "unknown")}
 
 
-def duplicates(traverse: Traverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
+def duplicates(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
     """Each place in one sequence, in two, without any; and two places of one picture."""
     once = np.arange(traverse.truth.shape[1])
     nothing = np.zeros(len(once), np.int64)
@@ -246,7 +246,9 @@ def main(
         tables(mode, figures["modes"][mode], encoder, figures)
 
 
-def measured(name: str, traverse: Traverse, calibration: Calibration, repeats: int, verify: Verify) -> dict[str, Any]:
+def measured(
+    name: str, traverse: ScoredTraverse, calibration: Calibration, repeats: int, verify: Verify
+) -> dict[str, Any]:
     """All figures of one traverse."""
     references = traverse.truth.shape[1]
     made: dict[str, Any] = {}

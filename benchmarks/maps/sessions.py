@@ -66,7 +66,7 @@ WITHIN, NOTICED, HALVED = 3, 0.9, 0.5
 
 
 @dataclass(frozen=True)
-class Look:
+class FrameEvidence:
     """One frame: its own verdict, and its evidence for a session.
 
     best: the reference that it matches best alone; -1: none.
@@ -80,7 +80,7 @@ class Look:
     right: NDArray[np.bool_]
 
 
-class Walk:
+class SequenceMap:
     """A map of references in one sequence, and how frames look in it."""
 
     def __init__(self, encoder: Encoder, references: Encodings) -> None:
@@ -90,7 +90,7 @@ class Walk:
         self.graph: PlaceGraph = place_graph(self.where, np.arange(count), count, SAME_PLACE)
         self.alive = np.ones(count, np.bool_)
 
-    def looks(self, pictures: Sequence[Pixels], frames: Encodings, truth: Truth | None = None) -> list[Look]:
+    def looks(self, pictures: Sequence[Pixels], frames: Encodings, truth: Truth | None = None) -> list[FrameEvidence]:
         """The looks of frames; without a truth, no reference shows their place."""
         shown = np.zeros((len(pictures), len(self.alive)), np.bool_) if truth is None else truth
         return [
@@ -98,9 +98,9 @@ class Walk:
             for row, (pixels, right) in enumerate(zip(pictures, shown, strict=True))
         ]
 
-    def _look(self, pixels: Pixels, frame: Encodings, right: NDArray[np.bool_]) -> Look:
+    def _look(self, pixels: Pixels, frame: Encodings, right: NDArray[np.bool_]) -> FrameEvidence:
         if not frame.descriptors.any():
-            return Look(-1, "unknown", NOTHING, view_of(pixels), right)
+            return FrameEvidence(-1, "unknown", NOTHING, view_of(pixels), right)
         encoder, local = self.encoder, frame.local[0]
         scores = encoder.scores_from_inner_products(self.references.descriptors @ frame.descriptors[0])
         rows = np.argsort(-scores, kind="stable")
@@ -110,7 +110,7 @@ class Walk:
         ranked = rows[found.order]
         known = (self.where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
         judgement = judge(found.scores, *known)
-        return Look(
+        return FrameEvidence(
             int(ranked[0]),
             judgement.verdict,
             sighted(evidence(ranked, found.scores, *known), ranked, judgement),
@@ -118,14 +118,14 @@ class Walk:
             right,
         )
 
-    def followed(self, looks: Sequence[Look]) -> Iterator[tuple[Look, Estimate, Run]]:
+    def followed(self, looks: Sequence[FrameEvidence]) -> Iterator[tuple[FrameEvidence, Estimate, Run]]:
         """A session's estimate after each look."""
         run = Run(RunOptions(), self.graph)
         for look in looks:
             run.advance(look.seen, Step(), look.view)
             yield look, run.estimate(2, self.alive), run
 
-    def noticed(self, before: Sequence[Look], after: Sequence[Look]) -> tuple[int, int] | None:
+    def noticed(self, before: Sequence[FrameEvidence], after: Sequence[FrameEvidence]) -> tuple[int, int] | None:
         """After how many frames that say so, and after how many frames, a session has left the old place.
 
         None: it did not give the right place at the cut.  (AFTER + 1, AFTER + 1): it has not noticed.
@@ -146,7 +146,9 @@ class Walk:
         return AFTER + 1, AFTER + 1
 
 
-def spliced(looks: Sequence[Look], others: Sequence[Look] | None, seed: int) -> Iterator[tuple[list[Look], list[Look]]]:
+def spliced(
+    looks: Sequence[FrameEvidence], others: Sequence[FrameEvidence] | None, seed: int
+) -> Iterator[tuple[list[FrameEvidence], list[FrameEvidence]]]:
     """Stretches before and after a cut; after it, of ``others``, or of the same walk far away."""
     random = np.random.default_rng(seed)
     after = looks if others is None else others
@@ -210,7 +212,7 @@ def main(
     for name, task in tasks.items():
         kept = figures[name] = {}
         frames, references = encoded[name]
-        walk = Walk(chosen, references)
+        walk = SequenceMap(chosen, references)
         looks = walk.looks(task.queries, frames, task.truth)
         steps = list(walk.followed(looks))
 
@@ -306,13 +308,13 @@ def main(
 
 def halved(
     encoder: Encoder, pictures: Sequence[Pixels], frames: Encodings, references: Encodings, truth: Truth
-) -> tuple[Walk, list[Look], list[Look]]:
+) -> tuple[SequenceMap, list[FrameEvidence], list[FrameEvidence]]:
     """A map of the middle half of the references: the looks of frames that it has, and of frames far from all of it."""
     count = truth.shape[1]
     kept = np.arange(count // 4, count - count // 4)
     wide = np.zeros(count, np.bool_)
     wide[max(0, kept[0] - APART) : kept[-1] + APART + 1] = True
-    walk = Walk(encoder, references.at(kept))
+    walk = SequenceMap(encoder, references.at(kept))
     there = np.flatnonzero(truth[:, kept].any(axis=1))
     apart = np.flatnonzero(~truth[:, wide].any(axis=1) & truth.any(axis=1))
     known = walk.looks([pictures[row] for row in there.tolist()], frames.at(there), truth[np.ix_(there, kept)])

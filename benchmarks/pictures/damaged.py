@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import typer
 
-from benchmarks.pictures.decoders import WAYS, Refused, by_opencv
+from benchmarks.pictures.decoders import WAYS, PictureRefused, by_opencv
 from benchmarks.report import report
 from core.frames.preprocessing import Pixels
 
@@ -142,7 +142,7 @@ class Tally:
     def _decoded(self, data: bytes) -> Pixels | None:
         try:
             return self._way(data)
-        except Refused:
+        except PictureRefused:
             return None
 
 

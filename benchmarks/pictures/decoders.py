@@ -18,7 +18,7 @@ FORMATS = ("JPEG", "PNG", "WEBP")
 MOST_PIXELS = Limits().max_pixels
 
 
-class Refused(Exception):
+class PictureRefused(Exception):
     """A picture that a way does not decode."""
 
 
@@ -27,7 +27,7 @@ def by_project(data: bytes) -> Pixels:
     try:
         return decode(data)
     except InvalidImage as error:
-        raise Refused from error
+        raise PictureRefused from error
 
 
 def by_opencv(data: bytes) -> Pixels:
@@ -35,16 +35,16 @@ def by_opencv(data: bytes) -> Pixels:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
-        raise Refused from error
+        raise PictureRefused from error
     if pixels is None:
-        raise Refused
+        raise PictureRefused
     return np.asarray(pixels, np.uint8)
 
 
 def _opened(data: bytes) -> Image.Image:
     image = Image.open(io.BytesIO(data), formats=FORMATS)
     if image.width * image.height > MOST_PIXELS or getattr(image, "n_frames", 1) > 1:
-        raise Refused
+        raise PictureRefused
     return image
 
 
@@ -54,7 +54,7 @@ def by_pillow(data: bytes) -> Pixels:
         image = ImageOps.exif_transpose(_opened(data))
         return np.ascontiguousarray(np.asarray(image.convert("RGB"))[:, :, ::-1])
     except Exception as error:  # Pillow's plug-ins raise what their parsers do
-        raise Refused from error
+        raise PictureRefused from error
 
 
 def by_pillows_header(data: bytes) -> Pixels:
@@ -69,9 +69,9 @@ def by_pillows_header(data: bytes) -> Pixels:
         else:
             found = _tolerant(data)
     except Exception as error:  # as above
-        raise Refused from error
+        raise PictureRefused from error
     if found is None or found.shape[:2] != (image.height, image.width):
-        raise Refused
+        raise PictureRefused
     turned = {3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
     return np.asarray(cv2.rotate(found, turned[orientation]) if orientation in turned else found, np.uint8)
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.pictures.decoders import WAYS, Refused
+from benchmarks.pictures.decoders import WAYS, PictureRefused
 from benchmarks.process import memory, peak_memory
 from benchmarks.report import report
 
@@ -122,7 +122,7 @@ def measure(way: str) -> None:
     before, began, outcome = memory(os.getpid()), time.process_time(), "decoded"
     try:
         WAYS[way](data)
-    except Refused:
+    except PictureRefused:
         outcome = "refused"
     except MemoryError:
         outcome = "no memory"

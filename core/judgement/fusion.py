@@ -42,7 +42,7 @@ ambiguous."""
 
 
 @dataclass(frozen=True)
-class CameraView:
+class CameraRanking:
     """The ranking of one camera of a rig.
 
     rows: int64 [n], rows of the map, best first.
@@ -82,7 +82,7 @@ class Fused:
     weights: Values
 
 
-def fuse(views: Sequence[CameraView], calibration: Calibration, neighborhood: Neighborhood) -> Fused:
+def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood: Neighborhood) -> Fused:
     """Judge the frames of several cameras of a rig together, against one map.
 
     Args:

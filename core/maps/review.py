@@ -32,7 +32,7 @@ class ReviewFrame:
 
 
 @dataclass(frozen=True)
-class ReviewPage:
+class StoredReviews:
     """Some stored frames, and the number and bytes of all at that moment.
 
     frames: newest first.
@@ -58,7 +58,7 @@ class Review(Protocol):
     def shrink(self, setting: ReviewSetting) -> None:
         """Drop the oldest frames beyond new limits, and give back the room."""
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
         """The latest frames, newest first, and how many are stored in all, as of one moment.
 
         Args:

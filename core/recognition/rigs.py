@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.judgement.fusion import CameraView, Fused, fuse
+from core.judgement.fusion import CameraRanking, Fused, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
 from core.maps import Map
@@ -41,7 +41,7 @@ def locate_rig(
         ranked = rank_places(map_, encoder, encodings, question.selection)
         if not len(ranked[0].rows):
             return locate(map_, encoder, queries[:1])[0]  # no place is allowed, or there is none
-        views = [CameraView(one.rows, one.scores, one.whereabouts, one.examined, one.weights) for one in ranked]
+        views = [CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights) for one in ranked]
         fused = fuse(views, calibration, neighborhood)
         places = map_.places_at(fused.rows[: question.k].tolist())
         if None not in places:

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 
 from core.errors import InvalidRecording
 from core.recordings.messages import STAMP_BYTES, Coding, type_name
-from core.recordings.storage import ChunkedStorage, Connection, Key, Record
+from core.recordings.storage import ChunkedStorage, Key, Record, TopicConnection
 
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 _HEAD = 22
@@ -52,7 +52,7 @@ class McapStorage(ChunkedStorage):
             self._schemas[told.id] = type_name(told.name)
         elif isinstance(told, Channel):
             coding = CODINGS.get(told.message_encoding)
-            self._connections[told.id] = Connection(told.topic, self._schemas.get(told.schema_id, ""), coding)
+            self._connections[told.id] = TopicConnection(told.topic, self._schemas.get(told.schema_id, ""), coding)
         else:
             channel = self._connections.get(told.channel_id)
             self._note(told.channel_id, told.log_time, told.data, channel and channel.coding, key)

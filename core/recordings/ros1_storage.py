@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 from core.recordings.frame import NANOSECONDS
 from core.recordings.messages import STAMP_BYTES, type_name
-from core.recordings.storage import ChunkedStorage, Connection, Key, Record
+from core.recordings.storage import ChunkedStorage, Key, Record, TopicConnection
 
 _MESSAGE, _CONNECTION = 2, 7
 LARGEST_HEADER = 1 << 20
@@ -44,7 +44,7 @@ class Ros1Storage(ChunkedStorage):
             topic, kind = (
                 one.decode(errors="replace") for one in (record.fields.get("topic", b""), told.get("type", b""))
             )
-            self._connections[number] = Connection(topic, type_name(kind), "ros1")
+            self._connections[number] = TopicConnection(topic, type_name(kind), "ros1")
 
     def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str, int]:
         packing = record.fields.get("compression", b"none").decode(errors="replace")

@@ -9,7 +9,7 @@ from typing import Any
 
 from core.errors import InvalidRecording
 from core.recordings.messages import STAMP_BYTES, Coding, type_name
-from core.recordings.storage import Connection, Key, Storage, unpacked
+from core.recordings.storage import Key, Storage, TopicConnection, unpacked
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """A message that the recorder has compressed begins so; one in CDR cannot."""
@@ -45,7 +45,7 @@ class SqliteStorage(Storage):
             "SELECT id, coalesce(CAST(name AS TEXT), ''), coalesce(CAST(type AS TEXT), ''), serialization_format "
             "FROM topics ORDER BY id"
         ):
-            self._connections[number] = Connection(name, type_name(kind), CODINGS.get(coding))
+            self._connections[number] = TopicConnection(name, type_name(kind), CODINGS.get(coding))
         # There is no index by topic, and behind a damage no index helps.
         for number, row, received, start in self._rows(
             "SELECT topic_id, id, coalesce(CAST(timestamp AS INTEGER), 0), "

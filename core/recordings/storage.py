@@ -54,7 +54,7 @@ class Entry(NamedTuple):
     key: Key
 
 
-class Connection(NamedTuple):
+class TopicConnection(NamedTuple):
     """What writes messages to a topic; a topic may have several."""
 
     topic: str
@@ -70,7 +70,7 @@ class Storage(ABC):
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._connections: dict[int, Connection] = {}
+        self._connections: dict[int, TopicConnection] = {}
         self._counts: Counter[int] = Counter()
         self._found: defaultdict[int, array[int]] = defaultdict(lambda: array("q"))
         """By connection: of each picture and pose when it was received and taken, and its key."""

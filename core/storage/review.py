@@ -25,7 +25,7 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame, ReviewPage, frames_to_drop
+from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
 from core.maps.stored_fields import moment_text
 
 FILE = "review.sqlite"
@@ -105,13 +105,13 @@ class ReviewFrames:
                 _drop_oldest(connection, setting, self._held)
             connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
         conditions = ["number < ?1"] + ([] if labelled is None else [f"label IS {'NOT ' * labelled}NULL"])
         query = f"SELECT {_COLUMNS} FROM frames WHERE {' AND '.join(conditions)} ORDER BY number DESC LIMIT ?2"
         with self._using() as connection:  # nobody writes meanwhile
             rows = connection.execute(query, (2**62 if before is None else before, limit)).fetchall()
             count, size = _size(connection)
-        return ReviewPage([_frame(row) for row in rows], count, size)
+        return StoredReviews([_frame(row) for row in rows], count, size)
 
     def labelled(self) -> list[ReviewFrame]:
         query = f"SELECT {_COLUMNS} FROM frames WHERE label IS NOT NULL ORDER BY number"

@@ -31,8 +31,8 @@ from lab.baselines.system import (
     Array,
     Constants,
     Description,
-    Index,
     InnerProducts,
+    ReferenceIndex,
     Resources,
     arrays_digest,
     stack,
@@ -83,7 +83,7 @@ class Trunk:
     graph: Callable[[Tensors], ModelProto]
 
 
-class _Graph:
+class _CompactGraph:
     """Nodes and constants as they come; a value is known by its name.
 
     Raises:
@@ -133,7 +133,7 @@ MOBILENET_BLOCKS = ("2_1", "2_2", "3_1", "3_2", "4_1", "4_2", "5_1", "5_2", "5_3
 
 def mobilenet_graph(weights: Tensors) -> ModelProto:
     """MobileNetV1 down to conv5_6 (Howard et al., 2017): 1 x 3 x 224 x 224 to 1 x 1024 x 7 x 7."""
-    graph = _Graph(weights)
+    graph = _CompactGraph(weights)
 
     def rectified(values: str, name: str, stride: int, pad: int) -> str:
         made = graph.conv(values, name, graph.array(f"{name}/W"), graph.array(f"{name}/b"), stride, pad)
@@ -156,7 +156,7 @@ def squeezenet_graph(weights: Tensors) -> ModelProto:
 
     Lasagne convolves where others correlate, so that kernels are turned; the batch norm is folded in.
     """
-    graph = _Graph(weights)
+    graph = _CompactGraph(weights)
 
     def rectified(values: str, name: str, stride: int = 1, pad: int = 0) -> str:
         beta, gamma, mean, inverse = (graph.array(f"{name}/bn_{part}") for part in ("beta", "gamma", "mean", "inv_std"))
@@ -301,7 +301,7 @@ class CompactGem:
         vector = unit(generalized_mean(self._run({IMAGE: self._image(pixels)})[0][0]))
         return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return InnerProducts(stack(references))
 
 

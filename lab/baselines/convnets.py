@@ -31,7 +31,7 @@ from lab.baselines.system import (
     Array,
     Constants,
     Description,
-    Index,
+    ReferenceIndex,
     Resources,
     VectorSystem,
     stack,
@@ -50,7 +50,7 @@ IMAGENET_MEAN = (104.00699, 116.66877, 122.67892)
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedMean:
     """How the mean of a network is published: the names of its file, or the values themselves, BGR."""
 
     means: tuple[str, ...]
@@ -66,7 +66,7 @@ def mean_file(model: Path, names: Sequence[str]) -> Path | None:
     return next((present[name.lower()] for name in names if name.lower() in present), None)
 
 
-def import_published(model: Path, published: Published, side: int) -> tuple[NetworkDefinition, dict[str, Tensor]]:
+def import_published(model: Path, published: PublishedMean, side: int) -> tuple[NetworkDefinition, dict[str, Tensor]]:
     """The convolutional trunk of a published ``.caffemodel``, for an input of ``side`` x ``side`` pixels.
 
     Its mean is that of a mean file beside it, else that which the model itself names, else the published one.
@@ -85,7 +85,7 @@ def import_published(model: Path, published: Published, side: int) -> tuple[Netw
     return import_caffe(model, mean, input_size=(side, side))
 
 
-def load_trunk(path: Path, layer: str, published: Published) -> ShallowNetwork:
+def load_trunk(path: Path, layer: str, published: PublishedMean) -> ShallowNetwork:
     """The network of a ``.caffemodel``, or of a network file that was imported before, as deep as ``layer``."""
     if path.name.endswith(NETWORK_SUFFIX):
         return load_network(path, (layer,))
@@ -95,7 +95,7 @@ def load_trunk(path: Path, layer: str, published: Published) -> ShallowNetwork:
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def _extractor(path: Path, layer: str, published: Published) -> FeatureExtractor:
+def _extractor(path: Path, layer: str, published: PublishedMean) -> FeatureExtractor:
     # Only the maps are read, so what the definition says of regions is never used.
     definition = FeatureDefinition(layers=(layer,), regions=1, steps=(1.0,), unit_features=False)
     return FeatureExtractor(load_trunk(path, layer, published), definition)
@@ -115,7 +115,7 @@ ALEXNET = About(
 
 
 def build_alexnet(about: About, resources: Resources) -> PooledSystem:
-    published = Published(("ilsvrc_2012_mean.npy", "imagenet_mean.binaryproto"), IMAGENET_MEAN)
+    published = PublishedMean(("ilsvrc_2012_mean.npy", "imagenet_mean.binaryproto"), IMAGENET_MEAN)
     return PooledSystem(about, _extractor(resources.file(), "conv3", published), flatten)
 
 
@@ -167,12 +167,12 @@ class Pyramid(MapsSystem):
     def keep(self, maps: list[Array]) -> dict[str, Array]:
         return {"descriptor": spatial_pyramid_pool(*maps)}
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return Differences(stack(references))
 
 
 def build_pyramid(about: About, resources: Resources) -> Pyramid:
-    published = Published((f"{about.name}_mean.npy", "amosnet_mean.npy"))
+    published = PublishedMean((f"{about.name}_mean.npy", "amosnet_mean.npy"))
     return Pyramid(about, _extractor(resources.file(), "conv5", published))
 
 
@@ -200,7 +200,7 @@ class Places365(VectorSystem):
 
         layers = {layer.name: layer for layer in read_caffemodel(path).layers}
         side = VGG_SIDE if "conv5_3" in layers else SIDE
-        definition, weights = import_published(path, Published(("places365CNN_mean.binaryproto",)), side)
+        definition, weights = import_published(path, PublishedMean(("places365CNN_mean.binaryproto",)), side)
         trunk = definition.convolutions()[-1].name
         self._trunk = ShallowNetwork(definition, (trunk,))
         self._trunk.load_weights(weights)

@@ -34,8 +34,8 @@ from lab.baselines.system import (
     Array,
     Constants,
     Description,
-    Index,
     InnerProducts,
+    ReferenceIndex,
     Resources,
     arrays_digest,
     stack,
@@ -233,7 +233,7 @@ class CrossRegionBow(CrossRegion):
         times = {"forward": forward, "regions": found, "words": 1e3 * (time.perf_counter() - began)}
         return Description({"regions": regions, "weights": weights}, times)
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return MutualRegions(references, scale=1 / N)
 
 
@@ -271,7 +271,7 @@ class CrossRegionVlad(CrossRegion):
         times = {"forward": forward, "regions": found, "vlad": 1e3 * (time.perf_counter() - began)}
         return Description({"descriptor": vector}, times)
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         words = len(self.centers)
         return InnerProducts(stack(references), finish=lambda products: products / np.float32(words))
 
@@ -283,7 +283,7 @@ class MutualRmac(MapsSystem):
         vectors = regional_vectors(*maps)
         return {"regions": vectors, "weights": np.ones(len(vectors), np.float32)}
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return MutualRegions(references, scale=1 / len(references[0].arrays["weights"]))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
 from core.recognition.stages import score_matrix
-from lab.baselines.system import About, Array, Description, Index, InnerProducts, stack, system_identity
+from lab.baselines.system import About, Array, Description, InnerProducts, ReferenceIndex, stack, system_identity
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderSummary
@@ -96,7 +96,7 @@ class EncoderSystem:
         ]
         return [(left, top, right, bottom) for left, top, right, bottom in boxes.tolist()]
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         vectors = stack(references)
         if not self.encoder.candidates:
             return InnerProducts(vectors, finish=self.encoder.scores_from_inner_products)

@@ -26,7 +26,7 @@ from lab.baselines.system import (
     Array,
     Constants,
     Description,
-    Index,
+    ReferenceIndex,
     Resources,
     arrays_digest,
     system_identity,
@@ -283,7 +283,7 @@ class FabMap:
         times = {"forward": 1e3 * (between - began), "words": 1e3 * (time.perf_counter() - between)}
         return Description({"words": words}, times)
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         if self.tree is None:
             raise InvalidModel("fabmap has no words yet; train it on frames first.")
         return Places(references, self.tree)

@@ -29,8 +29,8 @@ from lab.baselines.system import (
     About,
     Constants,
     Description,
-    Index,
     InnerProducts,
+    ReferenceIndex,
     Resources,
     stack,
     system_identity,
@@ -138,7 +138,7 @@ class NetVladLayer:
 
 
 @dataclass(frozen=True)
-class Whitening:
+class PcaWhitening:
     """PCA whitening as one product (the paper's section 5.1): matrix [P, K·D], bias [P]."""
 
     matrix: Tensor
@@ -165,7 +165,9 @@ class NetVlad:
 
     sequential = False
 
-    def __init__(self, about: About, network: ShallowNetwork, layer: NetVladLayer, whitening: Whitening | None) -> None:
+    def __init__(
+        self, about: About, network: ShallowNetwork, layer: NetVladLayer, whitening: PcaWhitening | None
+    ) -> None:
         from core.networks.identity import json_digest, tensors_digest
 
         self.about, self.network, self.layer, self.whitening = about, network, layer, whitening
@@ -184,7 +186,7 @@ class NetVlad:
         times = {"forward": 1e3 * (between - began), "vlad": 1e3 * (time.perf_counter() - between)}
         return Description({"descriptor": vector.numpy()}, times)
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return InnerProducts(stack(references))
 
 
@@ -195,7 +197,7 @@ def build(about: About, resources: Resources) -> NetVlad:
 # Reading the published files
 
 
-Parts = tuple[ShallowNetwork, NetVladLayer, Whitening | None]
+Parts = tuple[ShallowNetwork, NetVladLayer, PcaWhitening | None]
 
 
 def load_netvlad(path: Path) -> Parts:
@@ -296,7 +298,7 @@ def _matconvnet_layer(weights: Sequence[Value]) -> NetVladLayer:
     return NetVladLayer(torch.from_numpy(assignment.T.copy()), biases, torch.from_numpy(-negated.T.copy()))
 
 
-def _matconvnet_whitening(weights: Sequence[Value], layer: NetVladLayer) -> Whitening:
+def _matconvnet_whitening(weights: Sequence[Value], layer: NetVladLayer) -> PcaWhitening:
     words, depth = layer.centers.shape
     matrix = numbers(weights[0], "The whitening", 1, 1, words * depth, None)[0, 0]  # (D·K) x P
     count = matrix.shape[1]
@@ -304,7 +306,7 @@ def _matconvnet_whitening(weights: Sequence[Value], layer: NetVladLayer) -> Whit
     bias = numbers(weights[1], "The bias of the whitening", None, None).reshape(-1)
     if len(bias) != count:
         raise InvalidModel(f"The bias of the whitening has {len(bias)} values; {count} are needed.")
-    return Whitening(torch.from_numpy(by_word.copy()), torch.from_numpy(bias))
+    return PcaWhitening(torch.from_numpy(by_word.copy()), torch.from_numpy(bias))
 
 
 # Files of the PyTorch ports
@@ -346,4 +348,4 @@ def _from_torch(checkpoint: Mapping[str, Tensor]) -> Parts:
     if f"{whitener}.weight" not in plain:
         return network, layer, None
     matrix = read(f"{whitener}.weight", None, words * depth, 1, 1)[:, :, 0, 0]
-    return network, layer, Whitening(matrix, read(f"{whitener}.bias", len(matrix)))
+    return network, layer, PcaWhitening(matrix, read(f"{whitener}.bias", len(matrix)))

@@ -33,8 +33,8 @@ from lab.baselines.system import (
     Array,
     Constants,
     Description,
-    Index,
     InnerProducts,
+    ReferenceIndex,
     Resources,
     stack,
     system_identity,
@@ -223,7 +223,7 @@ class MapsSystem(ABC):
         """The arrays that describe a frame, by name, from the maps of each layer."""
 
     @abstractmethod
-    def index(self, references: Sequence[Description]) -> Index: ...
+    def index(self, references: Sequence[Description]) -> ReferenceIndex: ...
 
     def describe(self, pixels: Pixels) -> Description:
         maps, forward = read_maps(self.extractor, pixels)
@@ -242,7 +242,7 @@ class PooledSystem(MapsSystem):
     def keep(self, maps: list[Array]) -> dict[str, Array]:
         return {"descriptor": unit(self.pool(*maps))}
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return InnerProducts(stack(references))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
-from lab.baselines.system import About, Array, Constants, Description, Index, Resources, stack, system_identity
+from lab.baselines.system import About, Array, Constants, Description, ReferenceIndex, Resources, stack, system_identity
 
 R_X, R_Y = 64, 32
 P = 8
@@ -166,7 +166,7 @@ class SeqSlam:
         patches = patch_normalize(np.asarray(grey, np.uint8)).reshape(-1)
         return Description({"patches": patches}, {"forward": 1e3 * (time.perf_counter() - began)})
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return Sequences(references)
 
 

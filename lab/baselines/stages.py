@@ -30,7 +30,7 @@ from core.recognition.question import Verifier, Verify
 from core.recognition.stages import Candidates, Positions, likeness_of_first, traverse_candidates, traverse_neighborhood
 from core.recognition.verification import CANDIDATES, verify_candidates
 from lab.baselines.encoders import LOCAL_AGREEMENT, EncoderSystem, local_of
-from lab.baselines.system import About, Array, Description, Index, InnerProducts, stack
+from lab.baselines.system import About, Array, Description, InnerProducts, ReferenceIndex, stack
 
 FIRST_STAGE, TWO_STAGES, VERIFIED = ".first-stage", ".two-stages", ".verified"
 
@@ -99,7 +99,7 @@ class VerifiedSystem(EncoderSystem):
         spent = 1e3 * (time.perf_counter() - began)
         return Description({**described.arrays, "keypoints": record}, {**described.milliseconds, "keypoints": spent})
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return ThreeStages(self.encoder, self._verify, references)
 
 

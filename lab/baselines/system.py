@@ -62,7 +62,7 @@ class Description:
         return sum(array.nbytes for array in self.arrays.values())
 
 
-class Index(Protocol):
+class ReferenceIndex(Protocol):
     """References that queries can be scored against."""
 
     def score(self, queries: Sequence[Description]) -> Array:
@@ -88,7 +88,7 @@ class System(Protocol):
     def describe(self, pixels: Pixels) -> Description:
         """Describe one frame, H x W x 3 uint8 BGR of any size; a blank frame gives a valid description too."""
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         """Prepare R >= 1 references; a sequential system takes them in the order of their traverse."""
 
 
@@ -139,7 +139,7 @@ class VectorSystem(ABC):
         vector = self.vector(pixels)
         return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return InnerProducts(stack(references))
 
 

@@ -23,14 +23,14 @@ MOST_IMAGES = 3000
 
 
 @dataclass(frozen=True)
-class Split:
+class ImageSplit:
     """Images to learn from and images to measure with, in natural order."""
 
     train: list[Path]
     held_out: list[Path]
 
 
-def split(paths: list[Path], limit: int, seed: int) -> Split:
+def split(paths: list[Path], limit: int, seed: int) -> ImageSplit:
     """Draw ``limit`` images if there are more, and hold one in five out."""
     if len(paths) > limit:
         remark(f"{limit} of {len(paths)} images are drawn (--limit).")
@@ -38,11 +38,11 @@ def split(paths: list[Path], limit: int, seed: int) -> Split:
         paths = [paths[index] for index in sorted(drawn)]
     held_out = paths[HELD_OUT - 1 :: HELD_OUT][:MOST_HELD_OUT]
     calibrating = set(held_out)
-    return Split([path for path in paths if path not in calibrating], held_out)
+    return ImageSplit([path for path in paths if path not in calibrating], held_out)
 
 
 def install_described(
-    folder: Path, name: str, network: str, network_file: Path, chosen: Split | None, seed: int
+    folder: Path, name: str, network: str, network_file: Path, chosen: ImageSplit | None, seed: int
 ) -> Encoder:
     """Make and install the encoder that a network's own description asks for.
 
@@ -54,7 +54,7 @@ def install_described(
     from core.networks.onnx_network import load_onnx_network
     from lab.conversion.encoder_making import make_encoder
 
-    taken = chosen or Split([], [])
+    taken = chosen or ImageSplit([], [])
     opened = load_onnx_network(network_file)
     with progress() as bar:
 

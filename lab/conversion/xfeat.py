@@ -103,7 +103,7 @@ def xfeat_graph(weights: Weights) -> ModelProto:
     Its input ``image`` is uint8 [H, W, 3]; its outputs are those of :class:`core.networks.xfeat.FeatureMaps`, in that
     order.  The weights stay in half precision; ONNX Runtime converts them once, when a session is made.
     """
-    graph = _Graph(weights)
+    graph = _XFeatGraph(weights)
     values = graph.add("Cast", "image", to=TensorProto.FLOAT)
     grey = graph.add("Unsqueeze", graph.add("ReduceMean", values, axes=[2], keepdims=0), graph.whole_numbers(0, 1))
     # The authors scale pixels to [0, 1] and add 1e-5 to the variance.
@@ -134,7 +134,7 @@ def xfeat_graph(weights: Weights) -> ModelProto:
     )
 
 
-class _Graph:
+class _XFeatGraph:
     """Nodes and constants as they come; a value is known by its name."""
 
     def __init__(self, weights: Weights) -> None:

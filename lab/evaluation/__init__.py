@@ -1,6 +1,6 @@
 """How well systems recognize one traverse by another: the thesis's protocol, data sets, and report."""
 
-from lab.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
+from lab.evaluation.protocol.comparison import ScalePoint, SeverityCurve, SizePoint, SystemComparison, SystemRun
 from lab.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
@@ -16,13 +16,13 @@ from lab.evaluation.protocol.results import results_csv
 __all__ = [
     "DEPTHS",
     "STAGES",
-    "Comparison",
     "Evaluation",
     "Outcome",
-    "Run",
     "ScalePoint",
     "SeverityCurve",
     "SizePoint",
+    "SystemComparison",
+    "SystemRun",
     "extended_precision",
     "judge",
     "judge_ranking",

@@ -7,7 +7,7 @@ from pathlib import Path
 from core.errors import InvalidResults
 from lab.baselines.system import About
 from lab.evaluation.data.pairs import TraversePair
-from lab.evaluation.protocol.comparison import Run
+from lab.evaluation.protocol.comparison import SystemRun
 from lab.evaluation.protocol.figures import STAGES, summarize
 from lab.evaluation.protocol.outcomes import judge, matched_scores
 from lab.evaluation.protocol.results import read_similarity
@@ -18,7 +18,7 @@ SHORT_MARK = "elsewhere"
 """In charts, where there is little room."""
 
 
-def read_others(folder: Path, pair: TraversePair) -> list[Run]:
+def read_others(folder: Path, pair: TraversePair) -> list[SystemRun]:
     """The runs of the matrices ``NAME.npy`` of a folder, with a row a query and a column a reference.
 
     Their figures are those of any run but for times and memory, which nobody measured here.
@@ -35,7 +35,7 @@ def read_others(folder: Path, pair: TraversePair) -> list[Run]:
     return [_run(path, pair) for path in paths]
 
 
-def _run(path: Path, pair: TraversePair) -> Run:
+def _run(path: Path, pair: TraversePair) -> SystemRun:
     scores = read_similarity(path)
     expected = (len(pair.queries), len(pair.references))
     if scores.shape != expected:
@@ -48,7 +48,7 @@ def _run(path: Path, pair: TraversePair) -> Run:
     evaluation = summarize(f"{path.stem} ({MARK})", outcomes, len(pair.kept), {})
     matched = matched_scores(scores, pair.kept, pair.excluded)
     evaluation = evaluation.model_copy(update=trust_figures(matched, pair.kept, outcomes, evaluation.notes))
-    return Run(
+    return SystemRun(
         about=About(path.stem, f"{path.stem} ({SHORT_MARK})", "not computed here", {"similarities": path.name}),
         identity=f"{path.stem} ({MARK})",
         evaluation=evaluation,

@@ -19,7 +19,7 @@ from lab.evaluation.cache import CacheEntry, EvaluationCache
 from lab.evaluation.data.pairs import TraversePair
 from lab.evaluation.data.published import published_figures
 from lab.evaluation.map_sizes import map_sizes
-from lab.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
+from lab.evaluation.protocol.comparison import ScalePoint, SeverityCurve, SizePoint, SystemComparison, SystemRun
 from lab.evaluation.protocol.figures import STAGES, summarize
 from lab.evaluation.protocol.outcomes import judge, matched_scores
 from lab.evaluation.protocol.trust import trust_figures
@@ -28,7 +28,7 @@ from lab.evaluation.severity import severity, severity_steps
 from lab.evaluation.subject import Described, Load, Subject, Training
 
 
-class Watch(Protocol):
+class ProgressWatch(Protocol):
     """Receives the progress of the evaluation."""
 
     def begin(self, system: str, steps: int) -> None:
@@ -57,10 +57,10 @@ def compare_systems(
     training: Training,
     load: Load,
     cache: EvaluationCache,
-    watch: Watch,
+    watch: ProgressWatch,
     extras: Extras = Extras(),
-    others: Sequence[Run] = (),
-) -> Comparison:
+    others: Sequence[SystemRun] = (),
+) -> SystemComparison:
     """Evaluate each system in turn; each result is cached as soon as it exists.
 
     Args:
@@ -70,7 +70,7 @@ def compare_systems(
     Raises:
         InvalidModel: a system gives no finite scores, or cannot learn from the images of ``training``.
     """
-    runs: list[Run] = []
+    runs: list[SystemRun] = []
     points: list[ScalePoint] = []
     sizes: list[SizePoint] = []
     curves: list[SeverityCurve] = []
@@ -87,7 +87,7 @@ def compare_systems(
         watch.end()
     ranked = best_first([*runs, *others])
     seeing = _best_encoder(systems, ranked)
-    return Comparison(
+    return SystemComparison(
         name=pair.name,
         references=pair.references,
         queries=pair.queries,
@@ -104,7 +104,7 @@ def compare_systems(
     )
 
 
-def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
+def evaluate(subject: Subject, cache: EvaluationCache) -> SystemRun:
     """The figures of one system; measured now, or taken from the cache with the times of then."""
     key = subject.key("run")
     measured = _loaded(cache.load(key), subject)
@@ -125,7 +125,7 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
     matched = matched_scores(measured.scores, subject.pair.kept, subject.pair.excluded)
     trusted = trust_figures(matched, subject.pair.kept, outcomes, evaluation.notes)
     evaluation = evaluation.model_copy(update=trusted)
-    return Run(
+    return SystemRun(
         about=subject.about,
         identity=measured.identity,
         evaluation=evaluation,
@@ -138,7 +138,7 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class SystemMeasurement:
     """The measurements before any judgement.
 
     identity: of the system, after training.
@@ -155,7 +155,7 @@ class Measurement:
     describe_milliseconds: float
 
 
-def measure(subject: Subject) -> Measurement:
+def measure(subject: Subject) -> SystemMeasurement:
     """Describe the kept references, describe the queries, score each query against all references.
 
     Raises:
@@ -166,7 +166,7 @@ def measure(subject: Subject) -> Measurement:
     index = subject.system.index(references.descriptions)
     scored = subject.score(index, queries.descriptions)
     sizes = [description.nbytes for description in references.descriptions]
-    return Measurement(
+    return SystemMeasurement(
         identity=subject.system.identity,
         scores=scored.scores,
         bytes_per_place=round(sum(sizes) / len(sizes)),
@@ -184,12 +184,12 @@ def stage_medians(described: Described) -> dict[str, float | None]:
     return {stage: float(np.median(spent)) if spent else None for stage, spent in times.items()}
 
 
-def best_first(runs: Sequence[Run]) -> list[Run]:
+def best_first(runs: Sequence[SystemRun]) -> list[SystemRun]:
     """Runs by falling AUC-PR, then recall@1, then in their order."""
     return sorted(runs, key=lambda one: (-one.evaluation.auc_pr, -(one.evaluation.recall_at["1"] or 0)))
 
 
-def _best_encoder(systems: Sequence[System], ranked: Sequence[Run]) -> EncoderSystem | None:
+def _best_encoder(systems: Sequence[System], ranked: Sequence[SystemRun]) -> EncoderSystem | None:
     """The best of the encoders, whose regions are drawn; None without an encoder."""
     encoders = {system.identity: system for system in systems if isinstance(system, EncoderSystem)}
     return next((encoders[one.identity] for one in ranked if one.identity in encoders), None)
@@ -204,16 +204,16 @@ def _steps(subject: Subject, extras: Extras) -> int:
     return steps
 
 
-def _entry(measured: Measurement) -> CacheEntry:
+def _entry(measured: SystemMeasurement) -> CacheEntry:
     values = {name: value for name, value in vars(measured).items() if name != "scores"}
     return CacheEntry(values, {"scores": measured.scores})
 
 
-def _loaded(entry: CacheEntry | None, subject: Subject) -> Measurement | None:
+def _loaded(entry: CacheEntry | None, subject: Subject) -> SystemMeasurement | None:
     if entry is None:
         return None
     try:
-        measured = Measurement(scores=np.asarray(entry.arrays["scores"], np.float32), **entry.values)
+        measured = SystemMeasurement(scores=np.asarray(entry.arrays["scores"], np.float32), **entry.values)
     except (KeyError, TypeError):
         return None
     expected = (len(subject.pair.queries), len(subject.pair.kept))

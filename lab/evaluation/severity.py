@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from core.judgement.curves import auc_pr
-from lab.baselines.system import Index
+from lab.baselines.system import ReferenceIndex
 from lab.evaluation.cache import CacheEntry, EvaluationCache
 from lab.evaluation.data.disturbances import DISTURBANCES, Disturbance
 from lab.evaluation.protocol.comparison import SeverityCurve
@@ -66,7 +66,7 @@ def _disturbed(subject: Subject, disturbance: Disturbance, level: float, seed: i
     )
 
 
-def _point(subject: Subject, index: Index, queries: Described) -> tuple[float, float]:
+def _point(subject: Subject, index: ReferenceIndex, queries: Described) -> tuple[float, float]:
     """recall@1 (0 where no query has a true reference) and AUC-PR."""
     scores = subject.score(index, queries.descriptions).scores
     outcomes = judge(scores, subject.pair.kept, subject.pair.truth, subject.pair.excluded)

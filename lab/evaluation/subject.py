@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
 from core.threads import keep_numpy_single_threaded
-from lab.baselines.system import About, Description, Index, System, Trainable
+from lab.baselines.system import About, Description, ReferenceIndex, System, Trainable
 from lab.evaluation.cache import arrays_digest, cache_key, files_digest
 from lab.evaluation.data.pairs import TraversePair
 
@@ -151,7 +151,7 @@ class Subject:
             self._advance()
         return Described(descriptions, times)
 
-    def score(self, index: Index, queries: Sequence[Description]) -> Scored:
+    def score(self, index: ReferenceIndex, queries: Sequence[Description]) -> Scored:
         """Scores of the queries, each scored and timed alone unless the system is sequential.
 
         Raises:

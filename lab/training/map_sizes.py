@@ -96,7 +96,7 @@ class Judged(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Traverse:
+class ScoredTraverse:
     """Q queries and R references, scored all against all.
 
     first, both: float32 [Q, R], the scores of the first stage and of both.
@@ -184,13 +184,13 @@ class Traverse:
 
 def scored(
     encoder: Encoder, queries: Encodings, references: Encodings, truth: NDArray[np.bool_], pairs: Pairs | None = None
-) -> Traverse:
+) -> ScoredTraverse:
     """A traverse with the scores of all its queries and references."""
     first, both = all_scores(encoder, queries, references)
     among, promised = all_scores(encoder, references, references)[1], _nothing()
     if encoder.screened > encoder.candidates:
         promised = np.stack([encoder.promise(cells, references.local) for cells in queries.local])
-    return Traverse(first, both, among, truth, encoder.candidates, pairs, promised, encoder.screened)
+    return ScoredTraverse(first, both, among, truth, encoder.candidates, pairs, promised, encoder.screened)
 
 
 def keypoints_of_frames(frames: Sequence[Pixels]) -> list[Keypoints]:
@@ -205,7 +205,7 @@ def all_scores(encoder: Encoder, queries: Encodings, references: Encodings) -> t
     return first, first + np.stack([encoder.agreement(cells, references.local) for cells in queries.local])
 
 
-def cut(traverse: Traverse, size: int, how: Cut, generator: np.random.Generator) -> Positions:
+def cut(traverse: ScoredTraverse, size: int, how: Cut, generator: np.random.Generator) -> Positions:
     """The references of one map, int64 [size], ascending."""
     count = traverse.truth.shape[1]
     if how == "spread":
@@ -215,7 +215,7 @@ def cut(traverse: Traverse, size: int, how: Cut, generator: np.random.Generator)
 
 
 def trials_of_size(
-    traverse: Traverse,
+    traverse: ScoredTraverse,
     size: int,
     how: Cut,
     calibration: Calibration,
@@ -242,7 +242,7 @@ def trials_of_size(
 
 
 def trials_of_halves(
-    traverse: Traverse, calibration: Calibration, verify: Verify = "never"
+    traverse: ScoredTraverse, calibration: Calibration, verify: Verify = "never"
 ) -> tuple[Trials, list[Judged]]:
     """Trials of all queries against maps of the first and of the second half of the references."""
     middle, end = traverse.truth.shape[1] // 2, traverse.truth.shape[1]
@@ -262,7 +262,7 @@ def corridor_and_lip6(datasets: Path) -> Iterator[tuple[str, TraverseTask]]:
     yield "lip6", with_corrected_truth(load_traverses(datasets / "eval/lip6_outdoor", "query", "reference"))
 
 
-def fitting_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, Traverse]]:
+def fitting_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, ScoredTraverse]]:
     """The traverses that are fitted to: two stretches of nordland_tiny, and the sequences of camvid."""
     folder = datasets / "eval/nordland_tiny"
     for start, stop in STRETCHES:
@@ -274,7 +274,7 @@ def fitting_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, T
         yield f"camvid {name}", _drive(encoder, [read(path) for path in paths])
 
 
-def _drive(encoder: Encoder, frames: Sequence[Pixels], keypoints: Sequence[Keypoints] | None = None) -> Traverse:
+def _drive(encoder: Encoder, frames: Sequence[Pixels], keypoints: Sequence[Keypoints] | None = None) -> ScoredTraverse:
     """A traverse of frames that were taken in one drive.
 
     Every third frame is a reference, and the others are queries that show the place of the reference beside them.
@@ -288,7 +288,7 @@ def _drive(encoder: Encoder, frames: Sequence[Pixels], keypoints: Sequence[Keypo
     return scored(encoder, described.at(queried), described.at(kept), np.abs(queried[:, None] - kept) <= 2, pairs)
 
 
-def verifiable_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, Traverse]]:
+def verifiable_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, ScoredTraverse]]:
     """The sequences of camvid with keypoints, without the frames of a car that stood still.
 
     These show what the frame before shows, so that strangers would be none.
@@ -310,7 +310,7 @@ def _grouped(paths: Sequence[Path]) -> list[tuple[str, list[Path]]]:
     return [(name, [path for path in paths if path.stem.split("_")[0] == name]) for name in names]
 
 
-def fit_environment(encoder: Encoder, datasets: Path, traverses: Sequence[tuple[str, Traverse]]) -> Environment:
+def fit_environment(encoder: Encoder, datasets: Path, traverses: Sequence[tuple[str, ScoredTraverse]]) -> Environment:
     """The prior of the scores of other places: floors of tower, sequences of camvid, stretches of nordland_tiny.
 
     Each of the three kinds counts alike.  By moments: μ₀ and σ₀² are the means of the environments' means and
@@ -343,7 +343,7 @@ def fit_environment(encoder: Encoder, datasets: Path, traverses: Sequence[tuple[
     )
 
 
-def widened(calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int = 3) -> Environment:
+def widened(calibration: Calibration, traverses: Sequence[tuple[str, ScoredTraverse]], repeats: int = 3) -> Environment:
     """The calibration's environment with the least deviation, in twentieths more, that refuses strangers of small maps.
 
     The environments of the training data are few, and the threshold is found in maps for which nothing is imagined.
@@ -367,7 +367,7 @@ def widened(calibration: Calibration, traverses: Sequence[tuple[str, Traverse]],
 
 
 def _in_small_maps(
-    calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int
+    calibration: Calibration, traverses: Sequence[tuple[str, ScoredTraverse]], repeats: int
 ) -> Iterator[tuple[str, Trials]]:
     """Trials in maps of each of the SMALL sizes, runs and drawn ones, with the kind of traverse."""
     for name, traverse in traverses:
@@ -393,7 +393,9 @@ def _moments(values: Sequence[float], shares: Sequence[float]) -> tuple[float, f
     return mean, float(np.average(np.square(np.array(values) - mean), weights=shares))
 
 
-def fit_small_maps(calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int = 10) -> Curve:
+def fit_small_maps(
+    calibration: Calibration, traverses: Sequence[tuple[str, ScoredTraverse]], repeats: int = 10
+) -> Curve:
     """The calibration's curve with what changes where the background is imagined.
 
     Slope and intercept for full maps stay.  The two other parameters are fitted by maximum likelihood to maps of
@@ -417,7 +419,7 @@ def fit_small_maps(calibration: Calibration, traverses: Sequence[tuple[str, Trav
 
 
 def fit_geometry(
-    calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int = 10
+    calibration: Calibration, traverses: Sequence[tuple[str, ScoredTraverse]], repeats: int = 10
 ) -> GeometryTerms:
     """The terms of evidence, by maximum likelihood with SUPPORT given.
 

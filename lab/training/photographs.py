@@ -25,7 +25,7 @@ REAL_NIGHTS = 0.75
 
 
 @dataclass(frozen=True)
-class Split:
+class PhotographSplit:
     """Photographs to train on and held-out photographs, as paths."""
 
     train: tuple[Path, ...]
@@ -44,7 +44,7 @@ def find_photographs(folder: Path) -> tuple[Path, ...]:
     return found
 
 
-def split_photographs(folder: Path) -> Split:
+def split_photographs(folder: Path) -> PhotographSplit:
     """Keep out one photograph in fifty by its name's hash, and every third camera of ``day_night``.
 
     The rule depends on names alone, so every machine and every later stage sees the same split.
@@ -61,7 +61,7 @@ def split_photographs(folder: Path) -> Split:
             digest = hashlib.sha256(relative.as_posix().encode()).digest()
             out = digest[0] * 256 + digest[1] < 65536 // 50
         (held_out if out else train).append(path)
-    return Split(tuple(train), tuple(held_out))
+    return PhotographSplit(tuple(train), tuple(held_out))
 
 
 def source_weights(paths: tuple[Path, ...], folder: Path) -> NDArray[np.float64]:

@@ -65,7 +65,7 @@ STAGES = ("first stage alone", "with local agreement", "with local agreement and
 COLUMNS = ("corridor recall@1", "corridor AUC-PR", "lip6 recall@1", "lip6 AUC-PR", "webcams recall@1", "night recall@1")
 
 
-class Geometry:
+class VerifiedPairs:
     """The gain by verification of the scores of pairs of pictures of two sets; a pair is verified once."""
 
     def __init__(self, queries: list[Keypoints], references: list[Keypoints], store: Path) -> None:
@@ -86,13 +86,13 @@ class Geometry:
         return scores + np.where(chosen, self.known, np.float32(0))
 
 
-class Traverses:
+class TraverseEvaluation:
     """Two traverses, their keypoints, and the figures of an encoder on them."""
 
     def __init__(self, name: str, task: TraverseTask, network: XFeat, cache: Path) -> None:
         self.task = task
         self.references = found(network, task.references, name)
-        self.geometry = Geometry(found(network, task.queries, name), self.references, cache / f"{name}.npy")
+        self.geometry = VerifiedPairs(found(network, task.queries, name), self.references, cache / f"{name}.npy")
 
     def figures(self, encoder: Encoder, references: Encodings) -> list[tuple[float, float]]:
         """Recall@1 and AUC-PR by one, two and three stages."""
@@ -108,14 +108,14 @@ class Traverses:
         return float(matched.mean()), auc_pr(answers.max(axis=1), matched)
 
 
-class Cameras:
+class CameraEvaluation:
     """Fixed cameras among distractors, their keypoints, and the figures of an encoder on them."""
 
     def __init__(self, name: str, task: CameraTask, network: XFeat, distractors: list[Keypoints], cache: Path) -> None:
         self.task = task
         pictures = found(network, task.pictures, name)
-        self.among = Geometry(pictures, pictures, cache / f"{name}-among.npy")
-        self.far = Geometry(pictures, distractors, cache / f"{name}-far.npy")
+        self.among = VerifiedPairs(pictures, pictures, cache / f"{name}-among.npy")
+        self.far = VerifiedPairs(pictures, distractors, cache / f"{name}-far.npy")
 
     def figures(self, encoder: Encoder, distractors: Encodings) -> list[float]:
         """Recall@1 by one, two and three stages.
@@ -181,11 +181,13 @@ def main(
     others = [with_vocabulary(packaged, seed, vocabulary_pictures(datasets, images, seed), cache) for seed in further]
     encoders = [packaged, *others]
     network, tasks = load_xfeat(), load_tasks(datasets)
-    corridor = Traverses("corridor", load_traverses(datasets / "eval/corridor", "query", "ref"), network, cache)
-    lip6 = Traverses("lip6", tasks.lip6, network, cache)
+    corridor = TraverseEvaluation(
+        "corridor", load_traverses(datasets / "eval/corridor", "query", "ref"), network, cache
+    )
+    lip6 = TraverseEvaluation("lip6", tasks.lip6, network, cache)
     distractors = lip6.references[:DISTRACTORS]
     cameras = [
-        Cameras(name, task, network, distractors, cache)
+        CameraEvaluation(name, task, network, distractors, cache)
         for name, task in (("webcams", tasks.webcams), ("night", tasks.night))
     ]
     store = cache / "figures.json"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.day.drive import Drive, drive
+from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
 from benchmarks.day.robots import Asking, Mode, Verify
 from benchmarks.day.situations import SITUATIONS, Moment, moments
-from benchmarks.day.walks import Walk, drawn
+from benchmarks.day.walks import WalkPair, drawn
 from placerec_client import Client
 from tests.service.server import Server
 
@@ -21,14 +21,14 @@ SHORT = 0.35
 
 
 @pytest.fixture(scope="module")
-def walk() -> Walk:
+def walk() -> WalkPair:
     return drawn()
 
 
 class Day:
     """A real service with the maps of the drawn walk, and robots in it."""
 
-    def __init__(self, folder: Path, walk: Walk) -> None:
+    def __init__(self, folder: Path, walk: WalkPair) -> None:
         self._folder, self._walk, self._made = folder, walk, set[Change]()
         self.server = Server(folder).wait()
 
@@ -37,7 +37,7 @@ class Day:
         assert self.server.stop() == 0
         self.server = Server(self._folder, reservation=port).wait()
 
-    def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> Drive:
+    def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> DriveOutcomes:
         """What becomes of a robot in a situation."""
         url, change = str(self.server.client.base_url), SITUATIONS[situation].map
         if change not in self._made:
@@ -49,7 +49,7 @@ class Day:
 
 
 @pytest.fixture(scope="module")
-def day(tmp_path_factory: pytest.TempPathFactory, walk: Walk) -> Iterator[Day]:
+def day(tmp_path_factory: pytest.TempPathFactory, walk: WalkPair) -> Iterator[Day]:
     made = Day(tmp_path_factory.mktemp("day"), walk)
     yield made
     assert made.server.stop() == 0
@@ -105,7 +105,7 @@ def test_a_session_goes_on_after_a_restart(day: Day) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", SITUATIONS)
-def test_a_situation_is_the_same_each_time(walk: Walk, name: str) -> None:
+def test_a_situation_is_the_same_each_time(walk: WalkPair, name: str) -> None:
     first, second = (list(moments(SITUATIONS[name], walk, 0.1)) for _ in range(2))
     assert first == second
     seconds = [moment.second for moment in first]
@@ -122,12 +122,12 @@ def _ways(way: list[Moment]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["passing", "reverse", "stop and go", "leaving and coming back", "pace 0.3"])
-def test_wheels_measure_how_far_a_robot_goes(walk: Walk, name: str) -> None:
+def test_wheels_measure_how_far_a_robot_goes(walk: WalkPair, name: str) -> None:
     truth, wheels = _ways(list(moments(SITUATIONS[name], walk)))
     assert np.allclose(wheels, truth, rtol=0.1)
 
 
-def test_wheels_do_not_notice_that_a_robot_is_carried(walk: Walk) -> None:
+def test_wheels_do_not_notice_that_a_robot_is_carried(walk: WalkPair) -> None:
     truth, wheels = _ways(list(moments(SITUATIONS["carried off"], walk, SHORT)))
     assert truth.max() > 10
     assert wheels[truth.argmax()] == 0

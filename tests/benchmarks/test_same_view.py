@@ -10,7 +10,7 @@ from benchmarks.geometry.same_view import (
     SETS,
     TRAVERSES,
     VIEWS,
-    Comparison,
+    ComparedPictures,
     compared,
     pictures,
     same_views,
@@ -34,7 +34,7 @@ def network() -> XFeat:
     return load_xfeat()
 
 
-def failed(made: list[Comparison]) -> list[Comparison]:
+def failed(made: list[ComparedPictures]) -> list[ComparedPictures]:
     return [one for one in made if one.fails(one.inliers)]
 
 
@@ -58,7 +58,7 @@ def test_strangers_have_no_more_evidence(network: XFeat) -> None:
 @pytest.mark.skipif(not HERE, reason="the pictures of ../shared/datasets are not here")
 def test_real_pictures_are_recognized(network: XFeat) -> None:
     """Each is compared with itself, and some with one other view, all of which have their turn."""
-    made: list[Comparison] = []
+    made: list[ComparedPictures] = []
     for number, path in enumerate(pictures(DATASETS, PICTURES)):
         views = views_in_turn(number // EVERY, 1) if number % EVERY == 0 else ("the same",)
         made += same_views(network, read(path), path.relative_to(DATASETS).as_posix(), views)

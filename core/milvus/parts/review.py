@@ -14,7 +14,7 @@ from psycopg import Connection
 
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame, ReviewPage, frames_to_drop
+from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
@@ -87,14 +87,14 @@ class MilvusReview:
         going = frames_to_drop(connection.execute(query, (self._map,)), count, size, setting, self._held)
         connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
 
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> ReviewPage:
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
         also = "" if labelled is None else f" AND label IS {'NOT ' * labelled}NULL"
         query = (
             f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number < %s{also} ORDER BY number DESC LIMIT %s"
         )
         with self._reading() as connection:
             found = connection.execute(query, (self._map, 2**62 if before is None else before, limit)).fetchall()
-            return ReviewPage([_frame(values) for values in found], *self._size(connection))
+            return StoredReviews([_frame(values) for values in found], *self._size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
         query = f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND label IS NOT NULL ORDER BY number"

@@ -23,7 +23,7 @@ EPSILON = 1e-5
 
 
 @dataclass(frozen=True)
-class Convolution:
+class NormalizedConvolution:
     """A convolution that includes the normalization after it: weight [K, C, k, k] and bias [K]."""
 
     weight: Tensor
@@ -34,13 +34,13 @@ class Convolution:
 
 
 @dataclass(frozen=True)
-class Block:
+class BottleneckBlock:
     """A bottleneck: convolutions of 1 x 1, 3 x 3 and 1 x 1; the input is added, through ``shortcut`` if needed."""
 
-    narrow: Convolution
-    see: Convolution
-    widen: Convolution
-    shortcut: Convolution | None
+    narrow: NormalizedConvolution
+    see: NormalizedConvolution
+    widen: NormalizedConvolution
+    shortcut: NormalizedConvolution | None
     stride: int
 
     def __call__(self, maps: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class ResNet50:
         self._weights = weights
         self.first = self._convolution("0", "1", 7, 3)
         channels = len(self.first.bias)
-        self.blocks: list[Block] = []
+        self.blocks: list[BottleneckBlock] = []
         for place, count, stride in GROUPS:
             for index in range(count):
                 block = self._block(f"{place}.{index}", channels, 1 if index else stride, shortcut=not index)
@@ -77,16 +77,16 @@ class ResNet50:
             maps = block(maps)
         return maps
 
-    def _block(self, name: str, channels: int, stride: int, shortcut: bool) -> Block:
+    def _block(self, name: str, channels: int, stride: int, shortcut: bool) -> BottleneckBlock:
         narrow = self._convolution(f"{name}.conv1", f"{name}.bn1", 1, channels)
         see = self._convolution(f"{name}.conv2", f"{name}.bn2", 3, len(narrow.bias))
         widen = self._convolution(f"{name}.conv3", f"{name}.bn3", 1, len(see.bias))
         around = self._convolution(f"{name}.downsample.0", f"{name}.downsample.1", 1, channels) if shortcut else None
         if len(widen.bias) != (channels if around is None else len(around.bias)):
             raise InvalidModel(f"{name} cannot be added to what comes into it: their channels differ.")
-        return Block(narrow, see, widen, around, stride)
+        return BottleneckBlock(narrow, see, widen, around, stride)
 
-    def _convolution(self, convolution: str, normalization: str, kernel: int, channels: int) -> Convolution:
+    def _convolution(self, convolution: str, normalization: str, kernel: int, channels: int) -> NormalizedConvolution:
         """(w·x - μ)·γ/√(σ² + ε) + β as one convolution."""
         weight = self._read(f"{convolution}.weight", None, channels, kernel, kernel)
         count = len(weight)
@@ -96,7 +96,7 @@ class ResNet50:
         if (variance < 0).any():
             raise InvalidModel(f"{normalization}.running_var has negative values.")
         factor = gamma / torch.sqrt(variance + EPSILON)
-        return Convolution(weight * factor[:, None, None, None], beta - mean * factor)
+        return NormalizedConvolution(weight * factor[:, None, None, None], beta - mean * factor)
 
     def _read(self, name: str, *shape: int | None) -> Tensor:
         if name not in self._weights:

@@ -24,7 +24,7 @@ from lab.commands.evaluation.saved_results import SavedOptions
 from lab.commands.evaluation.systems import SystemOptions, show_list
 from lab.commands.evaluation.traverses import RecordingsOptions, TraverseOptions, choose_training
 from lab.commands.evaluation.truth import TruthOptions
-from lab.evaluation import Comparison
+from lab.evaluation import SystemComparison
 from service.commands.console import progress, remark
 from service.commands.encoders.models import load_image, open_catalogue
 from service.commands.options.objects import takes
@@ -145,7 +145,7 @@ class _Bar:
         self._bar.update(self._task, completed=self._steps)
 
 
-def _show(comparison: Comparison, cache: EvaluationCache) -> None:
+def _show(comparison: SystemComparison, cache: EvaluationCache) -> None:
     figures = [run.evaluation for run in comparison.runs]
     first = figures[0]
     title = f"{comparison.name}: {first.queries} queries against {first.references} references"

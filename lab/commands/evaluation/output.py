@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from lab.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
-from lab.evaluation.data.published import RECALLS, Published
+from lab.evaluation import DEPTHS, Evaluation, Outcome, SystemComparison, SystemRun
+from lab.evaluation.data.published import RECALLS, PublishedRecall
 from lab.evaluation.protocol.results import results_csv
 from service.commands.console import number, remark, show, table, write_file
 from service.commands.encoders.models import name_of
@@ -71,7 +71,7 @@ class OutputOptions:
 
         return Extras(self.scalability, self.severity, seed, map_sizes=self.report is not None)
 
-    def write(self, comparison: Comparison, runs: Sequence[Run], elsewhere: Sequence[Run]) -> None:
+    def write(self, comparison: SystemComparison, runs: Sequence[SystemRun], elsewhere: Sequence[SystemRun]) -> None:
         """Write the files that the options name.
 
         Args:
@@ -112,7 +112,7 @@ def show_figures(figures: Sequence[Evaluation], title: str, verified: Sequence[s
     show(shown)
 
 
-def verify_of(run: Run) -> str | None:
+def verify_of(run: SystemRun) -> str | None:
     """When a system verified the geometry of its matches: auto, always or never; None if others have computed it."""
     return None if run.elsewhere else str(run.about.configuration.get("verification.verify", "never"))
 
@@ -161,7 +161,7 @@ def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Se
         remark(f"Taken from the cache, times included: {', '.join(cached)}.")
 
 
-def show_published(published: Sequence[Published]) -> None:
+def show_published(published: Sequence[PublishedRecall]) -> None:
     """A table of what others have published of the protocol; nothing where nobody has."""
     heads = (f"#recall@{depth}" for depth in RECALLS)
     title = "Published by others of this protocol; not measured here"
@@ -173,7 +173,7 @@ def show_published(published: Sequence[Published]) -> None:
         show(shown)
 
 
-def show_trends(comparison: Comparison) -> None:
+def show_trends(comparison: SystemComparison) -> None:
     """Tables of growing traverses and of disturbed queries, where they were measured."""
     if comparison.scalability:
         shown = table(
@@ -195,14 +195,14 @@ def show_trends(comparison: Comparison) -> None:
         show(shown)
 
 
-def run_json(run: Run) -> dict[str, Any]:
+def run_json(run: SystemRun) -> dict[str, Any]:
     """The figures of a run and its system."""
     about = {"title": run.about.title, "paper": run.about.paper, "configuration": dict(run.about.configuration)}
     marks = {"verify": verify_of(run), "cached": run.cached, **({"elsewhere": True} if run.elsewhere else {})}
     return {**run.evaluation.model_dump(), **about, **marks}
 
 
-def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, Any]:
+def comparison_json(comparison: SystemComparison, runs: Sequence[SystemRun]) -> dict[str, Any]:
     """The first run's figures on the top level, those of all in ``encoders``, and what else was measured.
 
     Args:

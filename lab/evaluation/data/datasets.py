@@ -7,7 +7,7 @@ from pathlib import Path
 
 from core.errors import InvalidGroundTruth, InvalidTraverse
 from core.frames.traverses import Truth, read_ground_truth
-from lab.evaluation.data.layouts import TRUTH_FILE, Layout, Traverses, folders
+from lab.evaluation.data.layouts import TRUTH_FILE, DatasetLayout, LayoutTraverses, folders
 from lab.evaluation.data.pairs import TraversePair, all_references, count_negatives, leave_run_out
 from lab.evaluation.data.presets import DATASETS, Dataset
 
@@ -58,7 +58,7 @@ def open_dataset(dataset: Dataset, folder: Path, reduced: bool = False, seed: in
     return TraversePair(dataset.title, references, queries, truth, kept, notes, excluded, dataset.name)
 
 
-def _find(dataset: Dataset, folder: Path) -> tuple[Layout, Path]:
+def _find(dataset: Dataset, folder: Path) -> tuple[DatasetLayout, Path]:
     """The layout in which the data set lies there, and the folder that holds it."""
     plain = () if not dataset.references else (folders("two folders", "", dataset.references, dataset.queries),)
     # The layout with a truth of its own comes before the folders alone.
@@ -86,7 +86,7 @@ def _missing(dataset: Dataset, folder: Path) -> str:
     )
 
 
-def _read(dataset: Dataset, layout: Layout, base: Path) -> Traverses:
+def _read(dataset: Dataset, layout: DatasetLayout, base: Path) -> LayoutTraverses:
     try:
         return layout.read(base)
     except InvalidGroundTruth as error:
@@ -101,7 +101,7 @@ def _or_own(dataset: Dataset, base: Path, error: InvalidGroundTruth) -> InvalidG
     return InvalidGroundTruth(f"{dataset.title}: {error} Or put its truth into {where}, with rows query,reference.")
 
 
-def _truth(dataset: Dataset, layout: Layout, base: Path, found: Traverses) -> Truth:
+def _truth(dataset: Dataset, layout: DatasetLayout, base: Path, found: LayoutTraverses) -> Truth:
     path = base / TRUTH_FILE
     if path.is_file():
         return read_ground_truth(path, len(found.queries), len(found.references))
@@ -119,7 +119,7 @@ def _truth(dataset: Dataset, layout: Layout, base: Path, found: Traverses) -> Tr
         raise _or_own(dataset, base, error) from error
 
 
-def _truth_files(dataset: Dataset, layout: Layout) -> list[str]:
+def _truth_files(dataset: Dataset, layout: DatasetLayout) -> list[str]:
     """The files in which publishers keep the truth."""
     return list(dict.fromkeys(one.truth_file for one in (layout, *dataset.layouts) if one.truth_file))
 

@@ -23,7 +23,7 @@ Names = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Traverses:
+class LayoutTraverses:
     """The traverses of a layout.
 
     truth: of each query; None where a rule has to say it.
@@ -39,7 +39,7 @@ class Traverses:
 
 
 @dataclass(frozen=True)
-class Layout:
+class DatasetLayout:
     """One way to lay out a data set.
 
     publisher: who hands it out so.
@@ -53,7 +53,7 @@ class Layout:
     publisher: str
     home: str
     holds: tuple[Names, ...]
-    read: Callable[[Path], Traverses]
+    read: Callable[[Path], LayoutTraverses]
     truth_file: str = ""
     inside: str = ""
 
@@ -101,7 +101,7 @@ def folders(
     truth_file: str = "",
     read_truth: Reader | None = None,
     only: str = "",
-) -> Layout:
+) -> DatasetLayout:
     """Two folders of images side by side.
 
     Args:
@@ -109,14 +109,14 @@ def folders(
         only: a text file with the names of the images that count, one a line, where it is there.
     """
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         known, queried = _images(base, references, only), _images(base, queries, only)
         path = present(base, (truth_file,)) if truth_file else None
         if path is None or read_truth is None or (base / TRUTH_FILE).is_file():
-            return Traverses(known, queried)
-        return Traverses(known, queried, read_truth(path, queried, known))
+            return LayoutTraverses(known, queried)
+        return LayoutTraverses(known, queried, read_truth(path, queried, known))
 
-    return Layout(publisher, home, (references, queries), read, truth_file)
+    return DatasetLayout(publisher, home, (references, queries), read, truth_file)
 
 
 def _images(base: Path, names: Names, only: str) -> list[Path]:
@@ -132,14 +132,14 @@ def _images(base: Path, names: Names, only: str) -> list[Path]:
     return images
 
 
-def downloaded(name: str, queries: str = "queries", references: Names = ("database", "gallery")) -> Layout:
+def downloaded(name: str, queries: str = "queries", references: Names = ("database", "gallery")) -> DatasetLayout:
     """As VPR-datasets-downloader (Berton et al., 2022) writes it: positions in the names of the files."""
     return folders("VPR-datasets-downloader", f"datasets/{name}/images/test", references, (queries,))
 
 
 def group(
     home: str, references: Names, queries: Names, truth_file: str, columns: tuple[int, int] | None = None
-) -> Layout:
+) -> DatasetLayout:
     """A folder of the tree in which the thesis's group published its data sets.
 
     Args:
@@ -151,24 +151,24 @@ def group(
     return folders("The thesis's group", home, known, queried, truth_file, reader)
 
 
-def vpr_bench(name: str, own_truth: bool = False) -> Layout:
+def vpr_bench(name: str, own_truth: bool = False) -> DatasetLayout:
     """As VPR-Bench (Zaffar et al., IJCV 2021) hands it out, with its own truth where it is requested."""
     truth = ("ground_truth_new.npy", read_array) if own_truth else ()
     return folders("VPR-Bench", f"datasets/{name}", ("ref",), ("query",), *truth)
 
 
-def vpr_tutorial(name: str, references: str, queries: str, masks: bool = False) -> Layout:
+def vpr_tutorial(name: str, references: str, queries: str, masks: bool = False) -> DatasetLayout:
     """As VPR_Tutorial (Schubert et al., RAM 2023) downloads it; with ``masks`` its ``GT.npz`` says what is true."""
     found = folders("VPR_Tutorial", f"images/{name}", (references,), (queries,))
     if not masks:
         return found
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         plain = found.read(base)
         truth, excluded = read_masks(base / "GT.npz", plain.queries, plain.references)
-        return Traverses(plain.references, plain.queries, truth, excluded)
+        return LayoutTraverses(plain.references, plain.queries, truth, excluded)
 
-    return Layout(found.publisher, found.home, (*found.holds, ("GT.npz",)), read, "GT.npz")
+    return DatasetLayout(found.publisher, found.home, (*found.holds, ("GT.npz",)), read, "GT.npz")
 
 
 def located(root: Path, name: str) -> Path | None:

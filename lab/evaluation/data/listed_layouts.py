@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from core.errors import InvalidGroundTruth, InvalidModel, InvalidTraverse
 from core.frames.traverses import Truth
 from lab.conversion.matfiles import read_mat
-from lab.evaluation.data.layouts import Layout, Names, Traverses, existing, located, present
+from lab.evaluation.data.layouts import DatasetLayout, LayoutTraverses, Names, existing, located, present
 from lab.evaluation.data.poses import near
 from lab.evaluation.data.truth_files import read_array, read_positions
 
 
-def dbstruct(home: str, files: Names, references: Names, queries: Names) -> Layout:
+def dbstruct(home: str, files: Names, references: Names, queries: Names) -> DatasetLayout:
     """A ``.mat`` file with a structure dbStruct, as NetVLAD's authors hand out Pittsburgh and Tokyo 24/7.
 
     Args:
@@ -26,7 +26,7 @@ def dbstruct(home: str, files: Names, references: Names, queries: Names) -> Layo
         references, queries: folders from which its names of images count; "." is ``home``.
     """
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         path = present(base, files)
         assert path is not None, "found"
         fields = _fields(path)
@@ -34,16 +34,16 @@ def dbstruct(home: str, files: Names, references: Names, queries: Names) -> Layo
         at_known = _positions(fields, ("utmDb", "locDb"), len(known), path)
         at_queried = _positions(fields, ("utmQ", "locQ"), len(queried), path)
         metres = _scalar(fields, "posDistThr", path)
-        return Traverses(
+        return LayoutTraverses(
             existing(_root(base, references, known[0]), known, path),
             existing(_root(base, queries, queried[0]), queried, path),
             near(at_queried, at_known, metres)[0],
         )
 
-    return Layout("NetVLAD's dbStruct", home, (files,), read, files[0])
+    return DatasetLayout("NetVLAD's dbStruct", home, (files,), read, files[0])
 
 
-def patch_netvlad(name: str, truth: str = "") -> Layout:
+def patch_netvlad(name: str, truth: str = "") -> DatasetLayout:
     """Patch-NetVLAD's lists of images (Hausler et al., CVPR 2021), beside the data sets that they name.
 
     Args:
@@ -55,27 +55,27 @@ def patch_netvlad(name: str, truth: str = "") -> Layout:
     ]
     positions = (f"dataset_gt_files/{truth}.npz", f"{truth}.npz")
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         known, queried = (_listed_images(base, names) for names in lists)
         if not truth:
-            return Traverses(known, queried)
+            return LayoutTraverses(known, queried)
         path = present(base, positions)
         assert path is not None, "found"
         at_queried, at_known, distance = read_positions(path)
         for images, positions_of, what in ((queried, at_queried, "queries"), (known, at_known, "references")):
             if len(images) != len(positions_of):
                 raise InvalidGroundTruth(f"{path.name} has {len(positions_of)} {what}, and the list {len(images)}.")
-        return Traverses(known, queried, near(at_queried, at_known, distance)[0])
+        return LayoutTraverses(known, queried, near(at_queried, at_known, distance)[0])
 
     held = (*lists, positions) if truth else tuple(lists)
-    return Layout("Patch-NetVLAD", "", held, read, positions[0] if truth else "")
+    return DatasetLayout("Patch-NetVLAD", "", held, read, positions[0] if truth else "")
 
 
-def gsv_cities(home: str, stem: str, truths: Names) -> Layout:
+def gsv_cities(home: str, stem: str, truths: Names) -> DatasetLayout:
     """GSV-Cities' lists (Ali-bey et al., 2022): the names of references and queries, and what is true of each query."""
     lists = [(f"{stem}_{side}Images.npy", f"{home.split('/')[-1]}/{stem}_{side}Images.npy") for side in ("db", "q")]
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         known, queried = (_names(present(base, names)) for names in lists)
         chosen = present(base, (f"{stem}_qIdx.npy",))
         if chosen is not None:
@@ -83,19 +83,19 @@ def gsv_cities(home: str, stem: str, truths: Names) -> Layout:
         references, queries = (existing(base, names, base / lists[0][0]) for names in (known, queried))
         path = present(base, truths)
         assert path is not None, "found"
-        return Traverses(references, queries, read_array(path, queries, references))
+        return LayoutTraverses(references, queries, read_array(path, queries, references))
 
-    return Layout("GSV-Cities", home, (*lists, truths), read, truths[0])
+    return DatasetLayout("GSV-Cities", home, (*lists, truths), read, truths[0])
 
 
-def mapillary(cities: Names, metres: float) -> Layout:
+def mapillary(cities: Names, metres: float) -> DatasetLayout:
     """Mapillary Street-Level Sequences as they are downloaded: tables of each city's queries and database.
 
     As its authors evaluate: no panoramas, the images of the subtask ``all``, true within ``metres``, and without the
     queries that have no true reference.
     """
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         known: list[Path] = []
         queried: list[Path] = []
         truth: Truth = []
@@ -109,10 +109,10 @@ def mapillary(cities: Names, metres: float) -> Layout:
             known += references
         if not queried:
             raise InvalidGroundTruth(f"{base}: no query lies within {metres:g} m of a reference.")
-        return Traverses(known, queried, truth)
+        return LayoutTraverses(known, queried, truth)
 
     held = tuple((f"{city}/{side}/postprocessed.csv",) for city in cities for side in ("query", "database"))
-    return Layout("Mapillary", "mapillary_sls/train_val", held, read)
+    return DatasetLayout("Mapillary", "mapillary_sls/train_val", held, read)
 
 
 def _city(folder: Path) -> tuple[list[Path], NDArray[np.float64]]:

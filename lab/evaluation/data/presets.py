@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, validate_call
 from pydantic.dataclasses import dataclass
 
-from lab.evaluation.data.layouts import Layout, Names, downloaded, folders, group, vpr_bench, vpr_tutorial
+from lab.evaluation.data.layouts import DatasetLayout, Names, downloaded, folders, group, vpr_bench, vpr_tutorial
 from lab.evaluation.data.listed_layouts import dbstruct, gsv_cities, mapillary, patch_netvlad
 from lab.evaluation.data.rules import Rule, around, every, frames, groups, nearest, within
 from lab.evaluation.data.sequences import baidu, kitti, tum
@@ -35,7 +35,7 @@ def _made(makers: tuple[Callable[..., Any], ...]) -> BeforeValidator:
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Sizes:
+class TraverseSizes:
     """T, R, and with reduced references T' and R' (Table 2.2).
 
     source: who counts so.
@@ -67,8 +67,8 @@ class Dataset:
     references: Names = ("reference", "ref")
     queries: Names = ("query",)
     rule: Annotated[Rule, _made(RULES)] | None = None
-    sizes: Sizes | None = None
-    layouts: tuple[Annotated[Layout, _made(LAYOUTS)], ...] = ()
+    sizes: TraverseSizes | None = None
+    layouts: tuple[Annotated[DatasetLayout, _made(LAYOUTS)], ...] = ()
     excluded: str = ""
     exclude: Annotated[Rule, _made(RULES)] | None = None
     source: str = "the thesis"

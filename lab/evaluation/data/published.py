@@ -16,7 +16,7 @@ RECALLS = (1, 5, 10)
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedRecall:
     """The recall of one system under one protocol.
 
     recall_at: shares of the queries, in the order of ``RECALLS``; shorter where fewer are published.
@@ -30,7 +30,7 @@ class Published:
     year: int
 
 
-class _Source(BaseModel):
+class _Publication(BaseModel):
     """A publication with recalls in percent, by protocol and system."""
 
     model_config = ConfigDict(extra="forbid")
@@ -39,11 +39,11 @@ class _Source(BaseModel):
     recalls: dict[str, dict[str, tuple[float, ...]]]
 
 
-def _published() -> tuple[Published, ...]:
+def _published() -> tuple[PublishedRecall, ...]:
     tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))["sources"]
     return tuple(
-        Published(protocol, system, tuple(round(figure / 100, 4) for figure in percent), found.source, found.year)
-        for found in map(_Source.model_validate, tables)
+        PublishedRecall(protocol, system, tuple(round(figure / 100, 4) for figure in percent), found.source, found.year)
+        for found in map(_Publication.model_validate, tables)
         for protocol, systems in found.recalls.items()
         for system, percent in systems.items()
     )
@@ -52,7 +52,7 @@ def _published() -> tuple[Published, ...]:
 PUBLISHED = _published()
 
 
-def published_figures(protocol: str) -> list[Published]:
+def published_figures(protocol: str) -> list[PublishedRecall]:
     """The published results of a protocol, the best first; nothing for folders without a name."""
     found = [one for one in PUBLISHED if one.protocol == protocol]
     return sorted(found, key=lambda one: -one.recall_at[0])

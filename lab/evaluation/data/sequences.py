@@ -15,14 +15,14 @@ from core.places import Pose
 from core.recordings.frame import NANOSECONDS
 from core.recordings.trajectory import Trajectory
 from core.recordings.trajectory_files import read_trajectory
-from lab.evaluation.data.layouts import Layout, Names, Traverses, present
+from lab.evaluation.data.layouts import DatasetLayout, LayoutTraverses, Names, present
 from lab.evaluation.data.poses import near, within_truth
 
 TUM_GAP = 0.1
 """Seconds between two poses that a frame may lie between."""
 
 
-def kitti(sequence: str, metres: float, degrees: float, frames: int) -> Layout:
+def kitti(sequence: str, metres: float, degrees: float, frames: int) -> DatasetLayout:
     """A sequence of KITTI's odometry benchmark (Geiger et al., CVPR 2012), as its archives unpack.
 
     Args:
@@ -32,7 +32,7 @@ def kitti(sequence: str, metres: float, degrees: float, frames: int) -> Layout:
     cameras = tuple(f"sequences/{sequence}/image_{camera}" for camera in (2, 0, 3, 1))
     poses = f"poses/{sequence}.txt"
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         folder = present(base, cameras)
         assert folder is not None, "found"
         images = find_images(folder)
@@ -42,17 +42,17 @@ def kitti(sequence: str, metres: float, degrees: float, frames: int) -> Layout:
         found = trajectory.at(np.arange(len(images), dtype=np.int64) * NANOSECONDS, 0.0)
         return _revisits(images, found, metres, degrees, frames)
 
-    return Layout("KITTI", "dataset", (cameras, (poses,)), read, poses, f"sequences/{sequence}")
+    return DatasetLayout("KITTI", "dataset", (cameras, (poses,)), read, poses, f"sequences/{sequence}")
 
 
-def tum(metres: float, degrees: float, frames: int) -> Layout:
+def tum(metres: float, degrees: float, frames: int) -> DatasetLayout:
     """A sequence of TUM's RGB-D benchmark (Sturm et al., IROS 2012), as its archive unpacks.
 
     Args:
         metres, degrees, frames: as for :func:`kitti`.
     """
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         images = sorted(find_images(base / "rgb"), key=lambda path: natural_key(path.name))
         times = []
         for image in images:
@@ -71,12 +71,12 @@ def tum(metres: float, degrees: float, frames: int) -> Layout:
         notes = (f"{left_out} of {len(images)} images have no pose within {TUM_GAP:g} s and are left out.",)
         chosen = [images[index] for index in known]
         found = _revisits(chosen, [poses[index] for index in known], metres, degrees, frames)
-        return Traverses(found.references, found.queries, found.truth, found.excluded, notes if left_out else ())
+        return LayoutTraverses(found.references, found.queries, found.truth, found.excluded, notes if left_out else ())
 
-    return Layout("TUM RGB-D", "", (("rgb",), ("groundtruth.txt",)), read, "groundtruth.txt")
+    return DatasetLayout("TUM RGB-D", "", (("rgb",), ("groundtruth.txt",)), read, "groundtruth.txt")
 
 
-def baidu(metres: float) -> Layout:
+def baidu(metres: float) -> DatasetLayout:
     """Baidu Mall (Sun et al., CVPR 2017): a file ``.camera`` for each image, whose last line but one is its place.
 
     Args:
@@ -87,17 +87,17 @@ def baidu(metres: float) -> Layout:
         (("query_images_undistort",), "query_gt"),
     )
 
-    def read(base: Path) -> Traverses:
+    def read(base: Path) -> LayoutTraverses:
         (known, at_known), (queried, at_queried) = (_cameras(base / images[0], base / poses) for images, poses in sides)
-        return Traverses(known, queried, near(at_queried, at_known, metres)[0])
+        return LayoutTraverses(known, queried, near(at_queried, at_known, metres)[0])
 
     held = (*(images for images, _ in sides), *((poses,) for _, poses in sides))
-    return Layout("Baidu", "baidu_datasets", held, read)
+    return DatasetLayout("Baidu", "baidu_datasets", held, read)
 
 
 def _revisits(
     images: list[Path], poses: Sequence[Pose | None], metres: float, degrees: float, frames: int
-) -> Traverses:
+) -> LayoutTraverses:
     """Each image against all but those ``frames`` before and after it."""
     found = [pose for pose in poses if pose is not None]
     assert len(found) == len(images), "each has a pose"
@@ -109,7 +109,7 @@ def _revisits(
             f"{images[0].parent} comes back to no place: no two images lie within {metres:g} m and {degrees:g}° of one "
             f"another and more than {frames} images apart."
         )
-    return Traverses(images, images, truth, excluded)
+    return LayoutTraverses(images, images, truth, excluded)
 
 
 def _trajectory(path: Path) -> tuple[Trajectory, bool]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.traverses import Truth
-from lab.evaluation.data.published import Published
+from lab.evaluation.data.published import PublishedRecall
 from lab.evaluation.protocol.figures import Evaluation
 from lab.evaluation.protocol.outcomes import Outcome
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Run:
+class SystemRun:
     """One system on one pair of traverses.
 
     identity: of the system, ``<name>@<sha256>``.
@@ -101,7 +101,7 @@ class SeverityCurve:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SystemComparison:
     """Systems on one pair of traverses.
 
     name: of the data set.
@@ -120,11 +120,11 @@ class Comparison:
     queries: list[Path]
     kept: NDArray[np.int64]
     truth: Truth
-    runs: list[Run]
+    runs: list[SystemRun]
     regions: Callable[[Path], Sequence[Box] | None] | None = None
     regions_of: str | None = None
     scalability: list[ScalePoint] | None = None
     map_sizes: list[SizePoint] | None = None
     severity: list[SeverityCurve] | None = None
     notes: list[str] = field(default_factory=list)
-    published: list[Published] = field(default_factory=list)
+    published: list[PublishedRecall] = field(default_factory=list)

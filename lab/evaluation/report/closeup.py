@@ -14,7 +14,7 @@ from lab.evaluation.report.threshold_effects import plot_fates
 from lab.evaluation.report.thumbnails import Thumbnails, data_uri
 
 if TYPE_CHECKING:
-    from lab.evaluation.protocol.comparison import Comparison, Run
+    from lab.evaluation.protocol.comparison import SystemComparison, SystemRun
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Closeup:
     stem: the end of the names of its files.
     """
 
-    run: Run
+    run: SystemRun
     mark: Mark
     stem: str
     constants: Sequence[tuple[str, str]]
@@ -45,7 +45,7 @@ class Closeup:
         return any(panel.boxes for group in self.groups for panels in group.cases for panel in panels)
 
 
-def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, thumbnails: Thumbnails) -> Closeup:
+def closeup(comparison: SystemComparison, run: SystemRun, mark: Mark, stem: str, thumbnails: Thumbnails) -> Closeup:
     """Everything about one run.
 
     Args:

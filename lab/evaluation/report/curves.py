@@ -17,11 +17,11 @@ from lab.evaluation.report.theme import LIGHT, Cast, Mark
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from lab.evaluation.protocol.comparison import Run
+    from lab.evaluation.protocol.comparison import SystemRun
     from lab.evaluation.protocol.trust import Trust
 
 
-def plot_pr(runs: Sequence[Run], cast: Cast) -> Chart | None:
+def plot_pr(runs: Sequence[SystemRun], cast: Cast) -> Chart | None:
     """Each system's precision over its recall; None where no system has a right match."""
     drawn = [
         (mark, curve, run.evaluation.auc_pr)
@@ -42,7 +42,7 @@ def plot_pr(runs: Sequence[Run], cast: Cast) -> Chart | None:
     return draw("pr", alt, "Precision over recall", paint, height_for(drawn))
 
 
-def plot_roc(runs: Sequence[Run], cast: Cast) -> Chart | None:
+def plot_roc(runs: Sequence[SystemRun], cast: Cast) -> Chart | None:
     """Each system's true over its false positive rate, the largest area first in the key; None without negatives."""
     drawn = [
         (mark, curve, run.evaluation.auc_roc)
@@ -65,7 +65,7 @@ def plot_roc(runs: Sequence[Run], cast: Cast) -> Chart | None:
     return draw("roc", alt, "True over false positives (ROC)", paint, height_for(drawn))
 
 
-def plot_recall(runs: Sequence[Run], cast: Cast) -> Chart | None:
+def plot_recall(runs: Sequence[SystemRun], cast: Cast) -> Chart | None:
     """Recall over how many best matches are looked at; None unless there is a choice of two."""
     depths = min(25, runs[0].scores.shape[1])
     drawn = [
@@ -88,13 +88,13 @@ def plot_recall(runs: Sequence[Run], cast: Cast) -> Chart | None:
     return draw("recall", alt, "Recall among the best N", paint, height_for(drawn))
 
 
-def trusted(runs: Sequence[Run], cast: Cast) -> list[tuple[Mark, Trust]]:
+def trusted(runs: Sequence[SystemRun], cast: Cast) -> list[tuple[Mark, Trust]]:
     """The systems whose answers have probabilities."""
     pairs = zip(runs, cast.runs, strict=True)
     return [(mark, found) for run, mark in pairs if (found := run.evaluation.trust) is not None]
 
 
-def plot_reliability(runs: Sequence[Run], cast: Cast) -> Chart | None:
+def plot_reliability(runs: Sequence[SystemRun], cast: Cast) -> Chart | None:
     """Share of right answers over their probability, a point a bin; None where no system has probabilities."""
     drawn = trusted(runs, cast)
     if not drawn:

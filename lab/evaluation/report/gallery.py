@@ -15,7 +15,7 @@ from lab.evaluation.report.thumbnails import Thumbnail, Thumbnails
 if TYPE_CHECKING:
     from lab.baselines.encoders import Box
     from lab.evaluation import Outcome
-    from lab.evaluation.protocol.comparison import Comparison, Run
+    from lab.evaluation.protocol.comparison import SystemComparison, SystemRun
 
 Regions = Callable[[Path], "Sequence[Box] | None"]
 
@@ -50,7 +50,7 @@ def wrong_first(outcomes: Sequence[Outcome], wrong: int, right: int) -> list[int
     return errors[:wrong] + [hits[place] for place in dict.fromkeys(spaced)]
 
 
-def case(comparison: Comparison, run: Run, query: int) -> Case:
+def case(comparison: SystemComparison, run: SystemRun, query: int) -> Case:
     """The view of a query in the gallery.
 
     Of a wrong match the best true reference, the one that was nearly chosen; of a right one the
@@ -104,7 +104,7 @@ class Group:
 
 
 def gallery(
-    comparison: Comparison, run: Run, thumbnails: Thumbnails, regions: Regions | None, most: int
+    comparison: SystemComparison, run: SystemRun, thumbnails: Thumbnails, regions: Regions | None, most: int
 ) -> tuple[Group, Group]:
     """Up to ``most`` wrong matches and half as many right ones; fewer when ``thumbnails`` is full."""
     parts: dict[bool, list[Sequence[Panel]]] = {False: [], True: []}
@@ -121,7 +121,7 @@ def gallery(
 
 
 def _panels(
-    comparison: Comparison, found: Case, thumbnails: Thumbnails, regions: Regions | None
+    comparison: SystemComparison, found: Case, thumbnails: Thumbnails, regions: Regions | None
 ) -> tuple[Panel, Panel, Panel]:
     """Three images and what they are."""
 

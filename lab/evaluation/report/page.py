@@ -23,10 +23,10 @@ from lab.evaluation.report.thumbnails import Thumbnails
 from lab.evaluation.report.trends import plot_cost, plot_map_sizes, plot_scalability, plot_severity
 
 if TYPE_CHECKING:
-    from lab.evaluation.protocol.comparison import Comparison
+    from lab.evaluation.protocol.comparison import SystemComparison
 
 
-def write_report(folder: Path, comparison: Comparison) -> None:
+def write_report(folder: Path, comparison: SystemComparison) -> None:
     """Write ``index.html``, which needs no other file and no network, and its charts as PNG files beside it.
 
     The same comparison gives the same bytes.  Nothing is written before all is made; files of an
@@ -91,7 +91,7 @@ def page(**values: Any) -> str:
     return environment.get_template("page.html").render(values, light=variables(LIGHT), dark=variables(DARK), keys=keys)
 
 
-def _remarks(comparison: Comparison, cast: Cast) -> list[str]:
+def _remarks(comparison: SystemComparison, cast: Cast) -> list[str]:
     """Why curves are missing."""
     runs = comparison.runs
     without = [

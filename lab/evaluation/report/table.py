@@ -11,7 +11,7 @@ from lab.evaluation.report.text import MISSING, milliseconds, number, size
 from lab.evaluation.report.trends import time_per_query
 
 if TYPE_CHECKING:
-    from lab.evaluation.protocol.comparison import Run
+    from lab.evaluation.protocol.comparison import SystemRun
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Column:
     group: str
     heading: str
     meaning: str
-    value: Callable[[Run], float | None]
+    value: Callable[[SystemRun], float | None]
     form: Callable[[float | None], str] = number
     higher_is_better: bool = True
     contest: bool = True
@@ -29,7 +29,7 @@ class Column:
     bar: bool = False
     """Its size, of 1, is drawn behind it."""
 
-    def best(self, runs: Sequence[Run]) -> float | None:
+    def best(self, runs: Sequence[SystemRun]) -> float | None:
         """The figure that stands out; None where there is no contest."""
         values = [value for run in runs if (value := self.value(run)) is not None]
         if len(runs) < 2 or not values or not self.contest:
@@ -37,7 +37,7 @@ class Column:
         return max(values) if self.higher_is_better else min(values)
 
 
-def columns(runs: Sequence[Run]) -> list[Column]:
+def columns(runs: Sequence[SystemRun]) -> list[Column]:
     """The columns that at least one run has a figure for."""
     made = [
         Column(
@@ -59,7 +59,7 @@ def columns(runs: Sequence[Run]) -> list[Column]:
     return [column for column in made if any(column.value(run) is not None for run in runs)]
 
 
-def stages(runs: Sequence[Run]) -> list[str]:
+def stages(runs: Sequence[SystemRun]) -> list[str]:
     """The stages that some run has a time for: the usual ones in their order, others after them, ``match`` last."""
     timed = {stage: None for run in runs for stage, time in run.milliseconds.items() if time is not None}
     usual = [stage for stage in STAGES if stage in timed and stage != "match"]

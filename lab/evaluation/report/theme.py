@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from lab.evaluation.report.text import plain
 
 if TYPE_CHECKING:
-    from lab.evaluation.protocol.comparison import Run
+    from lab.evaluation.protocol.comparison import SystemRun
 
 Dashes = tuple[float, ...]
 
@@ -122,7 +122,7 @@ class Cast:
     those of one name too by a number.
     """
 
-    def __init__(self, runs: Sequence[Run]) -> None:
+    def __init__(self, runs: Sequence[SystemRun]) -> None:
         labels = _told_apart([plain(run.about.title) for run in runs], [plain(run.about.name) for run in runs])
         self.runs = [Mark(label, place) for place, label in enumerate(labels)]
         self._names: dict[str, Mark] = {}

@@ -56,7 +56,7 @@ def plot_fates(name: str, system: str, outcomes: Sequence[Outcome], threshold: f
     scores = [outcome.score for outcome in outcomes]
     low, high = min(scores), max(scores)
     air = 0.07 * (high - low) or 0.07 * abs(high) or 0.07
-    frame = Frame(longest, low - air, high + air, threshold)
+    frame = PlotScales(longest, low - air, high + air, threshold)
     return [
         _plot(f"scores-{state}-{name}", title, system, shown, frame)
         for (state, title, _), shown in zip(states, found, strict=True)
@@ -64,7 +64,7 @@ def plot_fates(name: str, system: str, outcomes: Sequence[Outcome], threshold: f
 
 
 @dataclass(frozen=True)
-class Frame:
+class PlotScales:
     """The scales that the two plots share: most queries of one fate, lowest and highest score shown, the threshold."""
 
     longest: int
@@ -73,7 +73,7 @@ class Frame:
     threshold: float | None
 
 
-def _plot(name: str, title: str, system: str, found: Scores, frame: Frame) -> Chart:
+def _plot(name: str, title: str, system: str, found: Scores, frame: PlotScales) -> Chart:
     def paint(axes: Axes) -> None:
         from matplotlib.ticker import MaxNLocator
 

@@ -14,7 +14,7 @@ from lab.evaluation.report.theme import LIGHT, Cast, Mark, short
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from lab.evaluation.protocol.comparison import Run, ScalePoint, SeverityCurve, SizePoint
+    from lab.evaluation.protocol.comparison import ScalePoint, SeverityCurve, SizePoint, SystemRun
 
 
 SHORTEST = 1e-3
@@ -33,7 +33,7 @@ class Line:
     y: Sequence[float]
 
 
-def time_per_query(run: Run) -> float | None:
+def time_per_query(run: SystemRun) -> float | None:
     """Milliseconds of all stages of one query, the image's decoding left out; None where none was measured."""
     stages = {stage: time for stage, time in run.milliseconds.items() if time is not None}
     describing = run.evaluation.describe_milliseconds
@@ -42,7 +42,7 @@ def time_per_query(run: Run) -> float | None:
     return sum(stages.values()) if stages else None
 
 
-def plot_cost(runs: Sequence[Run], cast: Cast) -> Chart | None:
+def plot_cost(runs: Sequence[SystemRun], cast: Cast) -> Chart | None:
     """Accuracy over the time of a query; None unless two systems have both."""
     points = [
         (mark, time, run.evaluation.auc_pr)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.judgement.fusion import BLIND, CameraView, Fused, fuse, joint_probabilities, log_odds_of
+from core.judgement.fusion import BLIND, CameraRanking, Fused, fuse, joint_probabilities, log_odds_of
 from core.judgement.probability import Curve, sigmoid
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.places import Neighborhood, Pose
@@ -18,10 +18,10 @@ CALIBRATION = Calibration(
 NEIGHBORHOOD = Neighborhood(radius=1.0, frames=0)
 
 
-def view(scores: dict[int, float], weights: dict[int, float] | None = None) -> CameraView:
+def view(scores: dict[int, float], weights: dict[int, float] | None = None) -> CameraRanking:
     """Of places ten metres apart, by row."""
     rows = sorted(scores, key=lambda row: -scores[row])
-    return CameraView(
+    return CameraRanking(
         np.array(rows),
         np.array([scores[row] for row in rows], np.float32),
         places([Pose(x=10 * row, y=0) for row in rows]),
@@ -30,7 +30,7 @@ def view(scores: dict[int, float], weights: dict[int, float] | None = None) -> C
     )
 
 
-def fused(*views: CameraView) -> Fused:
+def fused(*views: CameraRanking) -> Fused:
     return fuse(views, CALIBRATION, NEIGHBORHOOD)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from core.errors import StorageFailure, UnknownFrame, UnknownMap
 from core.maps import MapSettings, ReviewSetting
-from core.maps.review import ReviewPage
+from core.maps.review import StoredReviews
 from core.storage import Atlas
 from core.storage.review import FILE, ReviewFrames
 from tests.core.maps.review import check_pages_are_of_one_moment
@@ -27,7 +27,7 @@ def frames_at(folder: Path) -> ReviewFrames:
 
 def test_a_frame_is_stored_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
-    assert review.page(None, 10) == ReviewPage([], 0, 0) and not (tmp_path / FILE).exists()
+    assert review.page(None, 10) == StoredReviews([], 0, 0) and not (tmp_path / FILE).exists()
     assert review.keep(b"one", ANSWER, SETTING) and review.keep(b"two", {"verdict": "ambiguous"}, SETTING)
     assert not review.keep(b"one", ANSWER, SETTING), "the same file is kept once"
     review.label(1, {"label": {"place": "p7"}})
@@ -37,7 +37,7 @@ def test_a_frame_is_stored_with_its_answer_and_survives_a_restart(tmp_path: Path
     assert (first.number, second.number) == (1, 2) and first.answer == ANSWER and first.size == 3
     assert first.label == {"label": {"place": "p7"}} and second.label is None
     assert [again.picture(one.number) for one in (first, second)] == [b"one", b"two"]
-    assert again.page(2, 10) == ReviewPage([first], 2, 6) and again.page(None, 1) == ReviewPage([second], 2, 6)
+    assert again.page(2, 10) == StoredReviews([first], 2, 6) and again.page(None, 1) == StoredReviews([second], 2, 6)
     assert again.page(None, 10, labelled=True).frames == again.labelled() == [first]
     assert again.page(None, 10, labelled=False).frames == [second]
     again.close()

@@ -20,7 +20,7 @@ from lab.baselines.netvlad import (
     ABOUT,
     NetVlad,
     NetVladLayer,
-    Whitening,
+    PcaWhitening,
     aggregate,
     load_netvlad,
     soft_assignment,
@@ -332,7 +332,7 @@ def test_centres_of_another_depth(tmp_path: Path) -> None:
 
 
 def test_whitening_by_hand() -> None:
-    found = Whitening(torch.tensor([[1.0, 0.0], [0.0, 2.0]]), torch.tensor([2.0, 2.0]))(torch.tensor([1.0, 1.0]))
+    found = PcaWhitening(torch.tensor([[1.0, 0.0], [0.0, 2.0]]), torch.tensor([2.0, 2.0]))(torch.tensor([1.0, 1.0]))
     torch.testing.assert_close(found, torch.tensor([0.6, 0.8]))
 
 

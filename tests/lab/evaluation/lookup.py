@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
-from lab.baselines.system import About, Description, Index, InnerProducts, stack
+from lab.baselines.system import About, Description, InnerProducts, ReferenceIndex, stack
 
 
 def write_images(folder: Path, values: Sequence[int]) -> list[Path]:
@@ -52,7 +52,7 @@ class Lookup:
         row = self.table[int(pixels[0, 0, 0])]
         return Description({"descriptor": row, "extra": np.zeros(2, np.uint8)}, dict.fromkeys(self.stages, 2.0))
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return InnerProducts(stack(references), finish=lambda products: products / np.float32(2))
 
 
@@ -83,7 +83,7 @@ class Together(Lookup):
 
     sequential = True
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return _Together(stack(references))
 
 

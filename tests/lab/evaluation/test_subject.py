@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.errors import InvalidModel
 from core.frames.traverses import tolerance_truth
-from lab.baselines.system import Description, Index, Trainable
+from lab.baselines.system import Description, ReferenceIndex, Trainable
 from lab.evaluation.data.pairs import TraversePair
 from lab.evaluation.subject import Subject, Training
 from tests.lab.evaluation.lookup import Learner, Lookup, Together, load, write_images
@@ -56,13 +56,13 @@ class Counting(Lookup):
         super().__init__(TABLE)
         self.sizes = sizes
 
-    def index(self, references: Sequence[Description]) -> Index:
+    def index(self, references: Sequence[Description]) -> ReferenceIndex:
         return Counted(super().index(references), self.sizes)
 
 
 @dataclass
 class Counted:
-    inner: Index
+    inner: ReferenceIndex
     sizes: list[int]
 
     def score(self, queries: Sequence[Description]) -> NDArray[np.float32]:

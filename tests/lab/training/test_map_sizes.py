@@ -17,7 +17,7 @@ from lab.training.map_sizes import (
     CANDIDATES,
     SMALL,
     STRANGERS,
-    Traverse,
+    ScoredTraverse,
     cut,
     fit_geometry,
     fit_small_maps,
@@ -38,13 +38,13 @@ CALIBRATION = Calibration(
 COUNT = 80
 
 
-def traverse(mean: float, seed: int, gain: float = 0.1) -> Traverse:
+def traverse(mean: float, seed: int, gain: float = 0.1) -> ScoredTraverse:
     """Places that score ``mean`` with each other, and ``gain`` more where they are the same."""
     random = np.random.default_rng(seed)
     apart = np.abs(np.arange(COUNT)[:, None] - np.arange(COUNT))
     truth = apart <= 2
     both = (random.normal(mean, 0.02, (COUNT, COUNT)) + gain * truth).astype(np.float32)
-    return Traverse(both / 4, both, both, truth, 30)
+    return ScoredTraverse(both / 4, both, both, truth, 30)
 
 
 def test_a_stranger_is_far_from_every_place_of_the_map() -> None:
@@ -106,7 +106,7 @@ def test_an_environment_is_widened_until_strangers_of_small_maps_are_refused() -
     assert widened(CALIBRATION, alike[:1], repeats=1) == CALIBRATION.environment, "nothing has to be refused"
 
 
-def verifiable(mean: float, seed: int) -> Traverse:
+def verifiable(mean: float, seed: int) -> ScoredTraverse:
     """A traverse of which true pairs have much evidence, and the nearest one the most."""
     random = np.random.default_rng(100 + seed)
     plain = traverse(mean, seed, gain=0.05)
@@ -114,7 +114,7 @@ def verifiable(mean: float, seed: int) -> Traverse:
     share = np.where(plain.truth, 0.3 - 0.1 * apart, random.uniform(0, 0.03, (COUNT, COUNT)))
     evidence = np.where(plain.truth, random.gamma(2, 60, (COUNT, COUNT)), random.gamma(2, 12, (COUNT, COUNT)))
     blank = [Keypoints(8, 8, np.zeros((0, 2), np.uint16), np.zeros((0, 64), np.int8))] * COUNT
-    return Traverse(plain.first, plain.both, plain.among, plain.truth, 30, Pairs(blank, blank, evidence, share))
+    return ScoredTraverse(plain.first, plain.both, plain.among, plain.truth, 30, Pairs(blank, blank, evidence, share))
 
 
 def test_a_pair_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from core.geometry.keypoints import Keypoints
 from lab.training import vocabularies
-from lab.training.vocabularies import COLUMNS, STAGES, Geometry, best_of, table
+from lab.training.vocabularies import COLUMNS, STAGES, VerifiedPairs, best_of, table
 
 
 def test_the_best_places_of_each_query_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,11 +30,11 @@ def test_chosen_pairs_gain_and_are_verified_once(tmp_path: Path, monkeypatch: py
     queries, references = ([Keypoints(width, 1, *none) for width in widths] for widths in ((1, 2), (1, 2, 3)))
     scores = np.zeros((2, 3), np.float32)
     first = np.array([[True, False, True], [False, False, False]])
-    made = Geometry(queries, references, tmp_path / "pairs.npy")
+    made = VerifiedPairs(queries, references, tmp_path / "pairs.npy")
     np.testing.assert_allclose(made.raised(scores, first), np.array([[1.01, 0, 1.03], [0, 0, 0]]), rtol=1e-6)
     assert asked == [[1, 1, 3]]
 
-    again = Geometry(queries, references, tmp_path / "pairs.npy")
+    again = VerifiedPairs(queries, references, tmp_path / "pairs.npy")
     more = first | np.array([[False, False, False], [False, True, False]])
     np.testing.assert_allclose(again.raised(scores, more), np.array([[1.01, 0, 1.03], [0, 2.02, 0]]), rtol=1e-6)
     assert asked == [[1, 1, 3], [2, 2]]

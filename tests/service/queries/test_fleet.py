@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from benchmarks.endurance import growth, judge
-from benchmarks.fleet import Fleet, Plan, Scene, Seen
+from benchmarks.fleet import Fleet, Scene, Seen, Workload
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -20,13 +20,13 @@ def frequent_housekeeping(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.fleet.HOUSEKEEPING_SECONDS", 0.5)
 
 
-def plan(server: Server, map_id: str) -> Plan:
+def plan(server: Server, map_id: str) -> Workload:
     for number in range(FIXED):
         assert server.enrol(map_id, f"fixed-{number}", jpeg(number)).status_code == 201
     scenes = [Scene(jpeg(number), jpeg(number)) for number in range(FIXED)]
     url = str(server.client.base_url)
     fixed = {f"fixed-{number}": number for number in range(FIXED)}
-    return Plan(url, map_id, scenes, [jpeg(40)], fixed, robots=2, operators=0, rate=5)
+    return Workload(url, map_id, scenes, [jpeg(40)], fixed, robots=2, operators=0, rate=5)
 
 
 @pytest.mark.thorough
@@ -54,7 +54,7 @@ def test_a_place_that_is_lost_or_comes_back_is_reported(server: Server, map_id: 
 @pytest.mark.thorough
 def test_operators_enrol_and_delete_and_the_counts_agree(server: Server, map_id: str) -> None:
     scenes = [Scene(jpeg(number), jpeg(number)) for number in range(40)]
-    fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
+    fleet = Fleet(Workload(str(server.client.base_url), map_id, scenes * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
     asyncio.run(fleet.fill())
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 160
     asyncio.run(fleet.work(3.0, exports=False))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from lab.evaluation.data.presets import Sizes, read_datasets
+from lab.evaluation.data.presets import TraverseSizes, read_datasets
 
 FAMILY = """
 [families.walk]
@@ -19,7 +19,7 @@ def test_a_protocol_has_what_its_family_gives_and_it_does_not() -> None:
     own = 'title = "Own"\nsource = "else"\nsizes = { queries = 3, references = 4 }\nqueries = ["night"]'
     (found,) = read_datasets(f'{FAMILY}\n[protocols."walk.1"]\nfamily = "walk"\n{own}')
     assert (found.name, found.title, found.truth, found.source) == ("walk.1", "Own", "±1 frames", "else")
-    assert (found.references, found.queries, found.sizes) == (("reference", "ref"), ("night",), Sizes(3, 4))
+    assert (found.references, found.queries, found.sizes) == (("reference", "ref"), ("night",), TraverseSizes(3, 4))
     assert found.rule is not None
     assert [true.tolist() for true in found.rule([Path("0"), Path("1")], [Path("0"), Path("1"), Path("2")])] == [
         [0, 1],

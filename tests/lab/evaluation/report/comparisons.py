@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.frames.traverses import Truth, tolerance_truth
 from lab.baselines.system import About
-from lab.evaluation import Comparison, Outcome, Run, judge, summarize
+from lab.evaluation import Outcome, SystemComparison, SystemRun, judge, summarize
 from lab.evaluation.report import write_report
 
 TIMES: dict[str, float | None] = {"forward": 4.25, "regions": None, "vlad": None, "match": 0.5}
@@ -37,17 +37,17 @@ def make_run(
     truth: Truth,
     title: str | None = None,
     nbytes: int = 1536,
-) -> Run:
+) -> SystemRun:
     """A run judged as any is."""
     outcomes = judge(scores, kept, truth)
     about = About(name, title or name, "Somebody, 2020", {"N": 300, "layers": ("conv3", "conv4")})
     identity = f"{name}@0123456789abcdef"
-    return Run(about, identity, summarize(identity, outcomes, len(kept), TIMES), outcomes, scores, nbytes, TIMES)
+    return SystemRun(about, identity, summarize(identity, outcomes, len(kept), TIMES), outcomes, scores, nbytes, TIMES)
 
 
 def make_comparison(
     folder: Path, systems: int = 2, kept: Sequence[int] | None = None, count: int = 8, noise: float = 1.0
-) -> Comparison:
+) -> SystemComparison:
     """``count`` queries and references, the same place at the same index; each system is noisier than the last."""
     generator = np.random.default_rng(7)
     chosen = np.array(range(count) if kept is None else kept, np.int64)
@@ -58,7 +58,7 @@ def make_comparison(
         scores = (alike + noise * (0.3 + 0.1 * place) * generator.random(alike.shape)).astype(np.float32)
         runs.append(make_run(f"system-{place}", scores, chosen, truth))
     runs.sort(key=lambda run: -run.evaluation.auc_pr)
-    return Comparison(
+    return SystemComparison(
         "a data set",
         write_images(folder / "references", count),
         write_images(folder / "queries", count),
@@ -117,12 +117,12 @@ class Page(HTMLParser):
         return [one for one in found if style is None or style in (one.attributes.get("class") or "").split()]
 
 
-def written_page(folder: Path, comparison: Comparison) -> Page:
+def written_page(folder: Path, comparison: SystemComparison) -> Page:
     """The page of a comparison, written to a folder and read again."""
     return page_of(folder, comparison)[1]
 
 
-def page_of(folder: Path, comparison: Comparison) -> tuple[str, Page]:
+def page_of(folder: Path, comparison: SystemComparison) -> tuple[str, Page]:
     """The same, and its text."""
     write_report(folder, comparison)
     html = (folder / "index.html").read_text("utf-8")
@@ -133,7 +133,7 @@ def page_of(folder: Path, comparison: Comparison) -> tuple[str, Page]:
 class Written:
     """A report with all its sections."""
 
-    comparison: Comparison
+    comparison: SystemComparison
     folder: Path
     html: str
     page: Page

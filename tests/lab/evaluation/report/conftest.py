@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from lab.evaluation import ScalePoint, SeverityCurve, SizePoint
-from lab.evaluation.data.published import Published
+from lab.evaluation.data.published import PublishedRecall
 from tests.lab.evaluation.report.comparisons import Written, make_comparison, page_of
 
 
@@ -25,7 +25,7 @@ def written(small_charts: None, tmp_path_factory: pytest.TempPathFactory) -> Wri
     comparison = replace(
         made,
         runs=[made.runs[0], replace(made.runs[1], elsewhere=True)],
-        published=[Published("made", "Ghost <net>", (0.5, 0.75), "Some paper, Table 1", 2024)],
+        published=[PublishedRecall("made", "Ghost <net>", (0.5, 0.75), "Some paper, Table 1", 2024)],
         scalability=[ScalePoint("system-0", n, n, 0.9 / n, 0.8, 0.0) for n in (1, 2)],
         map_sizes=[SizePoint("system-0", n, 4, 3, 0.5, 0.0625, 0.1875, 0.75, 0.25, 0.125) for n in (1, 4)],
         severity=[SeverityCurve("a/b <c>", "unknown", [0.0, 1.0], "", [0.9, 0.5], [0.8, 0.3])],

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.evaluation import Comparison
+from lab.evaluation import SystemComparison
 from lab.evaluation.protocol.trust import trust_figures
 from lab.evaluation.report.curves import plot_pr, plot_recall, plot_reliability, plot_roc
 from lab.evaluation.report.theme import Cast
@@ -29,7 +29,7 @@ def test_texts_name_all_systems_and_their_areas(tmp_path: Path) -> None:
 # The reliability section: drawn where there are probabilities, absent where not
 
 
-def with_probabilities(folder: Path) -> Comparison:
+def with_probabilities(folder: Path) -> SystemComparison:
     comparison = make_comparison(folder, systems=2, count=60, noise=6.0)
     runs = []
     for run in comparison.runs:
