@@ -3,9 +3,9 @@
     python -m benchmarks.maps.damaged_bags
 
 Each kind of bag is cut at many places, and in copies of it one bit is turned over.  Of the frames that a reader gives,
-those count that are equal to what was written; *wrong* ones are pictures that nobody wrote.  The readers of rosbags and
-mcap are asked for what they give before their first error.  Hostile bags are small files that unpack to 1.5 GB; each is
-read in a process of its own, whose most memory counts.
+those count that are equal to the written ones; *wrong* ones are pictures that nobody wrote.  The readers of rosbags and
+mcap are judged by their frames before their first error.  Hostile bags are small files that unpack to 1.5 GB; each is
+read in a process of its own, whose peak memory counts.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def by_mcap(path: Path) -> Iterator[bytes]:
         try:
             make_reader(file).get_summary()
             reader: Any = make_reader(file)
-        except Exception:  # of what is cut or damaged, mcap raises whatever its parsers do
+        except Exception:  # of cut or damaged files, mcap raises any error of its parsers
             file.seek(0)
             reader = NonSeekingReader(file)
         for _, _, message in reader.iter_messages(CAMERA, log_time_order=False):
@@ -83,7 +83,7 @@ READERS: dict[str, Reader] = {"recordings": by_recordings, "rosbags": by_rosbags
 
 
 def tried(reader: Reader, path: Path, written: set[bytes]) -> Counter[str]:
-    """What came of reading a damaged bag."""
+    """The outcome of reading a damaged bag."""
     began, given, found = time.perf_counter(), set[bytes](), Counter[str]()
     try:
         for data in reader(path):
@@ -112,7 +112,7 @@ def damaged(whole: bytes, cuts: int, flips: int) -> Iterator[tuple[str, bytes]]:
 
 
 def hostile(folder: Path, size: int = BOMB) -> dict[str, Path]:
-    """Small files whose one chunk unpacks to so many bytes; those of MCAP say that it has a thousand."""
+    """Small files whose one chunk unpacks to ``size`` bytes; those of MCAP say that it has a thousand."""
     zeros = b"\x80" + (size - 9).to_bytes(8, "little") + bytes(size - 9)
     said = [compressed(START, bytes(1000))]
     made = {}

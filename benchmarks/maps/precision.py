@@ -6,11 +6,11 @@ Queries are never stored and stay float32; references go through the storage's o
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another
 reference is the best of the first stage, and of both, ``deviation`` by how much a first-stage score differs at most,
 and ``error`` how long the differences of the descriptors are, by the length of the descriptors.  ``products`` is the
-median time of the products of a query with 100 descriptors as they are kept, on one thread.
+median time of the products of a query with 100 descriptors as they are stored, on one thread.
 
 Beside them are FAISS's six bits a value, of a range that is fixed from the first row on, so that no row depends on a
 later one: ±1; each value's range in the first 100 rows; ±1 of each row's largest value; ±1 of the largest of each 128,
-which is what the storage does, and for which FAISS has products only with what it has unpacked.
+as the storage does; for these FAISS has products only with rows that it has unpacked.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Side = tuple[NDArray[np.float32], NDArray[np.int8]]
 """Descriptors float32 [n, D] and local descriptors int8 [n, C, L]."""
 Array = NDArray[np.float32]
 Products = Callable[[Array], Array]
-"""The products of queries, float32 [B, D], with rows that are kept: float32 [B, n]."""
+"""The products of queries, float32 [B, D], with stored rows: float32 [B, n]."""
 
 MOST_TIMED, REPEATS = 100, 60
 
@@ -86,7 +86,7 @@ def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side
 
 
 def faiss_index(low: Array, high: Array) -> faiss.IndexScalarQuantizer:
-    """An index of six bits a value whose ranges, float32 [D], are what is given."""
+    """An index of six bits a value with the given ranges, float32 [D]."""
     index = faiss.IndexScalarQuantizer(len(low), faiss.ScalarQuantizer.QT_6bit, faiss.METRIC_INNER_PRODUCT)
     faiss.copy_array_to_vector(np.concatenate([low, high - low]), index.sq.trained)
     index.is_trained = True
@@ -94,7 +94,7 @@ def faiss_index(low: Array, high: Array) -> faiss.IndexScalarQuantizer:
 
 
 def by_faiss(rows: Array, low: Array, high: Array, scales: Array) -> tuple[Array, int, Products]:
-    """What comes back of rows, float32 [n, D], bytes a row, and products with the first rows in their codes.
+    """Rows as they come back, float32 [n, D], bytes a row, and products with the first rows in their codes.
 
     Args:
         scales: float32 [n, D / d], by which d values each are divided before; low, high: float32 [d].
@@ -116,7 +116,7 @@ def by_faiss(rows: Array, low: Array, high: Array, scales: Array) -> tuple[Array
         np.put_along_axis(made, where, found, axis=1)
         return made * factors.T
 
-    scaled = bool((scales != 1).any())  # in half precision, as the storage keeps its own
+    scaled = bool((scales != 1).any())  # in half precision, as the storage has its own
     return back, scales.shape[1] * (codes.shape[1] + 2 * scaled), products
 
 

@@ -5,7 +5,7 @@
 JPEG files, as they are and written again in other formats, are damaged in six ways: cut; cut and given an end; one
 byte flipped; 64 bytes zeroed; 64 bytes taken out; the header given 16 more rows.  A damaged picture is *wrong* where it
 is decoded to other pixels than the same way makes of the sound one.  A way is also given whole pictures with bytes
-after their end, and JPEG files with the stray bytes before a marker that cheap cameras write; what it refuses of these
+after their end, and JPEG files with the stray bytes before a marker that cheap cameras write; its refusal of these
 counts as sound.  The times are medians of sound pictures, in milliseconds.
 """
 
@@ -119,7 +119,7 @@ def sound_variants(data: bytes) -> list[bytes]:
 
 
 class Tally:
-    """What one way did with the pictures of one format."""
+    """The results of one way with the pictures of one format."""
 
     def __init__(self, way: Callable[[bytes], Pixels]) -> None:
         self._way = way
@@ -127,7 +127,7 @@ class Tally:
         self.milliseconds: list[float] = []
 
     def add(self, data: bytes, damaged: dict[str, bytes]) -> None:
-        """Try a sound picture and what damage made of it."""
+        """Try a sound picture and its damaged copies."""
         began = time.perf_counter()
         whole = self._way(data)
         self.milliseconds.append(1000 * (time.perf_counter() - began))

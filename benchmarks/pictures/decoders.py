@@ -1,4 +1,4 @@
-"""Ways from the bytes of a picture to pixels: the project's, and what libraries offer by themselves."""
+"""Ways from the bytes of a picture to pixels: the project's, and those of libraries by themselves."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def by_pillow(data: bytes) -> Pixels:
     try:
         image = ImageOps.exif_transpose(_opened(data))
         return np.ascontiguousarray(np.asarray(image.convert("RGB"))[:, :, ::-1])
-    except Exception as error:  # Pillow's plug-ins raise what their parsers do
+    except Exception as error:  # Pillow's plug-ins raise any error of their parsers
         raise PictureRefused from error
 
 

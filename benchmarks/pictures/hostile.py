@@ -1,9 +1,9 @@
-"""What hostile pictures of at most 16 MiB cost, by the way of decoding: processor time and peak memory.
+"""The cost of hostile pictures of at most 16 MiB, by the way of decoding: processor time and peak memory.
 
     python -m benchmarks.pictures.hostile
 
-Each is decoded in a process of its own, which may take 4 GB and ``LONGEST`` seconds.  Memory is what it takes at most
-beyond what it has before.
+Each is decoded in a process of its own, which may take 4 GB and ``LONGEST`` seconds.  Memory is its peak
+beyond the memory that it has before.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 
 def measure(way: str) -> None:
-    """Decode the picture on standard input, and print seconds, memory and what came of it."""
+    """Decode the picture on standard input, and print seconds, memory and the outcome."""
     data = sys.stdin.buffer.read()
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MOST_MEMORY, held + MOST_MEMORY))

@@ -51,7 +51,7 @@ def read_orientation(block: bytes | None) -> int:
 
 
 def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
-    """The pose and the time that an image file was taken at, according to its metadata; None for what is missing.
+    """The pose and the time that an image file was taken at, by its metadata; None for either that is missing.
 
     The pose is in degrees (WGS 84).  Its heading is the image direction if that is relative to true north; a magnetic
     direction is ignored, as its declination is not known.  The time is in UTC: that of the camera's clock if its offset

@@ -42,7 +42,7 @@ class Limits:
 
 
 ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
-"""Of a picture that was accepted, whatever today's limits are; no service can be set to accept a larger one."""
+"""The limits of a picture that was accepted, under any settings; no service can be set to accept a larger one."""
 
 
 def decode(data: bytes, limits: Limits = Limits()) -> Pixels:

@@ -45,7 +45,7 @@ def decode_jpeg(data: bytes, shape: tuple[int, int], coded: int, tolerant: Calla
     Args:
         shape: height and width that its header announces; no more memory is taken.
         coded: where its coded data begins.
-        tolerant: a decoder that gives the same pixels of a sound file, and takes what the strict mode calls odd; None
+        tolerant: a decoder that gives the same pixels of a sound file, and accepts the strict mode's oddities; None
             if it cannot decode.
 
     Raises:

@@ -24,7 +24,7 @@ _LEAST_LEFT = 0.1
 
 
 class Mask(BaseModel):
-    """What to ignore in each frame of one camera.
+    """The parts of each frame of one camera that are ignored.
 
     ``polygons`` are given by their corners, (x, y) in shares of the upright frame's width and height,
     from its top left corner; where they overlap, all that any of them holds is covered.

@@ -37,7 +37,7 @@ class InputDefinition(BaseModel):
 def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
     """Make a frame the input of a network.
 
-    The whole frame is resized without a crop; its aspect ratio is not kept (method, section 1).
+    The whole frame is resized without a crop; its aspect ratio is not preserved (method, section 1).
 
     Args:
         pixels: uint8 [H, W, 3], BGR.

@@ -109,11 +109,11 @@ def read_kept_references(path: Path, references: int) -> NDArray[np.int64]:
     """Read the indices of the references to keep, one on each line; int64 [R'], ascending.
 
     Raises:
-        InvalidGroundTruth: the file cannot be read, a line is no index, or none is kept.
+        InvalidGroundTruth: the file cannot be read, a line is no index, or there is none.
     """
     kept = {_index(line.strip(), references, "reference", path, number) for number, line in _lines(path)}
     if not kept:
-        raise InvalidGroundTruth(f"{path.name} keeps no reference.")
+        raise InvalidGroundTruth(f"{path.name} lists no reference.")
     return np.array(sorted(kept), np.int64)
 
 

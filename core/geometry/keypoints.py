@@ -1,6 +1,6 @@
-"""The keypoints of a frame, quantized, and the record in which a place keeps them.
+"""The keypoints of a frame, quantized, and the record in which a place stores them.
 
-Positions are shares of the frame's width and height, so that they mean the same whatever size the network saw;
+Positions are shares of the frame's width and height, so that they mean the same at any size of the network's input;
 :meth:`Keypoints.pixels` gives them in pixels of the frame.
 
 A record is the frame's width and height in pixels and the number of keypoints n, each four bytes, then the positions,
@@ -23,7 +23,7 @@ LENGTH = 64
 """Values of a descriptor: those of XFeat."""
 
 SHARES = 1 << 16
-"""Steps by which a position is kept, over the whole width or height."""
+"""Steps by which a position is quantized, over the whole width or height."""
 RESOLUTION = 254.0
 """Steps of 1 / RESOLUTION quantize the values of descriptors; values of half a unit and more, which are rare, become
 127."""
@@ -33,12 +33,12 @@ _EACH = 4 + LENGTH
 
 
 def record_bytes(count: int) -> int:
-    """Bytes of the record of so many keypoints."""
+    """Bytes of the record of ``count`` keypoints."""
     return _HEADER.size + _EACH * count
 
 
 def count_of(size: int) -> int:
-    """How many keypoints a record of so many bytes has."""
+    """How many keypoints a record of ``size`` bytes has."""
     return (size - _HEADER.size) // _EACH
 
 

@@ -1,4 +1,4 @@
-"""What geometric verification finds of the pairs of two traverses."""
+"""Geometric verification of the pairs of two traverses."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Values = NDArray[np.float64]
 
 
 class Pairs:
-    """What verification finds of pairs of Q queries and R references, each of which is verified when it is needed.
+    """The verification of pairs of Q queries and R references; each pair is verified when it is first needed.
 
     evidence: float64 [Q, R]; share: float64 [Q, R], inliers by the keypoints of the picture that has fewer.  NaN where
-    nobody has asked yet.
+    a pair is not verified yet.
     """
 
     def __init__(

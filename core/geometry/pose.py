@@ -58,12 +58,12 @@ SLOPE_DEVIATION = 1.0
 SCALE_DEVIATION = 0.3
 """Deviation of the logarithm of the length of a shift: which points are typical is a matter of chance."""
 PER_MATCH, PER_VALUE = float(np.log(4)), 4.0
-"""What the criterion charges for the free distance of each match, and for each value within a logarithm (Torr's
+"""The penalties of the criterion for the free distance of each match, and for each value within a logarithm (Torr's
 λ1 and λ2)."""
 TEMPERATURE = 4.0
 """Answers are weighed by the exponential of half their criterion over this, as matches are no independent evidence."""
 HOPELESS = 150.0
-"""Answers whose criterion is worse by more at first are not looked at again."""
+"""Answers with a criterion that is worse by more at first are not considered again."""
 NEGLIGIBLE = 1e-3
 """Weight from which on an answer is a part of the mixture."""
 INFLATION = 1.5
@@ -96,7 +96,7 @@ class RelativeView:
     """The camera of a query in the frame of a place's camera, of which x points ahead, y to the left and z up.
 
     turn: float64 [3, 3], the rotation from the axes of the query's camera to those of the place's.
-    shift: float64 [3], the centre of the query's camera, in units of the typical distance of what both see.
+    shift: float64 [3], the centre of the query's camera, in units of the typical distance of the points that both see.
     covariance: float64 [6, 6], of a small rotation about the place's axes that follows the turn (radians), and of the
         shift.
     inliers: how many matches fit.
@@ -153,7 +153,7 @@ def relative_view(
 
 
 def _by_assumed_field(view: RelativeView) -> RelativeView:
-    """The view of a camera whose focal length was assumed, with what that leaves open of its turn."""
+    """The view of a camera whose focal length was assumed, with the uncertainty of its turn that follows."""
     turn, covariance = _vector(view.turn), view.covariance.copy()
     covariance[:3, :3] += np.outer(turn, turn) * FOCAL_DEVIATION**2
     return replace(view, covariance=covariance, source="field-of-view")
@@ -223,7 +223,7 @@ class _Plane:
         return _Plane(_rotation(step[:3]) @ self.rotation, self.centre + step[3:6], self.tilt + step[6:])
 
     def is_like(self, other: _Plane | _RigidScene) -> bool:
-        """Whether the other is a plane in which the cameras stand alike."""
+        """Whether the other is a plane in which the cameras have the same poses."""
         apart = float(np.abs(self.rotation - other.rotation).max() + np.abs(self.centre - other.centre).max())
         return isinstance(other, _Plane) and apart < SAME
 
@@ -279,7 +279,7 @@ class _RigidScene:
         return _RigidScene(_rotation(step[:3]) @ self.rotation, centre / np.linalg.norm(centre))
 
     def is_like(self, other: _Plane | _RigidScene) -> bool:
-        """Whether the other is a rigid scene in which the cameras stand alike; the sign of c does not matter."""
+        """Whether the other is a rigid scene with the same poses of the cameras; the sign of c does not matter."""
         apart = float(np.abs(self.rotation - other.rotation).max() + 1 - abs(self.centre @ other.centre))
         return isinstance(other, _RigidScene) and apart < SAME
 
@@ -473,7 +473,7 @@ def _view(p: Array, q: Array, model: _Model, noise: float) -> RelativeView:
 
 
 def _mixture(views: Sequence[tuple[float, RelativeView]]) -> RelativeView:
-    """Mean and covariance of a mixture: what the views disagree in adds to what each leaves open."""
+    """Mean and covariance of a mixture: the disagreement of the views adds to the uncertainty of each."""
     _, first = views[0]
     at = np.array([np.r_[_vector(view.turn @ first.turn.T), view.shift] for _, view in views])
     weights = np.array([weight for weight, _ in views])

@@ -5,11 +5,11 @@ one rigid scene, the matches x, x' fit a fundamental matrix, x'^T F x = 0; a rob
 them fit, its inliers.
 
 A camera that stands or only turns, and a scene that is a plane, leave F open: x' ~ H x with one homography H, and each
-F = [e]x H fits, whatever the epipole e (Hartley and Zisserman, Multiple View Geometry, section 11.9).  The estimator,
+F = [e]x H fits, for any epipole e (Hartley and Zisserman, Multiple View Geometry, section 11.9).  The estimator,
 which throws such samples away as degenerate, may find nothing then, in a frame and itself too.  So a homography is
 estimated beside it, and those are the inliers of which there are more.
 
-Matches that lie on one line in a picture, as lamps at night may, fit F = l' l^T whatever the other picture shows: all
+Matches that lie on one line in a picture, as lamps at night may, fit F = l' l^T with any other picture: all
 points of the one line go with all points of the other picture.  Such a matrix says nothing and has no inliers.
 
 A few inliers come by chance, the more the more matches there are.  How surprising k inliers of m matches are is said by
@@ -62,7 +62,7 @@ GRID = 8
 
 @dataclass(frozen=True)
 class Verification:
-    """What the geometry of a query and a candidate says.
+    """The geometric evidence for a query and a candidate.
 
     keypoints: how many the query and the candidate have.
     matches: int64 [m, 2], numbers of the query's and of the candidate's keypoints; ascending in the query's.

@@ -40,7 +40,7 @@ class PluggedNetwork:
         module: is put into evaluation mode; it may compute more than the outputs need.
         outputs: names of submodules as in ``module.named_modules()``, each with an output [B, K, X, Y].
         shown: the input that the module expects.
-        description: what else distinguishes the network (its class, its version); part of the identity.
+        description: further properties that distinguish the network (its class, its version); part of the identity.
         rectify: clip the outputs at zero, for layers that come before their rectifier.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The description of a network that others trained: what goes in, what comes out, and what is made of it.
+"""The description of a network that others trained: its input, its output, and the use that is made of it.
 
 It is a small file in JSON beside the network's own file::
 
@@ -10,7 +10,7 @@ It is a small file in JSON beside the network's own file::
       "aggregation": {"method": "vlad", "words": 32, "whitening": 512}
     }
 
-A global descriptor is a map of one cell, and tokens are the cells of a map row by row, so that whatever a network gives
+A global descriptor is a map of one cell, and tokens are the cells of a map row by row, so that any output of a network
 is a map of features to everything that follows.
 """
 
@@ -41,7 +41,7 @@ class Sizes(_Part):
 
 
 class Output(_Part):
-    """What is taken from a network.
+    """The output that is taken from a network.
 
     ``descriptor``: one vector of a frame, [1, K].  ``maps``: [1, K, X, Y].  ``tokens``: [1, N, K], one for each square
     of ``patch`` pixels, row by row, after ``skip`` others, such as a class token.
@@ -76,7 +76,7 @@ class Aggregation(_Part):
     unit_features: bool = Field(default=True, description="Each feature is scaled to unit length first.")
     gamma: float = Field(default=1.0, gt=0, le=1, description="Exponent of the power normalization.")
     normalization: Literal["intra", "global"] = "intra"
-    whitening: int | None = Field(default=None, ge=1, le=65_536, description="Values that PCA whitening keeps.")
+    whitening: int | None = Field(default=None, ge=1, le=65_536, description="Values that PCA whitening retains.")
 
 
 class SecondStage(_Part):

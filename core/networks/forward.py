@@ -1,4 +1,4 @@
-"""The forward pass of a shallow network: ONNX Runtime computes it, and torch where a GPU or bfloat16 is asked for.
+"""The forward pass of a shallow network: ONNX Runtime computes it, and torch where a GPU or bfloat16 is requested.
 
 torch's own pass brings the weights into the processor's layout at every call and rectifies each map in a step of its
 own.  ONNX Runtime does both once, when a session is made; ``docs/benchmarks.md`` compares the two.
@@ -34,7 +34,7 @@ MOST_IMAGES = 64
 """Images of one batch on a GPU."""
 
 SILENT = 4
-"""ONNX Runtime's severity from which on it writes to standard error: what goes wrong is raised as well."""
+"""ONNX Runtime's severity from which on it writes to standard error: errors are raised as well."""
 
 
 class GraphRunner:
@@ -58,14 +58,14 @@ class GraphRunner:
         self._session()
 
     def _session(self) -> onnxruntime.InferenceSession:
-        """The session of as many threads as the calling thread may use."""
+        """The session with the number of threads that the calling thread may use."""
         threads = torch.get_num_threads()
         with self._making:
             if threads not in self._sessions:
                 options = onnxruntime.SessionOptions()
                 options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
                 options.log_severity_level = SILENT
-                # A thread that polls for work takes a core from what follows the pass, and from other processes.
+                # A thread that polls for work takes a core from the steps after the pass, and from other processes.
                 options.add_session_config_entry("session.intra_op.allow_spinning", "0")
                 try:
                     self._sessions[threads] = onnxruntime.InferenceSession(
@@ -79,7 +79,7 @@ class GraphRunner:
         """The outputs, in their order, for the graph's inputs by name.
 
         Raises:
-            InvalidModel: the inputs are too small for the layers, or not what the graph takes.
+            InvalidModel: the inputs are too small for the layers, or not those that the graph takes.
         """
         try:
             return self._session().run(self._outputs, dict(inputs))
@@ -168,7 +168,7 @@ def _copied(network: ShallowNetwork, device: torch.device, dtype: torch.dtype) -
 def has_bfloat16() -> bool:
     """Whether torch lets the processor multiply bfloat16, twice as fast as float32; elsewhere it is emulated.
 
-    ``ATEN_CPU_CAPABILITY`` can keep torch to a part of what the processor has.
+    ``ATEN_CPU_CAPABILITY`` can restrict torch to a part of the processor's instructions.
     """
     able = torch.cpu.get_capabilities().get("avx512_bf16", False)
     return bool(able) and torch.backends.cpu.get_cpu_capability() == "AVX512"

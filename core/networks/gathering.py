@@ -1,4 +1,4 @@
-"""One pass for the images of several threads: what waits while a batch is computed is computed together, next."""
+"""One pass for the images of several threads: those that wait while a batch is computed are the next batch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class _Call:
 class GatheredPass:
     """A network's pass that takes the images of its callers together; it is called like the network.  Thread-safe.
 
-    It has no threads of its own and waits for nobody: a caller that finds a lane free computes what is waiting, its own
+    It has no threads of its own and waits for nobody: a caller that finds a lane free computes those that wait, its own
     images included.  So a single caller has a batch of its own, and under load batches grow by themselves.
 
     Args:
@@ -47,7 +47,7 @@ class GatheredPass:
         """B x 3 x H x W to one B x K x X x Y tensor for each output.
 
         Raises:
-            Exception: whatever the pass raised on the batch that these images were in.
+            Exception: the error that the pass raised on the batch that these images were in.
         """
         call = _Call(images)
         with self._changing:

@@ -28,7 +28,7 @@ def onnx_graph(network: ShallowNetwork) -> ModelProto:
         values = layer.name
         if not isinstance(layer, Relu):
             rectified = layer.name
-        found[rectified] = values  # a rectifier replaces what is before it
+        found[rectified] = values  # a rectifier replaces its input
     outputs = [f"output {index}" for index in range(len(network.outputs))]
     for name, output in zip(network.outputs, outputs, strict=True):
         nodes.append(helper.make_node("Transpose", [found[name]], [output], perm=[0, 2, 3, 1]))

@@ -128,7 +128,7 @@ def caffenet_definition(
     Args:
         normalize: with the two local response normalizations (the packaged network has none).
         norm_before_pool: AlexNet's order instead of CaffeNet's.
-        depth: how many of the five convolutions to keep.
+        depth: how many of the five convolutions to use.
         scale: factor on the mean-subtracted 0–255 pixels.
     """
     convolutions = (

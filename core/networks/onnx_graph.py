@@ -1,4 +1,4 @@
-"""What a graph in the ONNX format may be made of, and what it takes and gives."""
+"""The operators that a graph in the ONNX format may have, and its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _check_tensor(tensor: TensorProto) -> None:
 
 
 def bytes_of(tensor: TensorProto) -> int:
-    """The bytes that the shape of a tensor asks for; two values of four bits share a byte."""
+    """The bytes that the shape of a tensor requires; two values of four bits share a byte."""
     count = math.prod(tensor.dims)
     try:
         width = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
@@ -129,7 +129,7 @@ def graph_input(model: ModelProto, description: NetworkDescription) -> str:
         raise InvalidModel(f"It has {len(inputs)} inputs, not one for a picture.")
     taken = inputs[0].type.tensor_type
     if taken.elem_type != TensorProto.FLOAT:
-        raise InvalidModel("Its input is not of float32; export it so, whatever its weights are.")
+        raise InvalidModel("Its input is not of float32; export it so, with weights of any type.")
     shape = [side.dim_value if side.HasField("dim_value") else None for side in taken.shape.dim]
     shown = description.input
     wanted = (1, 3, shown.height, shown.width)
@@ -155,7 +155,7 @@ def graph_output(model: ModelProto, description: NetworkDescription) -> str:
 
 
 def as_maps(values: NDArray[Any], description: NetworkDescription) -> NDArray[np.float32]:
-    """What a network gives for one frame as maps, float32 [1, K, X, Y].
+    """The output of a network for one frame as maps, float32 [1, K, X, Y].
 
     Raises:
         InvalidModel: it has another shape than is described, too many values, or such as are not finite.

@@ -63,7 +63,7 @@ class OnnxNetwork:
         """float32 [B, 3, H, W] to one float32 [B, K, X, Y].
 
         Raises:
-            InvalidModel: what the graph gives is not what its description says, or is not finite.
+            InvalidModel: the graph's output is not as its description says, or is not finite.
         """
         frames = images.contiguous().numpy()
         found = [as_maps(self._run({self._input: frame[np.newaxis]})[0], self.description) for frame in frames]

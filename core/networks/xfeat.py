@@ -35,7 +35,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureMaps:
-    """What the network sees in a frame of H x W pixels.
+    """The output of the network for a frame of H x W pixels.
 
     heat: float32 [H, W], the probability within its cell that a pixel is the cell's keypoint, in [0, 1].
     reliability: float32 [H / 8, W / 8], in [0, 1].

@@ -1,4 +1,4 @@
-"""Calibration of a map: queries whose place is known are searched for, and the answers tell when to believe one.
+"""Calibration of a map: queries whose place is known are searched for, and the answers show when to believe one.
 
 Every query is searched for twice: in the map as it is, and in the map without the query's place, so that there are as
 many unknown places as known ones.  With the place everything is left out that lies within three times the distance that
@@ -45,7 +45,7 @@ FROM_ITSELF = (
 
 
 FROM_DOUBT = (
-    "The labelled frames are those that were kept for review; unless recognized ones are kept as well, they are harder "
+    "The labelled frames are those that were stored for review; without recognized ones among them they are harder "
     "than the frames that come."
 )
 """The warning of a calibration from the frames of review."""
@@ -126,7 +126,7 @@ def queries_from_traverse(
 
     Args:
         pairs: for places of the sequence the id of a place of another sequence that shows the same, or None if there
-            is none; without ``pairs`` the poses tell which places are the same, and alignment where there are none.
+            is none; without ``pairs`` the poses decide which places are the same, and alignment where there are none.
         most: the largest number of queries; they are spread evenly over the sequence.
 
     Raises:
@@ -203,7 +203,7 @@ def run_trials(
 
     Args:
         base: the calibration by which the answers are judged.
-        without_place: whether queries are also asked of the map without their place.
+        without_place: whether the map is also queried without their place.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -247,7 +247,7 @@ def calibrate_map(
 
     Args:
         beside: further queries, whose answers count as much; None: none.
-        target: what the calibration has to reach, such as a precision.
+        target: the target of the calibration, such as a precision.
         source: is noted in the calibration.
 
     Raises:

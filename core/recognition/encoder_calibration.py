@@ -19,13 +19,13 @@ UNMEASURED = Calibration(
 """Of an encoder before it is calibrated: no decision value reaches its threshold, so that every verdict is unknown."""
 
 NEIGHBOURS = 3
-"""Pictures up to so many places apart, in their order, may show the same place."""
+"""Pictures that are at most this many places apart, in their order, may show the same place."""
 
 
 def measure_calibration(encoder: Encoder, frames: Sequence[Pixels] | Iterable[Pixels], source: str) -> Calibration:
     """The calibration that an encoder ships with, by frames in the order in which they were taken.
 
-    Each is asked as it is, among the others, and as a second visit would see it (``fit_encoder_calibration``).
+    Each is a query as it is, among the others, and as a second visit would see it (``fit_encoder_calibration``).
 
     Raises:
         CalibrationImpossible: the frames are too few.

@@ -1,4 +1,4 @@
-"""What is asked of a map: a question, and the encoded frame that it is about."""
+"""A question to a map, and the encoded frame that it is about."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Verify = Literal["auto", "always", "never"]
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a map about a frame.
+    """A question to a map about a frame.
 
     k: how many matches to list.
-    selection: what is known of the place; None: nothing.
+    selection: the prior knowledge of the place; None: nothing.
     verify: when the geometry of the best candidates is verified.
-    camera: the name of the map's camera that took the frame, whose mask is applied and whose intrinsics tell the pose;
+    camera: the name of the map's camera that took the frame, whose mask is applied and whose intrinsics give the pose;
         None: not known.
     explain: whether the score of the best match is to be explained, which needs the features of the frame's regions.
     """
@@ -60,7 +60,7 @@ class Verifier:
     Args:
         when: see :data:`Verify`.
         find: finds the keypoints of the query's frame.
-        camera: the name of the map's camera that took it, whose intrinsics tell the pose; None: not known.
+        camera: the name of the map's camera that took it, whose intrinsics give the pose; None: not known.
     """
 
     def __init__(self, when: Verify, find: Callable[[], Keypoints], camera: str | None = None) -> None:

@@ -47,7 +47,7 @@ class RivalPlaces:
 
     places: ids, best first.
     score: of the first.
-    same_place: whether they show what the best match shows; else they are one place that looks like the query.
+    same_place: whether they show the place of the best match; else they are one place that looks like the query.
     """
 
     places: tuple[str, ...]
@@ -71,7 +71,7 @@ class Answer:
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them.
     third_stage: whether the candidates were verified geometrically.
-    rivals: what makes an answer ambiguous, the places of each group best first.
+    rivals: the groups of places that make an answer ambiguous, the places of each group best first.
     """
 
     judgement: Judgement
@@ -185,10 +185,10 @@ def describe(
     thumbnail_side: int = THUMBNAIL_SIDE,
     keypoints: Keypoints | None = None,
 ) -> Enrolment:
-    """The record that a map stores of an encoded frame: its descriptors, fields, and the picture that the map keeps.
+    """The record that a map stores of an encoded frame: its descriptors, fields, and the picture if the map stores it.
 
     Args:
-        picture: the bytes of the file; only needed if the map keeps images.
+        picture: the bytes of the file; only needed if the map stores images.
         digest: the frame's ``frame_digest``.
         pixels: uint8 [H, W, 3], BGR.
         thumbnail_side: the longer side of the thumbnail, in pixels.

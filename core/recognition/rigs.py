@@ -46,7 +46,7 @@ def locate_rig(
         places = map_.places_at(fused.rows[: question.k].tolist())
         if None not in places:
             break
-    # A place that is deleted all the same is not listed; the verdict stands unless it was the best one.
+    # A place that is deleted all the same is not listed; the verdict holds unless it was the best one.
     kept = [position for position, place in enumerate(places) if place is not None]
     judgement = fused.judgement if kept[:1] == [0] else replace(fused.judgement, verdict="unknown", probability=None)
     matches = [(float(fused.scores[position]), place) for position in kept if (place := places[position]) is not None]

@@ -62,7 +62,7 @@ class SelfQueries:
         """Which of the places at ``others``, int64 [n], are the same place as the one at ``position``; bool [n].
 
         Args:
-            times: so many times as far as the map says.
+            times: how many times as far as the map says.
         """
         neighborhood = self.neighborhood if times == 1 else self.neighborhood.times(times)
         return self.where.take(np.concatenate([[position], others])).near(0, neighborhood)[1:]

@@ -58,7 +58,7 @@ class Candidates:
     weights: float64 [n], the log prior of each place; None if the query had no prior.
     ordered: float32 [n], the values by which two stages order the places: the scores, changed by the prior.
     places: the number of places in the map, including those that the query may not find.
-    geometry: what verification found of the places, which are in the order of three stages then; None: none was
+    geometry: the results of verification for the places, which are in the order of three stages then; None: none was
         verified.
     verifications: of the first places, in their order; None for one that was not verified.
     """
@@ -80,7 +80,7 @@ class Candidates:
         return self.ordered if self.geometry is None else final_values(self.ordered, self.geometry.share)
 
     def with_geometry(self, geometry: Geometry, verifications: tuple[Verification | None, ...]) -> Candidates:
-        """The candidates, which are in the order of three stages, with what verification found of them."""
+        """The candidates, which are in the order of three stages, with the results of their verification."""
         return replace(self, geometry=geometry, verifications=verifications)
 
     def take(self, kept: Positions) -> Candidates:
@@ -117,7 +117,7 @@ def rank_places(
     Args:
         encoder: the map's encoder.
         encodings: the queries, encoded by it, each with at least one region; at least one query.
-        selection: what is known of the places; None: nothing.
+        selection: the prior knowledge of the places; None: nothing.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -147,7 +147,7 @@ def agree(
         scope: the places that the query may find.
         descriptor: the query's, float32 [D].
         local: the query's local descriptors, int8 [C, L].
-        ranking: what a search of the scope returned, rows int64 [n] and inner products float32 [n].
+        ranking: the result of a search of the scope, rows int64 [n] and inner products float32 [n].
 
     Returns:
         The first ``HEAD`` places of the ranking if a verdict needs no more, else all of them.
@@ -244,7 +244,7 @@ def likeness_of_first(encoder: Encoder, descriptors: Array, local: Cells) -> Arr
 def _is_enough(candidates: Candidates, neighborhood: Neighborhood, examined: int) -> bool:
     """Whether the candidates have as many places other than the best place as a verdict considers.
 
-    Among many frames of few views there are to be half as many as the second stage examines elsewhere, and so many that
+    Among many frames of few views there are to be half as many as the second stage examines elsewhere, and enough that
     no place has to be imagined that the map has.
 
     Args:
@@ -281,9 +281,9 @@ class CellComparison(NamedTuple):
     """How the second stage of an encoder compares a query with the places of a ranking.
 
     candidates: how many places it examines; 0 if the encoder has no second stage.
-    gains: returns what it adds to the scores at positions in the ranking, int64 [k] to float32 [k], at least 0.
+    gains: returns the addition to the scores at positions in the ranking, int64 [k] to float32 [k], at least 0.
     screened: among how many of the first places it looks for those that it examines.
-    promise: returns about what it would add; None: the first places are examined.
+    promise: returns an estimate of the addition; None: the first places are examined.
     """
 
     candidates: int
@@ -336,7 +336,7 @@ def examine(
         whereabouts: the poses and sequences of the n places.
         neighborhood: which places count as the same place.
         candidates, gains, screened, promise: as of :class:`CellComparison`.
-        others: how many of the examined places have to be other than the best place, if the map has so many.
+        others: how many of the examined places have to be other than the best place, if the map has that many.
     """
     raised = scores.copy()
     done = np.zeros(len(scores), np.bool_)
@@ -368,7 +368,7 @@ def _views_first(whereabouts: Whereabouts, queue: Positions) -> Positions:
 def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, references: Cells) -> Array:
     """Both stages for every query against every frame of one traverse, as a map of that traverse would score them.
 
-    It is what the evaluation compares: the frames of the references are the places of one sequence without poses.
+    The evaluation compares this matrix: the frames of the references are the places of one sequence without poses.
 
     Args:
         inner_products: of the descriptors, float32 [Q, R].

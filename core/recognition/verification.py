@@ -2,7 +2,7 @@
 
 ``always`` verifies the best ``CANDIDATES`` places of two stages.  ``auto`` looks only where these leave doubt: at the
 best match first, whose evidence may settle it, and else at the others.  A place without keypoints, as of a map that
-keeps none, stays where the first two stages have put it.
+stores none, stays where the first two stages have put it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 frame so few that they would say nothing."""
 
 MOST_VIEWS = 2
-"""Of so many places the geometry tells the pose: two directions meet in a point, and each takes some 20 ms."""
+"""The most places whose geometry gives the pose: two directions meet in a point, and each takes some 20 ms."""
 
 CANDIDATES = 10
 """How many places are verified at most: five lose 0.027 of the recall@1 on lip6, and fifteen gain 0.002."""
@@ -39,7 +39,7 @@ CANDIDATES = 10
 
 @dataclass(frozen=True)
 class ThirdStage:
-    """What came of the third stage.
+    """The outcome of the third stage.
 
     keypoints: of the query; None if its candidates were not verified.
     stored: of the places that were verified, by their rows.
@@ -133,7 +133,7 @@ def verify_candidates(
 
 
 def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifier: Verifier) -> bool:
-    """Whether the geometry of the best match tells the robot's pose, which its scores alone do not."""
+    """Whether the geometry of the best match gives the robot's pose, which its scores alone do not."""
     posed = judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE
     return bool(posed) and map_.cameras.intrinsics(verifier.camera) is not None
 
@@ -141,7 +141,7 @@ def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifie
 def relative_views(
     map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
 ) -> tuple[list[RelativeView | None], str | None]:
-    """How the query's camera stands to those of the places that were verified and belong to the best match's answer.
+    """The query's camera relative to those of the places that were verified and belong to the best match's answer.
 
     Returns:
         One for each of the first candidates, and why intrinsics were not used, if they do not fit a frame.
@@ -160,7 +160,7 @@ def relative_views(
         (known,) = map_.places_at([row])
         names = verifier.camera, None if known is None else known.camera
         cameras = [map_.cameras.intrinsics(name) for name in names]
-        if None in cameras and told:  # only the best match's heading can be told without intrinsics
+        if None in cameras and told:  # without intrinsics only the best match's heading is known
             views.append(None)
             continue
         try:
@@ -173,7 +173,7 @@ def relative_views(
 
 
 def verified(candidates: Candidates, found: Sequence[Verification | None]) -> Candidates:
-    """The candidates in their final order, with what verification found of the first of them."""
+    """The candidates in their final order, with the results of verification for the first of them."""
     evidence, share = np.full((2, len(candidates.rows)), np.nan)
     for at, one in enumerate(found):
         if one is not None:

@@ -1,4 +1,4 @@
-"""Bags: rosbag2 (SQLite, MCAP) and ROS 1; their topics, the frames of one of them, and the path that another tells."""
+"""Bags: rosbag2 (SQLite, MCAP) and ROS 1; their topics, the frames of one of them, and the path in another."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ OF_DIRECTORIES = (".db3", ".mcap")
 def bag_files(path: Path) -> list[Path]:
     """The files of a bag by their names: the file itself, or those of a rosbag2 directory in natural order.
 
-    There are none if the path is no bag.  A directory with pictures is none, whatever else lies in it.
+    There are none if the path is no bag.  A directory with pictures is none, even with other files in it.
     """
     if not path.is_dir():
         return [path] if _kind_of(path) in STORAGES else []
@@ -67,14 +67,14 @@ def _kind_of(path: Path) -> str:
 class Bag:
     """The files of one bag, opened.
 
-    remarks: sentences about what was found in them that a user must know.
+    remarks: sentences about their content that a user must know.
     """
 
     def __init__(self, path: Path) -> None:
         """Open a bag: a file, or a directory of files.
 
         Raises:
-            MissingExtra: what reads bags is not installed.
+            MissingExtra: the reader of bags is not installed.
             InvalidRecording: a file cannot be read, or is no bag.
         """
         check_installed()
@@ -107,7 +107,7 @@ class Bag:
             with file.open("rb") as packed, unpacked.open("wb") as plain:
                 shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True), plain)
         except zstandard.ZstdError as error:
-            self.remarks.append(f"{file.name} is cut short or damaged ({error}); what could be unpacked of it is read.")
+            self.remarks.append(f"{file.name} is cut short or damaged ({error}); the rest of it is read.")
         return unpacked
 
     def close(self) -> None:
@@ -157,7 +157,7 @@ class Bag:
         return name
 
     def frames(self, name: str) -> list[RecordedFrame]:
-        """The frames of a topic that ``choose`` has given, in the order of their times; remarks tell what is odd.
+        """The frames of a topic that ``choose`` has given, in the order of their times; remarks name oddities.
 
         The id of a frame is made of the topic and its stamp.
         """
@@ -227,7 +227,7 @@ class Bag:
             ]
 
     def _in_time(self, name: str, found: list[tuple[int, Entry]]) -> list[tuple[int, Entry]]:
-        """Entries in the order of their times; what is odd about the times becomes a remark."""
+        """Entries in the order of their times; oddities of the times become remarks."""
         unstamped = sum(not entry.stamp for _, entry in found)
         if unstamped:
             self.remarks.append(
@@ -253,11 +253,11 @@ class Bag:
         return [found[number] for number in order]
 
     def trajectory(self, name: str) -> Trajectory:
-        """The path that the poses of a topic tell.
+        """The path by the poses of a topic.
 
         Raises:
             UnknownTopic: the bag has no such topic of poses.
-            InvalidTrajectory: no message of it tells a pose.
+            InvalidTrajectory: no message of it has a pose.
         """
         self.choose(name, POSE_TYPES, "poses")
         times, places, turns, idle = [], [], [], 0
@@ -274,15 +274,15 @@ class Bag:
             places.append(pose[0])
             turns.append(pose[1])
         if idle:
-            self.remarks.append(f"{idle} messages of {name} tell no position (no fix) and are left out.")
+            self.remarks.append(f"{idle} messages of {name} have no position (no fix) and are left out.")
         if not times:
-            raise InvalidTrajectory(f"No message of {name} tells a position.")
+            raise InvalidTrajectory(f"No message of {name} has a position.")
         return Trajectory.of_samples(times, places, turns, self.topics[name].kind == FIX)
 
     def told(self) -> list[str]:
         """All remarks, those about damaged files first."""
         damaged = [
-            f"{file.name} {storage.problem}: what could be read of it is taken."
+            f"{file.name} {storage.problem}: the part that could be read is used."
             for file, storage in self._files
             if storage.problem is not None
         ]

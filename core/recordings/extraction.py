@@ -1,4 +1,4 @@
-"""Frames of a recording as a folder of pictures, for what takes files."""
+"""Frames of a recording as a folder of pictures, for readers of files."""
 
 from __future__ import annotations
 

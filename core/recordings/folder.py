@@ -35,7 +35,7 @@ class _Row(BaseModel):
 
 
 def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame], list[str]]:
-    """The frames of a directory, and remarks on them; one of whose name no id can be made has its name as its id.
+    """The frames of a directory, and remarks on them; a frame has its name as its id if no id can be made of it.
 
     Args:
         prefix: of the ids that are made from file names.

@@ -18,11 +18,11 @@ NANOSECONDS = 1_000_000_000
 class RecordedFrame:
     """A frame that is read when it is needed.
 
-    id: the id of its place, the same whenever the recording is opened; what no place can have if its file's name makes
+    id: the id of its place, the same whenever the recording is opened; one that no place can have if its file's name makes
         none.
-    name: what a message calls it, such as the name of its file.
+    name: its name in messages, such as that of its file.
     load: reads the bytes of a JPEG, PNG or WebP file; raises OSError or InvalidImage.  Frames that are loaded in their
-        order cost least, for a bag keeps one chunk unpacked and a video decodes forward only.
+        order cost least, for a bag retains one unpacked chunk and a video decodes forward only.
     nanoseconds: when it was taken by the recording's own clock, which for bags counts from 1970; None if not known.
     timestamp: when it was taken, UTC; None if not known, as for a video.
     embedded: whether pose and timestamp are those of the EXIF data of its bytes, which ``described`` reads.
@@ -37,7 +37,7 @@ class RecordedFrame:
     embedded: bool = False
 
     def described(self, data: bytes | None = None) -> RecordedFrame:
-        """The frame with the pose and the time that its bytes tell, if that is where they stand.
+        """The frame with the pose and the time in its bytes, if that is where they are.
 
         Args:
             data: its bytes, if they are at hand; otherwise they are loaded.

@@ -1,6 +1,6 @@
 """Keyframes: the frames of a recording that show something new, by distance, angle, time or change of descriptor.
 
-Without any choice of them, the frames in which nothing changes at all are told from the others by :func:`moving`.
+Without any choice of them, the frames in which nothing changes at all are separated from the others by :func:`moving`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ Describe = Callable[[RecordedFrame], NDArray[np.float32] | None]
 
 
 STANDING = 1.0
-"""Metres: a robot whose poses are farther apart, and by more than their noise, has moved, whatever it sees."""
+"""Metres: a robot whose poses are farther apart, and by more than their noise, has moved, with any view."""
 
 NOISE = 8.0
-"""Poses of one place are hardly ever farther apart than so many times their noise.  Of a stop of 300 frames, 1 frame is
-kept, and 3 at most where poses are interpolated; with 6 these were 3 and 6."""
+"""Poses of one place are hardly ever farther apart than this many times their noise.  Of a stop of 300 frames, 1 is
+retained, and 3 at most where poses are interpolated; with 6 these were 3 and 6."""
 
 LEAST_POSES = 8
 """With fewer poses, nothing is said of their noise."""
@@ -37,7 +37,7 @@ class Spacing:
 
     Metres, degrees and seconds are reached by the frame that is nearest to them if the next step is as the last: half
     of the step from the frame before may be missing, and a tenth of the measure at most.  So frames two metres apart,
-    whose poses are never quite exact, give one keyframe every four metres if four are asked for.
+    whose poses are never quite exact, give one keyframe every four metres if four are requested.
 
     metres, degrees, seconds: of their positions, headings and times.
     change: 1 less the inner product of their descriptors: 0 for equal frames, about 1 for frames of different places.
@@ -53,7 +53,7 @@ class Spacing:
 
 
 SLACK = 0.1
-"""Of a measure, what may be missing at most."""
+"""The most that may be missing of a measure."""
 
 
 @dataclass
@@ -68,8 +68,8 @@ def keyframes(
 ) -> Iterator[RecordedFrame]:
     """The first frame and then each that is far enough from the keyframe before it.
 
-    A frame is judged by the measures that are known of it and of the keyframe; one of which none is known is left out.
-    The pose and the time of a keyframe are read if its bytes tell them.
+    A frame is judged by the measures that are known of it and of the keyframe; a frame without any is left out.
+    The pose and the time of a keyframe are read if its bytes have them.
 
     Args:
         describe: is called, in the order of the frames, if ``spacing`` gives a change.
@@ -120,8 +120,8 @@ def moving(
 def pose_noise(frames: Sequence[RecordedFrame]) -> float:
     """The standard deviation of each coordinate of the frames' poses, metres.
 
-    It is told by how much the way of a second differs from that of the second before, which is little while a robot
-    stands or drives: the median of such differences, whose coordinates have six times the variance.  A second, for
+    It follows from how much the way of a second differs from that of the second before, which is little while a robot
+    waits or drives: the median of such differences, whose coordinates have six times the variance.  A second, for
     poses between those of a receiver are interpolated.  0 if there are few poses.
     """
     poses = [frame.pose for frame in frames if frame.pose is not None]

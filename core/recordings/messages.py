@@ -34,7 +34,7 @@ STAMP_BYTES = 16
 
 
 def check_installed() -> None:
-    """Check that what reads bags is installed.
+    """Check that the reader of bags is installed.
 
     Raises:
         MissingExtra: it is not.
@@ -79,11 +79,11 @@ def picture_of(data: bytes, kind: str, coding: Coding) -> bytes:
 
 
 def pose_of(data: bytes, kind: str, coding: Coding) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The position and the orientation that a message of ``POSE_TYPES`` tells.
+    """The position and the orientation in a message of ``POSE_TYPES``.
 
     Returns:
         float64 [3], metres, or latitude and longitude in degrees and 0; and float64 [4], the quaternion x, y, z, w, NaN
-        where it is not known.  None if the message tells no position: it has no fix, or numbers that are not finite.
+        where it is not known.  None if the message has no position: it has no fix, or numbers that are not finite.
 
     Raises:
         InvalidRecording: the message is damaged.
@@ -109,7 +109,7 @@ def _decoded(data: bytes, kind: str, coding: Coding) -> Any:
     store = _types(coding)
     try:
         return store.deserialize_ros1(data, kind) if coding == "ros1" else store.deserialize_cdr(data, kind)
-    except Exception as error:  # rosbags' own, struct's, NumPy's: whatever bytes that make no sense lead to
+    except Exception as error:  # rosbags' own, struct's, NumPy's: all errors that malformed bytes cause
         raise InvalidRecording(f"A message is damaged: it is no {kind}.") from error
 
 

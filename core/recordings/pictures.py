@@ -87,7 +87,7 @@ def png(pixels: NDArray[Any]) -> bytes:
 def image_pixels(message: Any) -> NDArray[np.uint8]:
     """The pixels of a sensor_msgs/Image, uint8 [H, W] or [H, W, 3] in BGR.
 
-    Of ``mono16`` the upper eight bits are kept, as the service does with a PNG file of 16 bits.
+    Of ``mono16`` the upper eight bits are used, as the service does with a PNG file of 16 bits.
 
     Raises:
         UnsupportedFormat: its encoding is none of ``IMAGE_ENCODINGS``.

@@ -19,7 +19,7 @@ from core.recordings.video import SUFFIXES as VIDEOS
 from core.recordings.video import Video
 
 LARGEST_GAP = 1.5
-"""Seconds between two known poses between which a pose is interpolated; a satellite receiver tells one a second."""
+"""Seconds between two known poses between which a pose is interpolated; a satellite receiver gives one a second."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Recording:
     """The frames of a recording, in the order in which they were taken.
 
     name: of its file or folder, without the suffix.
-    remarks: sentences about what was found that a user must know.
+    remarks: sentences about its content that a user must know.
     continuous: whether its frames were taken by a clock, as those of a bag or a video, and not chosen by somebody.
     """
 
@@ -83,7 +83,7 @@ def open_recording(path: Path, topic: str | None = None, poses: Poses = Poses(),
         InvalidRecording, InvalidTraverse: it cannot be read, or has no frame; or an option does not go with it.
         UnknownTopic: the bag has no such topic, or several could be meant.
         InvalidTrajectory: the trajectory cannot be read, or does not fit the frames.
-        MissingExtra: what reads bags is not installed.
+        MissingExtra: the reader of bags is not installed.
     """
     of_bag = bool(bag_files(path))
     for option, value in (("--topic", topic), ("--pose-topic", poses.topic)):
@@ -172,7 +172,7 @@ def _place(recording: Recording, trajectory: Trajectory, by_frame: bool, largest
         if len(times) < len(frames):
             raise InvalidTrajectory(
                 f"{len(frames) - len(times)} of {len(frames)} frames of {recording.name} have no time, so a trajectory "
-                "with times tells nothing about them."
+                "with times gives nothing for them."
             )
     found = trajectory.at(times, largest_gap)
     without = missing(found)

@@ -40,7 +40,7 @@ class SqliteStorage(Storage):
             raise InvalidRecording(f"{path} is not the database of a bag, or is damaged: {error}.") from error
 
     def _read(self) -> None:
-        # A column of SQLite may hold anything, whatever its type.
+        # A column of SQLite may hold values of any type.
         for number, name, kind, coding in self._database.execute(
             "SELECT id, coalesce(CAST(name AS TEXT), ''), coalesce(CAST(type AS TEXT), ''), serialization_format "
             "FROM topics ORDER BY id"

@@ -1,6 +1,6 @@
 """Files of bags: their topics, where each message is, and its bytes.
 
-A file is read once from its beginning to its end or to a damage, whatever index it has, and then by the places of its
+A file is read once from its beginning to its end or to a damage, even if it has an index, and then by the places of its
 messages.  rosbags reads whole files 1.2 to 1.8 times as fast, but none of 9 600 frames of cut bags (here 4 656; the
 cuts leave half of the bytes), half of the frames of MCAP files with one bit turned over (here 98 %), and unpacks 6.6 MB
 to 3.5 GB, as mcap does (here 0.3 GB): ``python -m benchmarks.maps.damaged_bags --cuts 20 --flips 60``.
@@ -25,12 +25,12 @@ Key = tuple[int, int]
 """Where a message is in its file; each kind of file has keys of its own."""
 
 MOST_UNPACKED = 1 << 30
-"""Bytes to which a chunk or a message is unpacked; more is not believed, since a few bytes can stand for any number."""
+"""Bytes to which a chunk or a message is unpacked; more is not believed, since a few bytes can unpack to any number."""
 PART = 1 << 20
 """Bytes that are unpacked at a time."""
 
 LATEST = 2**63 - 1
-"""Nanoseconds; a later time, which no clock tells, counts as this."""
+"""Nanoseconds; a later time, which no clock gives, counts as this."""
 
 
 class Topic(NamedTuple):
@@ -55,7 +55,7 @@ class Entry(NamedTuple):
 
 
 class TopicConnection(NamedTuple):
-    """What writes messages to a topic; a topic may have several."""
+    """A writer of messages to a topic; a topic may have several."""
 
     topic: str
     kind: str
@@ -65,7 +65,7 @@ class TopicConnection(NamedTuple):
 class Storage(ABC):
     """One file of a bag, opened and read through.
 
-    problem: what is wrong with the file, in words; None if it is whole.
+    problem: the fault of the file, in words; None if it is whole.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class Storage(ABC):
         return number not in self._connections or self._connections[number].kind in IMAGE_TYPES + POSE_TYPES
 
     def _note(self, number: int, received: int, start: bytes, coding: Coding | None, key: Key) -> None:
-        """Keep in mind where a message is; ``start`` holds its first bytes."""
+        """Note where a message is; ``start`` holds its first bytes."""
         self._counts[number] += 1
         if coding is not None and self._wanted(number):
             self._found[number].extend((min(received, LATEST), stamp_of(start, coding), *key))
@@ -117,7 +117,7 @@ class Storage(ABC):
 
 
 class Record(NamedTuple):
-    """A record of a file or of a chunk: its kind, its fields if they stand before its data, and where its data is."""
+    """A record of a file or of a chunk: its kind, its fields if they are before its data, and where its data is."""
 
     kind: int
     fields: dict[str, bytes]
@@ -187,7 +187,7 @@ class ChunkedStorage(Storage):
 
     @abstractmethod
     def _take(self, file: BinaryIO, record: Record, key: Key) -> None:
-        """Learn what a record tells, if it is a message or describes some."""
+        """Note the content of a record that is a message or describes some."""
 
     @abstractmethod
     def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str, int]:
@@ -232,7 +232,7 @@ def _data(file: BinaryIO, record: Record) -> bytes:
 
 
 def unpacked(data: bytes, packing: str, size: int = MOST_UNPACKED) -> tuple[bytes, str | None]:
-    """As much as can be unpacked of packed data, at most ``size`` and ``MOST_UNPACKED`` bytes, and what is wrong."""
+    """As much as can be unpacked of packed data, at most ``size`` and ``MOST_UNPACKED`` bytes, and the fault."""
     import lz4.frame
     import zstandard
 

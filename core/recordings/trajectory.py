@@ -59,7 +59,7 @@ class Trajectory:
     def at(self, nanoseconds: ArrayLike, largest_gap: float) -> list[Pose | None]:
         """The poses at some times: positions on the straight line between two samples, turns on the shortest arc.
 
-        The heading is the direction of the x axis of what moves, seen from above.
+        The heading is the direction of the x axis of the moving body, seen from above.
 
         Args:
             largest_gap: seconds; between samples further apart, and beyond the ends, there is no pose.

@@ -1,7 +1,7 @@
 """Trajectory files in the forms of TUM and KITTI.
 
 TUM: a line ``time x y z qx qy qz qw`` for each pose, time in seconds.  KITTI: the twelve values of a 3 x 4 matrix for
-each pose, row by row, in the axes of its cameras (x right, y down, z forward); times stand in a file of their own, or
+each pose, row by row, in the axes of its cameras (x right, y down, z forward); times are in a file of their own, or
 there is one pose for each frame.
 """
 
@@ -30,7 +30,7 @@ LEAST_DETERMINANT, LARGEST_DETERMINANT = 0.9, 1.1
 
 
 def read_trajectory(path: Path, times: Path | None = None) -> tuple[Trajectory, bool]:
-    """Read a trajectory file; the number of values in its lines tells its form.
+    """Read a trajectory file; the number of values in its lines decides its form.
 
     Args:
         times: of a file in the form of KITTI: a file with a line of seconds for each pose.

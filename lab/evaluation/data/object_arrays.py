@@ -1,4 +1,4 @@
-"""NumPy files of Python objects, in which VPR-Bench, AnyLoc and GSV-Cities keep lists of true references.
+"""NumPy files of Python objects, in which VPR-Bench, AnyLoc and GSV-Cities store lists of true references.
 
 Such a file is a pickle, and to load one is to run it.  Here the standard library lists its instructions
 (``pickletools``), and those that put numbers, texts, lists and arrays together are followed; nothing is imported or
@@ -25,7 +25,7 @@ _PLAIN = (
     pickletools.pyint, pickletools.pyinteger_or_bool, pickletools.pyfloat, pickletools.pystring, pickletools.pybytes,
     pickletools.pybytes_or_str, pickletools.pyunicode,
 )  # fmt: skip
-"""What instructions push that have their value with them."""
+"""The instructions that push the value of their argument, by the kind of the argument."""
 _CONSTANTS: dict[str, Any] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 _MULTIARRAYS = ("numpy.core.multiarray", "numpy._core.multiarray")
 _MARK = object()
@@ -49,7 +49,7 @@ class _Type:
 
 
 class _Refused(Exception):
-    """The file asks for something that no array of numbers and lists needs."""
+    """The file has an instruction that no array of numbers and lists needs."""
 
 
 def read_object_array(path: Path) -> Array:
@@ -79,7 +79,7 @@ def read_object_array(path: Path) -> Array:
 
 
 def _value(data: bytes) -> Any:
-    """What a pickle's instructions put together, on a stack as they assume; a function stands as its name."""
+    """The value that a pickle's instructions build, on a stack as they assume; a function is given as its name."""
     stack, memo = list[Any](), dict[int, Any]()
     argument: Any
     for instruction, argument, _ in pickletools.genops(data):
@@ -130,7 +130,7 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 
 def _made(called: str, arguments: tuple[Any, ...]) -> Any:
-    """What the calls give that NumPy writes: an empty array, a type, a number, and bytes as Python 2 has them."""
+    """The results of the calls that NumPy writes: an empty array, a type, a number, and bytes as Python 2 has them."""
     match called.rpartition("."):
         case (module, _, "_reconstruct") if module in _MULTIARRAYS:
             return Array()

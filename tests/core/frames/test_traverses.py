@@ -112,7 +112,7 @@ def test_kept_references_are_sorted_and_counted_once(tmp_path: Path) -> None:
     with pytest.raises(InvalidGroundTruth, match="no reference 4"):
         read_kept_references(path, 4)
     path.write_text("\n")
-    with pytest.raises(InvalidGroundTruth, match="keeps no reference"):
+    with pytest.raises(InvalidGroundTruth, match="lists no reference"):
         read_kept_references(path, 4)
     path.write_text("1,2\n")
     with pytest.raises(InvalidGroundTruth, match="'1,2' is not the index"):

@@ -157,7 +157,7 @@ def test_a_bag_that_is_cut_short_gives_what_it_holds(writer: str, tmp_path: Path
         # What is there is what was written: a part of the whole, from the beginning, with the same ids.
         assert data == [jpeg(index) for index in range(len(data))]
         assert frames[-1].id.endswith(f"{1_700_000_000 + len(data) - 1}.000000000")
-        assert "cut short" in remarks[0] and "what could be read of it is taken" in remarks[0], remarks
+        assert "cut short" in remarks[0] and "the part that could be read is used" in remarks[0], remarks
 
 
 @pytest.mark.parametrize(("column", "value"), [("data", None), ("data", 7), ("timestamp", "soon"), ("timestamp", None)])
@@ -345,8 +345,8 @@ def test_poses_come_from_satellites_without_a_heading(tmp_path: Path) -> None:
         middle = recording.frames[1].pose
     assert middle is not None and middle.heading is None and middle.latitude == pytest.approx(11)
     assert abs(middle.longitude or 0) == pytest.approx(180)
-    assert "1 messages of /fix tell no position" in recording.remarks[0]
-    with pytest.raises(InvalidTrajectory, match="No message of /fix tells a position"):
+    assert "1 messages of /fix have no position" in recording.remarks[0]
+    with pytest.raises(InvalidTrajectory, match="No message of /fix has a position"):
         open_recording(write_mcap(tmp_path / "b.mcap", [seen[0], told[1]]), poses=Poses(topic="/fix"))
 
 

@@ -121,7 +121,7 @@ def test_a_truncated_bag_enrols_what_it_holds_and_the_whole_one_the_rest(placere
     whole = bag.read_bytes()
     bag.write_bytes(whole[: len(whole) // 2])
     first = placerec("enrol", bag, "--map", "lab", "--create")
-    assert "walk.bag is cut short" in first.stderr and "what could be read of it is taken" in first.stderr
+    assert "walk.bag is cut short" in first.stderr and "the part that could be read is used" in first.stderr
     count = len(json.loads(placerec("maps", "places", "list", "lab", "--json").stdout))
     assert 10 < count < 40
 
