@@ -107,7 +107,7 @@ class Bag:
             with file.open("rb") as packed, unpacked.open("wb") as plain:
                 shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True), plain)
         except zstandard.ZstdError as error:
-            self.remarks.append(f"{file.name} is cut short or damaged ({error}); the rest of it is read.")
+            self.remarks.append(f"{file.name} is cut short or damaged ({error}); the part that unpacks is read.")
         return unpacked
 
     def close(self) -> None:

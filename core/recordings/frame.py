@@ -18,7 +18,7 @@ NANOSECONDS = 1_000_000_000
 class RecordedFrame:
     """A frame that is read when it is needed.
 
-    id: the id of its place, the same whenever the recording is opened; one that no place can have if its file's name makes
+    id: the id of its place, the same whenever the recording is opened; not a valid one if its file's name makes
         none.
     name: its name in messages, such as that of its file.
     load: reads the bytes of a JPEG, PNG or WebP file; raises OSError or InvalidImage.  Frames that are loaded in their

@@ -75,7 +75,7 @@ class EncoderThreads:
             thread.join()
 
     def put(self, frames: Iterable[QueuedFrame]) -> None:
-        """Add frames to the queue; bulk frames keep their order, and so do the others."""
+        """Add frames to the queue; bulk frames stay in their order, and so do the others."""
         with self._changed:
             for frame in frames:
                 if frame.pixels > self._limits.max_pixels:  # its header may lie; decoding refuses it at once

@@ -1,6 +1,6 @@
-"""What the queue asks of the encoders, wherever they run: threads of this process, or processes of a cluster.
+"""The interface between the queue and the encoders: threads of this process, or processes of a cluster.
 
-A frame waits in :class:`WaitingFrames` and becomes an :class:`Encoded`; :class:`Encoders` are what encodes it.
+A frame waits in :class:`WaitingFrames` and becomes an :class:`Encoded`; :class:`Encoders` encode it.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from service.errors.faults import DeadlineExceeded
 from service.telemetry.metrics import Metrics
 
 BULK_SHARE = 4
-"""One frame in so many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
+"""One frame in this many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
 
 
 @dataclass(frozen=True)
 class Encoded:
     """A frame, decoded and encoded.
 
-    source: its pixels, or what decodes them when they are first asked for, where another process has encoded it.
-    encoding: its regions have features only if these were asked for.
+    source: its pixels, or a function that decodes them when first needed, where another process has encoded it.
+    encoding: its regions have features only if these were requested.
     encoder: the encoder that has encoded it.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
     mask: the part of the frame that was ignored.
-    keypoints: its keypoints, if they were asked for.
+    keypoints: its keypoints, if they were requested.
     search_result: what the frame's ``after_encoding`` returned for it; None if it had none, or that failed.
     """
 
@@ -65,7 +65,7 @@ class Encoded:
         return self._scaled or ScaledFrame.of(self.pixels, self.mask)
 
     def find_keypoints(self) -> Keypoints:
-        """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
+        """The frame's keypoints; unless they were requested, this takes about 20 ms."""
         return keypoints_in(packaged_xfeat(), self.scaled) if self.keypoints is None else self.keypoints
 
     def query(self, question: Question) -> Query:
@@ -76,7 +76,7 @@ class Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.
 
         Args:
-            keep_scaled: keep what keypoints are found in, at most 0.7 MB.
+            keep_scaled: retain the scaled pixels in which keypoints are found, at most 0.7 MB.
         """
         return replace(self, source=np.zeros((0, 0, 3), np.uint8), _scaled=self.scaled if keep_scaled else None)
 
@@ -97,7 +97,7 @@ class QueuedFrame:
     features: whether the features of its regions are, which only explanations need.
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
-    result: the encoded frame, or the error that kept it from being encoded.
+    result: the encoded frame, or the error that prevented its encoding.
     attempts: how often its encoding was begun and lost, because the process that had it ended.
     queued: the ``time.perf_counter`` at which the frame began to wait.
     pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
@@ -134,7 +134,7 @@ class WaitingFrames:
         return len(self._robots) + len(self._bulk)
 
     def add(self, frame: QueuedFrame) -> None:
-        """Add a frame; bulk frames keep their order, and so do the others."""
+        """Add a frame; bulk frames stay in their order, and so do the others."""
         (self._bulk if frame.bulk else self._robots).append(frame)
 
     def first(self) -> QueuedFrame | None:
@@ -164,7 +164,7 @@ class WaitingFrames:
 
 
 class Encoders(Protocol):
-    """What encodes the frames that a queue has let in.  Thread-safe.
+    """The encoders of the frames that a queue has let in.  Thread-safe.
 
     A frame that cannot be encoded fails alone, by the error of its ``result``.  One whose ``result`` is cancelled
     before its encoding has begun is not encoded, nor is one whose deadline has passed.
@@ -186,7 +186,7 @@ class Encoders(Protocol):
 
 
 MakeEncoders = Callable[[Limits, Metrics], Encoders]
-"""Makes what encodes frames, given the largest frame that is decoded and where to count."""
+"""Makes the encoders, given the largest frame that is decoded and where to count."""
 
 
 def deadline_exceeded() -> DeadlineExceeded:

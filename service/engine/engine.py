@@ -90,7 +90,7 @@ class Engine:
     Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
     Args:
-        make_encoders: makes what encodes frames; None: threads of this process do.
+        make_encoders: makes the encoders; None: threads of this process.
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
@@ -253,10 +253,10 @@ class Engine:
         masks: Sequence[Mask | None] | None = None,
         keep_scaled: bool = False,
     ) -> list[Encoded | Exception]:
-        """Encode many frames: each frame, without its pixels, or the error that kept it from being encoded.
+        """Encode many frames: each frame, without its pixels, or the error that prevented its encoding.
 
         Args:
-            keep_scaled: keep of each frame what keypoints are found in.
+            keep_scaled: retain of each frame the scaled pixels in which keypoints are found.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.

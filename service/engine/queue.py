@@ -26,7 +26,7 @@ from service.telemetry.metrics import Metrics
 __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadline"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
-"""Some frames of a request, each with its index: encoded, or the error that kept it from being encoded."""
+"""Some frames of a request, each with its index: encoded, or the error that prevented its encoding."""
 
 UNWATCHED = 0.25
 """Seconds after which a connection is watched for a client that hangs up; most frames are encoded by then."""
@@ -53,7 +53,7 @@ class EncoderQueue:
         queue_length: the most requests that may have a place at one time.
         threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0 leaves the
             number to torch.
-        make_encoders: makes what encodes the frames; None: such threads.
+        make_encoders: makes the encoders; None: such threads.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class EncoderQueue:
         self._loader = ThreadPoolExecutor(1, "encoder-loader")
 
     def close(self) -> None:
-        """Cancel the waiting frames and end what encodes them; blocks."""
+        """Cancel the waiting frames and end the encoders; blocks."""
         self._loader.shutdown(cancel_futures=True)
         self.encoders.close()
 
@@ -249,7 +249,7 @@ class EncoderQueue:
 
 
 async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> ClientGone | DeadlineExceeded | None:
-    """Wait for a future; what ended its request before it was done, or None."""
+    """Wait for a future; the reason why its request ended before it was done, or None."""
     await asyncio.wait({awaited}, timeout=min(UNWATCHED, deadline.seconds_left()))
     if awaited.done():
         return None

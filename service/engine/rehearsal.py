@@ -1,6 +1,6 @@
 """A rehearsal: everything that robots and operators wait for is done once, on small maps that are thrown away.
 
-What a process does for the first time is slow: Numba compiles its loops or loads what it has compiled, and networks,
+The first time of everything in a process is slow: Numba compiles its loops or loads compiled ones, and networks,
 indexes and SQLite make their working memory.  Without a rehearsal a robot waits for that at its first frame of each
 kind.
 
@@ -37,7 +37,7 @@ FRAMES = 2
 """Of each of the two traverses."""
 
 STEPS = (Step(), Step(reach=2.0), Step(odometry=Odometry(2.0)))
-"""What sessions know of a motion: nothing, a speed limit, odometry."""
+"""The knowledge of a motion that sessions may have: none, a speed limit, odometry."""
 
 log = logging.getLogger("placerec.rehearsal")
 

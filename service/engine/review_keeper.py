@@ -1,6 +1,6 @@
-"""Keeps frames for review beside the requests: a thread writes them, and drops those for which there is no time.
+"""Stores frames for review beside the requests: a thread writes them, and drops those for which there is no time.
 
-What people say of a frame is said one after the other.
+People's verdicts on frames are written one after the other.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ log = logging.getLogger("placerec.review")
 
 
 class ReviewKeeper:
-    """Writes frames to the maps that keep them.  Any thread may offer one, and never waits.
+    """Writes frames to the maps that store them.  Any thread may offer one, and never waits.
 
-    dropped: how many frames were to be kept and were not.
+    dropped: how many frames were to be stored and were not.
     """
 
     def __init__(self) -> None:
@@ -41,13 +41,13 @@ class ReviewKeeper:
 
     @asynccontextmanager
     async def turn(self, map_: Map, number: int) -> AsyncIterator[None]:
-        """Hold the turn to say something of a kept frame of a map; call it on the event loop."""
+        """Hold the turn to write a verdict on a stored frame of a map; call it on the event loop."""
         key = (map_.record.id, map_.record.created_at, number)
         async with self._turns.setdefault(key, asyncio.Lock()):
             yield
 
     def offer(self, map_: Map, data: bytes, answer: Mapping[str, Any]) -> None:
-        """Have a frame kept, if the map's setting still says so when its turn comes.
+        """Have a frame stored, if the map's setting still says so when its turn comes.
 
         Args:
             data: the bytes of the frame's file.
@@ -66,7 +66,7 @@ class ReviewKeeper:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits, and stop; blocks."""
+        """Write the waiting frames, and stop; blocks."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -87,7 +87,7 @@ class ReviewKeeper:
                     map_.review.keep(data, answer, setting)
             except PlacerecError as error:
                 self.dropped += 1
-                log.warning("a frame is not kept for review: %s", error, extra={"map": map_.record.id})
+                log.warning("a frame is not stored for review: %s", error, extra={"map": map_.record.id})
             except Exception:  # a defect, which must not end the thread
                 self.dropped += 1
-                log.exception("a frame is not kept for review")
+                log.exception("a frame is not stored for review")

@@ -28,7 +28,7 @@ MOST_TOGETHER = 8
 """The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""
 
 CORES_A_SEARCH = 4
-"""One search of a map runs at a time for each so many cores: the search of a large map uses several cores itself."""
+"""One search of a map runs at a time for each group of this many cores: that of a large map uses several itself."""
 
 MOST_AHEAD = 4000
 """The most places of a map that is searched in the encoder's thread; such a search takes a few milliseconds."""
@@ -94,7 +94,7 @@ class Searches:
         """Answer a question about frames that the map's encoder has encoded, as :class:`SearchAhead` may have done.
 
         Args:
-            frames: they have their pixels, or are kept scaled, where they may be verified.
+            frames: they have their pixels, or scaled ones, where they may be verified.
 
         Raises:
             StorageFailure: the map's files cannot be read.
@@ -145,7 +145,7 @@ class Searches:
 
     def _start(self, key: _SearchKey) -> None:
         task = asyncio.create_task(self._run(key))
-        self._tasks.add(task)  # the loop itself keeps no task alive
+        self._tasks.add(task)  # the loop itself holds no reference to a task
         task.add_done_callback(self._tasks.discard)
 
     async def _run(self, key: _SearchKey) -> None:

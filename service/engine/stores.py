@@ -12,11 +12,11 @@ from service.settings import Settings
 class OpenStore:
     """The store of a service, and the lock on its data directory; close it at the end.
 
-    Servers are not waited for: one that cannot be reached keeps the service from being ready, not from starting.
+    Servers are not waited for: without one that can be reached the service starts and is not ready.
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFull, StorageFailure: the data directory cannot be opened.
-        MissingExtra: what speaks to the servers is not installed.
+        MissingExtra: the client of the servers is not installed.
     """
 
     def __init__(self, settings: Settings) -> None:

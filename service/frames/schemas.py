@@ -87,7 +87,7 @@ class MatchParameters(EncoderParameters):
     explain: bool = Field(default=False, description="Say which words, regions and cells carried the score.")
     format: Literal["json", "png"] | None = Field(
         default=None,
-        description="png: both frames side by side, what answers each other joined by lines; if left out, the Accept "
+        description="png: both frames side by side, corresponding points joined by lines; if left out, the Accept "
         "header decides, and json is the default.",
     )
 
@@ -95,7 +95,7 @@ class MatchParameters(EncoderParameters):
 class RegionsParameters(EncoderParameters):
     """How to show regions."""
 
-    limit: int | None = Field(default=None, ge=1, le=10_000, description="Only so many, those of the highest energy.")
+    limit: int | None = Field(default=None, ge=1, le=10_000, description="Only this many, those of the highest energy.")
     format: Literal["json", "png"] | None = Field(
         default=None, description="json or png; if left out, the Accept header decides, and json is the default."
     )

@@ -21,7 +21,7 @@ class Arrival:
 
     Args:
         folder: where it is to lie; made if it is missing.
-        action: what is done, for error messages, such as "store the map".
+        action: the action, for error messages, such as "store the map".
         inside: name of the file within a folder of its own; if left out it lies directly in ``folder``.
     """
 
@@ -89,7 +89,7 @@ async def arriving(arrival: Arrival, check_room: Callable[[], None]) -> AsyncIte
 
     Raises:
         StorageFull, StorageFailure: the disk refuses.
-        Others: what ``check_room`` raises.
+        Others: errors of ``check_room``.
     """
     try:
         await to_its_end(lambda: arrival.open(check_room))

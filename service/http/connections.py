@@ -27,7 +27,7 @@ MOST_SURPLUS = 64
 
 
 class Connection(Protocol):
-    """What the register knows of a connection."""
+    """The part of a connection that the register uses."""
 
     def give_way(self) -> None:
         """Close to make room for another connection; called only while no request is under way."""

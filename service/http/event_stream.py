@@ -50,7 +50,7 @@ async def set_within(changed: asyncio.Event, seconds: float) -> bool:
 async def stream_response(request: Request, stream: AsyncIterator[str]) -> Response:
     """The answer that sends a stream of events; to HEAD, the same without the stream.
 
-    What the stream raises before its first text is raised here, so that it is answered as a problem.
+    An error of the stream before its first text is raised here, so that it is answered as a problem.
     """
     first = await anext(stream)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}

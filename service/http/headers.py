@@ -102,7 +102,7 @@ def check_match(headers: Mapping[str, str], tag: str) -> None:
     """
     wanted = headers.get("if-match")
     if wanted is not None and wanted.strip() != "*" and tag not in strong_tags(wanted):
-        raise ExportGone("The export that If-Match names is no longer kept. Download the map again from the beginning.")
+        raise ExportGone("The export of If-Match is no longer stored. Download the map again from the beginning.")
 
 
 def is_known(headers: Mapping[str, str], tag: str) -> bool:

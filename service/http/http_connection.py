@@ -17,7 +17,7 @@ from service.http.connections import LEAST_PROGRESS, Connections, untaken
 from service.http.websocket_connection import WebSocketConnection, handshake_fault
 
 LINGER_SECONDS = 2.0
-"""How long what a refused client still sends is read and discarded: if the connection were closed at once, the client
+"""How long further bytes of a refused client are read and discarded: if the connection were closed at once, the client
 might lose the answer."""
 
 LAST_SECONDS = 0.25
@@ -109,11 +109,11 @@ class HttpConnection(HttpToolsProtocol):
         self._close()
 
     def _close(self) -> None:
-        """Close once the client has read what was written, which is timed as any answer is."""
+        """Close once the client has read the written bytes, which is timed as any answer is."""
         self.transport.close()
         self._watch_rest()
 
-    # What arrives
+    # Incoming
 
     def data_received(self, data: bytes) -> None:
         if self._stopped_reading:
@@ -262,7 +262,7 @@ class HttpConnection(HttpToolsProtocol):
         working = self._is_working()
         self._stop_listening()
         if working and self._in_message and not self._in_head and not self.pipeline:
-            # The rest of this request is broken: its handler is told that the client is gone.
+            # The rest of this request is broken: its handler is notified that the client is gone.
             self.cycle.disconnected = True
             self.cycle.message_event.set()
             if self.cycle.response_started:
@@ -296,7 +296,7 @@ class HttpConnection(HttpToolsProtocol):
         if self._is_working():
             self.cycle.keep_alive = False
 
-    # What is written
+    # Outgoing
 
     def _watch_rest(self) -> None:
         """Have ``pause_writing`` called now if anything is unread, and ``resume_writing`` when all is read."""

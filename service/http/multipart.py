@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class FormPart:
-    """One part of a form.  ``data`` is empty if the part was ``oversized``, because its bytes were not kept."""
+    """One part of a form.  ``data`` is empty if the part was ``oversized``, because its bytes were not retained."""
 
     name: str = ""
     filename: str | None = None

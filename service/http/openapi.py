@@ -75,7 +75,7 @@ def _access_problems(rule: Rule) -> list[type[Exception]]:
 
 
 def _tell_access(operation: dict[str, Any], rule: Rule) -> None:
-    """Document what key an operation needs."""
+    """Document the key that an operation needs."""
     operation["x-role"] = rule.role
     operation["security"] = [] if rule.role == "open" else [{"key": []}, {}]
     if rule.role != "open":
@@ -239,7 +239,7 @@ def _share_problems(operation: dict[str, Any], shared: dict[str, Any]) -> None:
 
 
 def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
-    """The application's OpenAPI document; it is made once and kept.
+    """The application's OpenAPI document; it is made once and cached.
 
     Args:
         models: models of bodies that routes parse themselves, and of events, which the framework does not find.

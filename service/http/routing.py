@@ -1,4 +1,4 @@
-"""What routes are made of: their dependencies, what a route that takes a frame begins with, and strict JSON bodies."""
+"""The parts of routes: their dependencies, the first steps of a route that takes a frame, and strict JSON bodies."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JSON_TYPES = ("application/json", "application/merge-patch+json")
 
 
 class FromState:
-    """A dependency that gives what the application keeps under a name (see :mod:`service.app.runtime`)."""
+    """A dependency that gives an object of the application by its name (see :mod:`service.app.runtime`)."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -35,7 +35,7 @@ class FromState:
 
 
 async def _whole_deletion(request: Request) -> None:
-    """Refuse a deletion that says more than its path: whoever says more means to delete less.
+    """Refuse a deletion that says more than its path: a caller that says more means to delete less.
 
     Raises:
         InvalidRequest: the query string has a parameter that the operation does not know, or there is a body.
@@ -48,7 +48,7 @@ async def _whole_deletion(request: Request) -> None:
 
 
 WHOLE_DELETION = Depends(_whole_deletion)
-"""What every DELETE depends on."""
+"""The dependencies of every DELETE."""
 
 
 async def _principal(request: Request) -> Principal:
@@ -100,7 +100,7 @@ async def json_body(request: Request) -> None:
 
 
 class FrameOptions(Protocol):
-    """Parameters that stand beside one frame."""
+    """Parameters beside one frame."""
 
     @property
     def encoder(self) -> str | None: ...
@@ -111,7 +111,7 @@ Options = TypeVar("Options", bound=FrameOptions)
 
 
 async def frame_for_map(request: Request, engine: Engine, map_id: str, options: Options) -> tuple[Map, bytes, Options]:
-    """What every route that takes one frame for a map begins with.
+    """The first steps of every route that takes one frame for a map.
 
     Returns:
         The map, the bytes of the frame's file, and the parameters, those of a form's fields included.
@@ -165,7 +165,7 @@ Page = Annotated[PageParameters, Query()]
 
 
 class StrictRequest(Request):
-    """A request whose JSON body contains only what can be written as JSON again."""
+    """A request whose JSON body contains only values that can be written as JSON again."""
 
     async def json(self) -> Any:
         value = parse_json(await self.body(), "The body")

@@ -50,7 +50,7 @@ def serve_application(
     on_signal: Callable[[], None],
     on_stop: Callable[[], None],
 ) -> None:
-    """Serve an application until the process is told to stop.
+    """Serve an application until the process receives a signal to stop.
 
     Args:
         application: the ASGI application.
@@ -76,7 +76,7 @@ def serve_application(
         server_header=False,
         ws_max_size=settings.max_image_bytes,
         ws_per_message_deflate=False,  # frames are compressed already
-        lifespan="off",  # kept here, so that an error at the start reaches the caller
+        lifespan="off",  # stored here, so that an error at the start reaches the caller
         timeout_keep_alive=math.ceil(settings.keep_alive_timeout),
         timeout_graceful_shutdown=math.ceil(settings.shutdown_timeout),
         **protocols,
@@ -150,7 +150,7 @@ class DrainingServer(uvicorn.Server):
         """Accept nothing new, and give the requests under way their time."""
         self._on_stop()
         await super().shutdown(sockets)
-        # What is still under way is cancelled, and answered so before the loop ends.
+        # A request that is still under way is cancelled, and answered so before the loop ends.
         tasks = [task for task in self.server_state.tasks if not task.done()]
         if tasks:
             log.warning("requests are given up", extra={"requests": len(tasks)})
@@ -172,7 +172,7 @@ def detect_dead_peers(listener: socket.socket, settings: Settings) -> None:
 
 
 def raise_file_limit(connections: int) -> None:
-    """Ask the system for as many open files as the connections and the maps may need; warn if it refuses."""
+    """Request as many open files from the system as the connections and the maps may need; warn if it refuses."""
     wanted = connections + SPARE_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)

@@ -97,7 +97,7 @@ async def read_frame(request: Request, settings: Settings) -> UploadedFrame:
 
 
 async def read_pair(request: Request, settings: Settings) -> tuple[bytes, bytes, Mapping[str, str]]:
-    """Read the frames in the parts ``a`` and ``b`` of a form, and its fields; it raises what ``read_frame`` raises."""
+    """Read the frames in the parts ``a`` and ``b`` of a form, and its fields; errors are those of ``read_frame``."""
     files, fields = split_form(await _read_form(request, settings, 2))
     found = {part.name: part for part in files}
     if len(files) != 2 or set(found) != {"a", "b"}:
@@ -125,7 +125,7 @@ async def _read_form(request: Request, settings: Settings, frames: int) -> list[
 
 
 def instead_of(kind: str) -> str:
-    """The end of a sentence that tells which content type is wanted: what the request has instead."""
+    """The end of a sentence about the wanted content type: the one that the request has instead."""
     return f", not as {kind[:80]}" if kind else "; the request has no Content-Type"
 
 

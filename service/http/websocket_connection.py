@@ -25,7 +25,7 @@ POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1008, 1013, 1012
 def handshake_fault(head: bytes) -> Fault | None:
     """Why the websockets library would refuse a request as a handshake; None if it would accept it.
 
-    It is asked beforehand because its own refusal is no problem object, or no answer at all and an open connection.
+    It is checked beforehand because its own refusal is no problem object, or no answer at all and an open connection.
     """
     judge = ServerProtocol()
     judge.receive_data(head)
@@ -62,7 +62,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._write_timer: asyncio.TimerHandle | None = None
 
     def came_from(self, origin: Connection) -> None:
-        """Take over the entry of the connection that asked for the upgrade in the register."""
+        """Take over the entry of the connection that requested the upgrade in the register."""
         self._origin = origin
         self._connections.stream(self)
         # Nothing is read until the handshake is answered; the first ``receive`` resumes reading.
@@ -79,7 +79,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._held.clear()
         super().connection_lost(exc)
 
-    # What arrives
+    # Incoming
 
     def data_received(self, data: bytes) -> None:
         if self.close_sent and self.close_timer is None:
@@ -149,7 +149,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         if not self.transport.is_closing():  # else the client has closed first
             super().shutdown()
 
-    # What is written
+    # Outgoing
 
     async def send(self, message: Any) -> None:
         await super().send(message)

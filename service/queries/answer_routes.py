@@ -72,10 +72,10 @@ class RecentAnswerView(BaseModel):
     camera: str | None = Field(description="The name of the camera that took the frame, if the request named it.")
     session: str | None = Field(description="The session that the frame belongs to; null: none.")
     frame: int | None = Field(description="The robot's number of the frame of the session.")
-    operation: str | None = Field(description="The operation that asked, such as `query` or `send_frame`.")
+    operation: str | None = Field(description="The operation that gave the answer, such as `query` or `send_frame`.")
     milliseconds: float | None = Field(description="From the arrival of the request; null for a part of a request.")
     request_id: str | None
-    principal: str | None = Field(description="The name of the key that asked; only admins see it, and the next two.")
+    principal: str | None = Field(description="The name of the caller's key; only admins see it, and the next two.")
     key: str | None
     client: str | None
 
@@ -114,7 +114,7 @@ class RecentAnswerList(BaseModel):
 
     items: list[RecentAnswerView]
     next_cursor: None = None
-    kept: int = Field(description=f"How many answers are kept now; at most {MOST_OF_MAP}, of this process.")
+    kept: int = Field(description=f"How many answers are stored now; at most {MOST_OF_MAP}, of this process.")
     hours: list[HourCount] = Field(
         description="Answers in each of the last 24 hours, if there were any; over restarts."
     )
@@ -131,7 +131,7 @@ class PlaceMatchList(BaseModel):
 
 
 class LatestParameters(Parameters):
-    """How many answers, and whose."""
+    """How many answers, and of which frames."""
 
     limit: int = Field(default=100, ge=1, le=MOST_OF_MAP, description="Most answers, the latest ones.")
     camera: str | None = Field(default=None, max_length=128, description="Only answers to frames of this camera.")
@@ -163,7 +163,7 @@ def list_answers(
 ) -> RecentAnswerList:
     """List the latest answers of a map, and how many there were in each of the last 24 hours.
 
-    The answers are kept in memory, so a restart forgets them; the counts are kept on disk. Who asked is shown to
+    The answers are held in memory, so a restart forgets them; the counts are stored on disk. The caller is shown to
     admins.
     """
     key = map_key(engine.maps.get(map_id))

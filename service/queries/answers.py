@@ -68,7 +68,7 @@ def _searching(found: Answer) -> dict[str, float]:
 
 
 def score_parts(candidates: Candidates, at: int) -> ScoreParts | None:
-    """What the place at a position of a ranking owes its place to; None where several frames were fused."""
+    """The parts of the score of the place at a position of a ranking; None where several frames were fused."""
     if candidates.first is None:
         return None
     verified = candidates.verifications[at] if at < len(candidates.verifications) else None

@@ -52,7 +52,7 @@ async def explain_match(
 ) -> MatchExplanation | None:
     """The explanation of a query's best match, with the path of a picture of both frames; None if the place is gone.
 
-    The picture that the map keeps of the place is encoded again, because the map does not store its regions.
+    The picture that the map stores of the place is encoded again, because the map does not store its regions.
 
     Args:
         query: the query, with pixels scaled for drawing.
@@ -194,7 +194,7 @@ def draw_explanation(
 
     Args:
         query, match: uint8 [H, W, 3], BGR.
-        inliers: what geometric verification found.
+        inliers: the result of geometric verification.
     """
     if len(inliers) >= LEAST_MATCHES:
         lines = [DrawnLine(pair.query, pair.match, 0.0) for pair in inliers[:DRAWN]]

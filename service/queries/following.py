@@ -1,4 +1,4 @@
-"""What follows an answer: it is counted, told to the listeners of the map, and a doubtful frame is kept for review."""
+"""After an answer: it is counted and sent to the listeners of the map; a doubtful frame is stored for review."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def follow_answer(
     count: bool = True,
     review: bool = True,
 ) -> None:
-    """Count an answer, tell the listeners of its map, if it has any, and keep the frame if the map says so.
+    """Count an answer, send it to the listeners of its map, if any, and store the frame if the map's settings say so.
 
     Nobody is waited for.
 
     Args:
-        frame: the bytes of the frame's file; listeners see a picture of it only if the map keeps pictures.
-        asked: whose frame it is.
+        frame: the bytes of the frame's file; listeners see a picture of it only if the map stores pictures.
+        queried: the origin of the frame.
         file: the name of the file part that the frame was.
         milliseconds: of the whole request, where the answer does not say it.
         count: whether the answer says something of the map, in whose statistics it is counted.
-        review: whether the map may keep the frame.
+        review: whether the map may store the frame.
     """
     record, given = map_.record, GivenAnswer.of(answer, asked, milliseconds)
     engine.metrics.observe_answer(record.id, answer.verdict, answer.score)
@@ -53,7 +53,7 @@ def follow_answer(
 
 
 def _count(engine: Engine, statistics: QueryStatistics, map_id: str, given: GivenAnswer) -> None:
-    """Count an answer in the statistics of its map, and keep it for a while, if the map still exists."""
+    """Count an answer in the statistics of its map, and store it for a while, if the map still exists."""
     with suppress(PlacerecError):  # the map was deleted in the meantime
         key = map_key(engine.maps.find(map_id))
         statistics.observe(key, given.verdict, given.best, given.score, given.decision)

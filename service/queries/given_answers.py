@@ -1,4 +1,4 @@
-"""Answers as they were given: what is told, counted, listed and kept for review; and the latest ones of each map."""
+"""Answers as they were given, for listeners, counts, lists and review; and the latest ones of each map."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from service.events.schemas import QueryEvent
 from service.queries.schemas import EstimatedPose, QueryAnswer
 
 MOST_OF_MAP = 500
-"""Answers of one map that are kept."""
+"""Answers of one map that are stored."""
 
 MOST = 20_000
-"""Answers of all maps together; those of the map that was asked least recently go first."""
+"""Answers of all maps together; those of the map that was queried least recently go first."""
 
 MOST_MATCHES = 5
-"""Matches that are kept of one answer, the best ones."""
+"""Matches that are stored of one answer, the best ones."""
 
 MapKey = tuple[str, str]
 """The id of a map and the time of its creation: a new map of the same id has answers of its own."""
 
 
 class AskedFrame(NamedTuple):
-    """Whose a frame is that was asked; None where that is not known.
+    """The origin of a queried frame; None where it is not known.
 
     camera: the name of the camera that took it.
     session, number: the session that it belongs to, and the robot's number of it.
@@ -41,11 +41,11 @@ class AskedFrame(NamedTuple):
 class GivenAnswer(NamedTuple):
     """An answer without the frame and without metadata, whose size nobody bounds.
 
-    frame: whose frame it was.
+    frame: the origin of the frame.
     matches: ids and scores of the best matches, best first.
     milliseconds: of the answer and of its request.
     revision: of the map that answered.
-    asker: who asked, with which request.
+    asker: the caller, and its request.
     """
 
     at: datetime
@@ -95,7 +95,7 @@ class GivenAnswer(NamedTuple):
         return self.matches[0][0] if self.matches else None
 
     def event(self, map_id: str, file: str | None = None, explanation: str | None = None) -> QueryEvent:
-        """What the listeners of the map are told.
+        """The event for the listeners of the map.
 
         Args:
             file: the name of the file part that the frame was.
@@ -118,12 +118,12 @@ class GivenAnswer(NamedTuple):
         )
 
     def for_review(self, event: QueryEvent) -> dict[str, Any]:
-        """What is kept of the answer with a frame for review, as JSON values."""
+        """The part of the answer that is stored with a frame for review, as JSON values."""
         told = event.model_dump(mode="json", include=REVIEWED)
         return told | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
 
     def rank_of(self, place_id: str) -> int | None:
-        """The rank of a place among the matches; None if it is not among those that are kept."""
+        """The rank of a place among the matches; None if it is not among the stored ones."""
         return next((rank for rank, (found, _) in enumerate(self.matches, start=1) if found == place_id), None)
 
 
@@ -144,7 +144,7 @@ class RecentAnswers:
         self._lock = threading.Lock()
 
     def add(self, key: MapKey, answer: GivenAnswer) -> None:
-        """Keep an answer of a map."""
+        """Store an answer of a map."""
         with self._lock:
             of_map = self._kept.get(key)
             if of_map is None:

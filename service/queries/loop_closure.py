@@ -135,7 +135,7 @@ async def query_or_enrol(
 
     If two robots send the same new place at the same time, one enrols it and the other finds it. A request can be
     repeated until it succeeds: the same frame with the same id is located among the other places, and not enrolled
-    again. `exclude_frames` and `exclude_seconds` keep a robot from finding its own last frames. A frame without
+    again. `exclude_frames` and `exclude_seconds` leave out a robot's own last frames. A frame without
     regions is not enrolled, nor is one that shows hardly anything, as behind a covered lens.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)

@@ -33,7 +33,7 @@ MAP_ERRORS = (
     errors.InvalidModel,
     EncoderNotInstalled,
 )
-"""Errors that keep one map from answering, but not the other maps."""
+"""Errors that prevent the answer of one map, but not those of the other maps."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class RigFrame:
 
 @dataclass(frozen=True)
 class MapReport:
-    """The answer of one map, or the error that kept it from answering.
+    """The answer of one map, or the error that prevented it.
 
     map_: None if the map could not be opened.
     answer: None if there is an error, or if no frame has regions.

@@ -170,7 +170,7 @@ def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequen
 
 
 def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None) -> MapAnswer:
-    """What a map answered, of which ``answer`` is the whole; None if it did not."""
+    """The entry of one map; ``answer`` is its whole answer, None if it gave none."""
     encoder = None if report.map_ is None else report.map_.record.encoder
     if report.error is not None:
         problem = request_problem(request, report.error)

@@ -27,7 +27,7 @@ _DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
 
 
 class FilterParameters(PlaceDescription):
-    """What is known of the place: filters on the places that may be found, or soft priors."""
+    """Prior knowledge of the place: filters on the places that may be found, or soft priors."""
 
     radius: float | None = Field(
         default=None,
@@ -80,14 +80,14 @@ class FilterParameters(PlaceDescription):
         "that contradicts them are multiplied by at least 1 - prior_trust.",
     )
     exclude_frames: int | None = Field(
-        default=None, ge=0, le=10**9, description="Leave out so many of the last places of the frame's own sequence."
+        default=None, ge=0, le=10**9, description="Leave out this many of the last places of the frame's own sequence."
     )
     exclude_seconds: float | None = Field(
         default=None,
         ge=0,
         le=1e9,
         allow_inf_nan=False,
-        description="Leave out the places of the frame's own sequence that were taken within so many seconds of the "
+        description="Leave out the places of the frame's own sequence that were taken within this many seconds of the "
         "frame, or that have no timestamp.",
     )
 
@@ -270,7 +270,7 @@ class MultiMapParameters(LocateParameters):
     verify: Verification = "auto"
 
     def question(self) -> Question:
-        """The question about a rig, of whose frames each has a camera of its own; see ``selection`` for errors."""
+        """The question about a rig; each of its frames has a camera of its own; see ``selection`` for errors."""
         return Question(self.k, self.selection(), self.verify)
 
     def map_ids(self) -> list[str] | None:

@@ -26,8 +26,8 @@ WIDEST = 960
 GAP = 8
 """The gap between the frames, in pixels."""
 
-KEPT = 64
-"""How many pictures are kept."""
+MOST = 64
+"""How many pictures are stored."""
 
 SECONDS = 600.0
 """For how long a picture can be fetched."""
@@ -80,7 +80,7 @@ def side_by_side(
             cv2.rectangle(canvas, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 255), 1 + round(outline.weight), cv2.LINE_AA)
     for line in sorted(lines, key=lambda one: one.weight):
         ends = _point(line.left, frames[0], starts[0]), _point(line.right, frames[1], starts[1])
-        # A colour for each height in the left frame, so that crossing lines can be told apart.
+        # A colour for each height in the left frame, so that crossing lines can be distinguished.
         colour = _colour(line.left[1])
         cv2.line(canvas, *ends, colour, 1 + round(line.weight), cv2.LINE_AA)
         for end in ends:
@@ -115,11 +115,11 @@ class ExplanationPictures:
         self._lock = threading.Lock()
 
     def keep(self, key: MapKey, picture: bytes) -> str:
-        """Keep a PNG for ``SECONDS``, or until its map is deleted; returns the name by which it can be fetched."""
+        """Store a PNG for ``SECONDS``, or until its map is deleted; returns the name by which it can be fetched."""
         name = secrets.token_urlsafe(12)
         with self._lock:
             self._kept[key, name] = (time.monotonic() + SECONDS, picture)
-            while len(self._kept) > KEPT:
+            while len(self._kept) > MOST:
                 self._kept.popitem(last=False)
         return name
 
@@ -127,12 +127,12 @@ class ExplanationPictures:
         """The PNG of a name.
 
         Raises:
-            UnknownExplanation: there is no such picture, or it is not kept any more.
+            UnknownExplanation: there is no such picture, or it is not stored any more.
         """
         with self._lock:
             until, picture = self._kept.get((key, name), (0.0, b""))
         if time.monotonic() > until:
             raise UnknownExplanation(
-                f"There is no picture {name[:40]!r}; the latest {KEPT} are kept for {SECONDS / 60:.0f} minutes."
+                f"There is no picture {name[:40]!r}; the latest {MOST} are stored for {SECONDS / 60:.0f} minutes."
             )
         return picture

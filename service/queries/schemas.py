@@ -44,7 +44,7 @@ class CellPair(BaseModel):
 
     query: tuple[int, int]
     match: tuple[int, int]
-    gain: float = Field(description="What the pair adds to the score.")
+    gain: float = Field(description="The pair's contribution to the score.")
 
 
 class KeypointPair(BaseModel):
@@ -58,10 +58,10 @@ class ExplanationView(BaseModel):
     """The parts of a score, which is the sum of `words` and of the gains of all `cells`."""
 
     score: float
-    words: list[float] = Field(description="What each word of the vocabulary adds (j_u, as it counts in the score).")
+    words: list[float] = Field(description="The share of each word of the vocabulary (j_u, as it counts in the score).")
     query_regions: list[ExplainedRegion] = Field(description="The regions with the largest loss, largest first.")
     match_regions: list[ExplainedRegion] | None = Field(
-        description="The same for the other frame; null if the map keeps no picture of it."
+        description="The same for the other frame; null if the map stores no picture of it."
     )
     regions: list[RegionPair] = Field(description="The matching regions among those listed.")
     cells: list[CellPair] = Field(description="The matching cells; empty without a second stage.")
@@ -73,7 +73,7 @@ class MatchExplanation(ExplanationView):
 
     place: str = Field(description="Id of the best match.")
     inliers: list[KeypointPair] = Field(
-        default_factory=list, description="What geometric verification found; empty if the match was not verified."
+        default_factory=list, description="The results of geometric verification; empty if the match was not verified."
     )
     match_picture: str = Field(
         description="The picture from which the regions of the match were extracted again: image, thumbnail (which is "
@@ -81,13 +81,13 @@ class MatchExplanation(ExplanationView):
     )
     picture: str | None = Field(
         description="Path of a PNG with both frames side by side and lines between the inliers or, where there are "
-        "fewer than eight, between the cells; valid for some minutes; null if the map keeps no "
+        "fewer than eight, between the cells; valid for some minutes; null if the map stores no "
         "picture of the match."
     )
 
 
 class ScoreParts(BaseModel):
-    """What a match's place in the ranking is made of: the score is the sum of `similarity` and `agreement`."""
+    """The parts of a match's score: it is the sum of `similarity` and `agreement`."""
 
     similarity: float = Field(
         description="J / V, or the cosine of descriptors that are normalized as a whole; weighted by 1 - `share` if "
@@ -101,7 +101,7 @@ class ScoreParts(BaseModel):
     )
     keypoints: int | None = Field(description="How many could: the keypoints of the frame that has fewer.")
     evidence: float | None = Field(
-        description="How surprising so many inliers would be of unrelated frames: minus the logarithm of the number "
+        description="How surprising these inliers would be of unrelated frames: minus the logarithm of the number "
         "of false alarms, at least 0."
     )
 
@@ -131,7 +131,7 @@ class VerificationView(BaseModel):
     state: VerificationState = Field(
         description="verified; not-needed: with `auto`, the scores settle the answer; no-keypoints: none of the "
         "candidates has any, or the frame too few to say anything, so the scores decide alone; never: it was not "
-        "asked for."
+        "requested."
     )
     candidates: int = Field(description="How many places were verified.")
     keypoints: int | None = Field(description="Keypoints of the frame; null if they were not needed.")
@@ -187,7 +187,7 @@ class EstimatedPose(BaseModel):
     offset_spread: float | None = Field(default=None, description="Degrees: the standard deviation of the offset.")
     source: PoseSource = Field(
         default="places",
-        description="What the covariance rests on: the poses of `places` alone, or also the turn and the shift between "
+        description="The basis of the covariance: the poses of `places` alone, or also the turn and the shift between "
         "the pictures by the cameras' `intrinsics` or, where one has none, the turn alone, by an assumed range of "
         "`field-of-view`.",
     )
@@ -199,7 +199,7 @@ class EstimatedPose(BaseModel):
         max_length=36,
         description="6 x 6, row by row, as in ROS: of errors in x, y, z (metres) and of rotations about x, y and z "
         "(radians), in the map's frame or, beside latitude and longitude, in that of east, north and up. The rotation "
-        "about z is counter-clockwise, also where headings are clockwise. What is not known has a large variance.",
+        "about z is counter-clockwise, also where headings are clockwise. An unknown value has a large variance.",
     )
 
     @model_serializer(mode="wrap")
@@ -210,12 +210,12 @@ class EstimatedPose(BaseModel):
 
 
 class RivalGroup(BaseModel):
-    """Places that keep an answer from being recognized, as one."""
+    """Places that prevent the recognition of an answer, as one."""
 
     places: list[str] = Field(description="Ids, best first; of each place and its neighbours the best.")
     score: float = Field(description="Score of the first.")
     same_place: bool = Field(
-        description="Whether they show what the best match shows, such as another traverse's view of it. Otherwise "
+        description="Whether they show the place of the best match, such as another traverse's view of it. Otherwise "
         "it is another place that looks like the frame."
     )
 
@@ -269,7 +269,7 @@ class QueryAnswer(BaseModel):
     )
     decision: float | None = Field(
         description="By how much the best match stands out from the rest of the map: the geometric mean of its score "
-        "and its lead; less than 0 where it is behind what a small map is expected to hold."
+        "and its lead; less than 0 where it is behind the expectation for a small map."
     )
     threshold: float = Field(
         description="The least decision value at which the best match can be recognized. A match that was verified is "
@@ -334,7 +334,7 @@ class MapMatch(BaseModel):
 
 
 class MapAnswer(BaseModel):
-    """The answer of one map: its own verdict, or the problem that kept it from answering."""
+    """The answer of one map: its own verdict, or the problem that prevented it."""
 
     map: str
     status: int = Field(description="The status that a query of this map alone would have had.")

@@ -32,7 +32,7 @@ from service.queries.given_answers import MapKey, RecentAnswers
 FILE = "statistics.sqlite"
 
 MOST_WEEKS = 260
-"""How many weeks of a map are kept."""
+"""How many weeks of a map are stored."""
 
 HOURS = 24
 """The hours of the last day, which are counted one by one."""
@@ -41,7 +41,7 @@ MOST_WAITING = 50_000
 """How many places may have counts that are not written yet; while the disk refuses, further counts are lost."""
 
 SPARE_PLACES = 1000
-"""Counts of deleted places are removed once a map has so many more counted places than places."""
+"""Counts of deleted places are removed once a map has this many more counted places than places."""
 
 log = logging.getLogger("placerec.statistics")
 
@@ -313,7 +313,7 @@ class QueryStatistics:
         return {one: sum(hours.values(), VerdictCounts()) for one, hours in found.items()}
 
     def _kept_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
-        """The counts from an hour on that are kept: id and creation time of the map, hour, and count of each verdict.
+        """The stored counts from an hour on: id and creation time of the map, hour, and count of each verdict.
 
         Args:
             key: of the only map that is wanted; None: all.
@@ -347,7 +347,7 @@ class QueryStatistics:
         }
 
     def keep_calibration(self, key: MapKey, report: str, trials: str) -> None:
-        """Keep what was measured in calibrating a map, in place of what was measured before.
+        """Store the measurements of a map's calibration, in place of earlier ones.
 
         Args:
             report, trials: JSON.
@@ -412,7 +412,7 @@ class QueryStatistics:
                 raise
 
     def _keep(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
-        """Add counts to those that are kept, all or none."""
+        """Add counts to the stored ones, all or none."""
         with self._replacing_damage():
             self._write(counts)
             return
