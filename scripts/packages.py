@@ -58,10 +58,10 @@ def configured(listing: str) -> dict[str, list[str]]:
 
 def uv_settings(listing: str) -> dict[str, str]:
     """uv's environment variables for what ``pip config list`` has printed."""
-    told = configured(listing)
+    stated = configured(listing)
     # Of all indexes the best version, as pip does, not that of the first index; hashes say which files are right.
     return {"UV_INDEX_STRATEGY": "unsafe-best-match"} | {
-        variable: separator.join(told[key]) for key, (variable, separator) in SETTINGS.items() if key in told
+        variable: separator.join(stated[key]) for key, (variable, separator) in SETTINGS.items() if key in stated
     }
 
 

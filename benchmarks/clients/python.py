@@ -104,9 +104,9 @@ def main(
     rows = [(kind, *found.values()) for kind, found in figures.items()]
     columns = [f"{robots} robots", "per s", "p50 ms", "p95 ms", "p99 ms", "robots' ms per query"]
     title = f"{encoder}, {places} places, {content}, verify={verify}"
-    kept = {"robots": robots, "rounds": rounds, "seconds": seconds, "verify": verify, "places": places}
+    stored = {"robots": robots, "rounds": rounds, "seconds": seconds, "verify": verify, "places": places}
     report(
-        "client", title, columns, rows, {**kept, "kinds": figures, "rates": rates, "ratio": ratio, "imports": imports}
+        "client", title, columns, rows, {**stored, "kinds": figures, "rates": rates, "ratio": ratio, "imports": imports}
     )
     print(f"client to load tool: {ratio:.3f}, {verdict(ratio, RATIO_LIMIT, at_least=True)}")
     for name, taken in imports.items():

@@ -74,7 +74,7 @@ def main(
     """Measure and report."""
     share_cores(cores())
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    rows, kept, bars = [], {}, []
+    rows, stored, bars = [], {}, []
     with both_stores(milvus, postgres) as stores:
         for name, task in corridor_and_lip6(datasets):
             references, queries = encoded(encoder, task.references), encoded(encoder, task.queries)
@@ -100,13 +100,13 @@ def main(
                 [f"{name}: {what} apart", abs(ours[figure] - theirs[figure])]
                 for what, figure in (("recall@1", "recall"), ("AUC-PR", "auc_pr"))
             ]
-            kept[name] = {**found, "same_first": sum(same), "queries": len(same), "scores_apart": apart}
+            stored[name] = {**found, "same_first": sum(same), "queries": len(same), "scores_apart": apart}
             print(
                 f"{name}: {sum(same)} of {len(same)} first matches are the same, scores are {apart:.1e} apart at most,"
             )
             print(f"    and {verdicts} verdicts differ")
     columns = ["traverse and store", "recall@1", "AUC-PR", "search, ms"]
-    report("cluster_answers", "the same queries in two stores", columns, rows, {"traverses": kept})
+    report("cluster_answers", "the same queries in two stores", columns, rows, {"traverses": stored})
     for what, value in bars:
         print(f"{what:<28} {value:.4f}   {verdict(float(value), MOST_APART)}")
 

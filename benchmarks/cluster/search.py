@@ -148,8 +148,8 @@ def main(
     ]
     columns = ["store", "ms", "recall@1", "core ms of Milvus", "of PostgreSQL"]
     title = f"one query against {places:,} places; medians of {rounds} rounds"
-    kept = {"places": places, "rows": rows, "fill_seconds": filled, "rounds": rounds, "queries": len(of.queries)}
-    report("cluster_search", title, columns, table, kept)
+    stored = {"places": places, "rows": rows, "fill_seconds": filled, "rounds": rounds, "queries": len(of.queries)}
+    report("cluster_search", title, columns, table, stored)
     for row in rows[:2]:
         print(f"{row['store']:<40} {row['recall']:.4f}   {verdict(row['recall'], LEAST_RECALL, True)}")
 

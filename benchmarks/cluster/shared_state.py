@@ -18,7 +18,7 @@ from pathlib import Path
 
 from service.access.gate import Buckets
 from service.jobs.jobs import Jobs
-from service.queries.given_answers import AskedFrame, GivenAnswer
+from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
@@ -118,7 +118,7 @@ def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
         def flush(_: int, counted: QueryStatistics = counted) -> None:
             for number in range(ANSWERS):
                 counted.observe(KEY, "recognized", f"p{number}", 0.5, 2.0)
-                counted.recent.add(KEY, GivenAnswer.of(ANSWER, AskedFrame()))
+                counted.recent.add(KEY, GivenAnswer.of(ANSWER, QueriedFrame()))
             counted.flush()
 
         found.append(median(rounds // 10, flush))

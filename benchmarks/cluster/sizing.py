@@ -77,10 +77,10 @@ def load_measured() -> dict[str, Any]:
     found: dict[str, Any] = json.loads((HERE / "measured.json").read_text())
     search = RESULTS / "cluster_search.json"
     if search.exists():
-        kept = json.loads(search.read_text())
-        row = kept["rows"][1]
+        stored = json.loads(search.read_text())
+        row = stored["rows"][1]
         if "milvus_milliseconds" in row:
-            found["stores"] = {"places": kept["places"], "milvus": row["milvus_milliseconds"]}
+            found["stores"] = {"places": stored["places"], "milvus": row["milvus_milliseconds"]}
             found["stores"] |= {"postgres": row["postgres_milliseconds"], "source": "benchmarks/results"}
     return found
 
@@ -157,14 +157,14 @@ def main(
     checked = foretold(measured)
     columns = ["embedded, two cores", "foretold, 1/s", "measured, 1/s", "foretold, ms", "measured, ms", "error"]
     report("cluster_model", "the model against what was measured", columns, checked, {"rows": checked})
-    rows, kept = [], []
+    rows, stored = [], []
     for robots, places in FLEETS:
         for index in INDEXES:
             found = sized(robots, places, rate, places_per_map, wait, times, index)
             hours = 730.0
             price = found["machines"] * machine + found["postgres_gb"] * gigabyte / hours
             found["price_per_million_queries"] = price / (robots * rate * 3600) * 1e6
-            kept.append(found)
+            stored.append(found)
             cores = "/".join(str(found["cores"][part]) for part in SMALLEST)
             rows.append(
                 [f"{robots:,} robots, {places:.0e} places, {index.name}", cores, f"{found['memory_gb']:,.0f}",
@@ -185,7 +185,7 @@ def main(
         "times": vars(times),
         "rate": rate,
         "places_per_map": places_per_map,
-        "fleets": kept,
+        "fleets": stored,
         "measured": measured,
     }
     report("cluster_sizing", f"cores, machines of {MACHINE_CORES} cores and {MACHINE_GB} GB", columns, rows, figures)

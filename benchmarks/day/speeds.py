@@ -124,8 +124,8 @@ def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[Pac
     yield "reverse", [PacedDrive(looks[::-1], -1.0)]
     yield "reverse, rate 0.3", [PacedDrive(looks[::-1][start::3], -3.0) for start in range(3)]
 
-    kept = np.arange(0, task.truth.shape[1], 3)
-    sparse = SequenceMap(encoder, references.at(kept)).looks(task.queries, queries, _around(task.truth, kept))
+    retained = np.arange(0, task.truth.shape[1], 3)
+    sparse = SequenceMap(encoder, references.at(retained)).looks(task.queries, queries, _around(task.truth, retained))
     yield "rate 3", [PacedDrive(sparse, 1 / 3)]
     yield "reverse, rate 3", [PacedDrive(sparse[::-1], -1 / 3)]
 
@@ -151,12 +151,12 @@ def drives(encoder: Encoder, task: TraverseTask) -> Iterator[tuple[str, list[Pac
     yield "stands, people pass, cold", cold
 
 
-def _around(truth: Truth, kept: NDArray[np.int64]) -> Truth:
+def _around(truth: Truth, retained: NDArray[np.int64]) -> Truth:
     """The truth in a map of every third reference: those next to a true one."""
     wide = truth.copy()
     wide[:, 1:] |= truth[:, :-1]
     wide[:, :-1] |= truth[:, 1:]
-    return wide[:, kept]
+    return wide[:, retained]
 
 
 def walked(places: int) -> PlaceGraph:
@@ -191,7 +191,7 @@ def main(
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {"encoder": chosen.identity}
     for name, task in corridor_and_lip6(datasets):
-        kept = figures[name] = {}
+        retained = figures[name] = {}
         for situation, robots in drives(chosen, task):
             counted = {
                 "single": [singles(one) for one in robots],
@@ -200,7 +200,7 @@ def main(
             }
             frames = sum(len(one.looks) - one.uncounted for one in robots)
             sums = {how: [sum(each) for each in zip(*found, strict=True)] for how, found in counted.items()}
-            kept[situation] = {"frames": frames} | sums
+            retained[situation] = {"frames": frames} | sums
             bars = (
                 verdict(sums["session"][0], sums["single"][0], at_least=True),
                 verdict(sums["session"][1], sums["single"][1]),

@@ -113,9 +113,9 @@ def lip6(datasets: Path) -> WalkPair:
     """Streets of Paris, the part of them that was walked once in each loop; the truth put right by local features."""
     folder = datasets / "eval/lip6_outdoor"
     frames, references = _files(folder / "query", 110), _files(folder / "reference")
-    kept = slice(140, 270)
-    stated = _stated(folder, 455, len(references))[: len(frames), kept]
-    references = references[kept]
+    retained = slice(140, 270)
+    stated = _stated(folder, 455, len(references))[: len(frames), retained]
+    references = references[retained]
     shown = corrected_truth([decode(one) for one in frames], [decode(one) for one in references], stated)
     return WalkPair("lip6", references, frames, shown, _files(datasets / "eval/corridor/query", 60))
 

@@ -97,11 +97,11 @@ def main(
                 bar = {"auto": verdict(ratio, RATIO), "always": verdict(more, MORE)}.get(way, "")
                 shares = (seen["verified"], seen["candidates"], seen["recognized"])
                 rows.append((f"{name}, {way}", seen["mean"], seen["median"], seen["p95"], ratio, more, *shares, bar))
-            kept = process.client.get(f"/v1/maps/{name}").json()["storage"]["keypoints"]
-            figures[name] = {"enrolled_a_second": rates, "ways": found, "keypoints": kept}
+            stored = process.client.get(f"/v1/maps/{name}").json()["storage"]["keypoints"]
+            figures[name] = {"enrolled_a_second": rates, "ways": found, "keypoints": stored}
             print(
                 f"{name}: {rates['with']:.1f} frames/s enrolled with keypoints, {rates['without']:.1f} without; "
-                f"{kept['bytes'] / kept['places'] / 1000:.1f} KB a place"
+                f"{stored['bytes'] / stored['places'] / 1000:.1f} KB a place"
             )
     columns = ["", "mean ms", "median", "p95", "ratio", "more", "verified", "candidates", "recognized", ""]
     report("geometry_requests", "One robot, of two cores", columns, rows, figures)

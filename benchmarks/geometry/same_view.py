@@ -210,14 +210,14 @@ def far_frames(network: XFeat, datasets: Path, name: str, most: int) -> list[Com
 def across_sets(network: XFeat, datasets: Path, most: int) -> list[ComparedPictures]:
     """Each of some pictures, and one of another set."""
     chosen = pictures(datasets, most)
-    kept = dict(zip(chosen, _keypoints(network, [read(path) for path in chosen]), strict=True))
+    stored = dict(zip(chosen, _keypoints(network, [read(path) for path in chosen]), strict=True))
     set_of = {path: path.relative_to(datasets).parts[1] for path in chosen}
     random = np.random.default_rng(0)
 
     def against_another(path: Path, seed: int) -> ComparedPictures:
         others = [other for other in chosen if set_of[other] != set_of[path]]
         other = others[seed % len(others)]
-        return compared("two sets", f"{path.name} and {other.name}", kept[path], kept[other])
+        return compared("two sets", f"{path.name} and {other.name}", stored[path], stored[other])
 
     seeds = random.integers(0, 1 << 31, len(chosen)).tolist()
     return each(lambda one: against_another(*one), list(zip(chosen, seeds, strict=True)), cores())
@@ -260,8 +260,8 @@ def report_views(made: Sequence[ComparedPictures], count: int) -> None:
     failures = [one for one in made if one.fails(one.inliers)]
     title = f"{count} pictures; comparisons with {ENOUGH_MATCHES} matches or more, of which fewer than half are inliers"
     columns = ["", "comparisons", "mean share", "matrix alone", "fail", ""]
-    kept = {"pictures": count, "rows": rows, "failures": [asdict(one) for one in failures]}
-    report("geometry_same_view", title, columns, rows, kept)
+    stored = {"pictures": count, "rows": rows, "failures": [asdict(one) for one in failures]}
+    report("geometry_same_view", title, columns, rows, stored)
     for one in failures:
         print(f"{one.picture}, {one.kind}: {one.inliers} inliers of {one.matches} matches")
 

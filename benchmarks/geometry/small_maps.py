@@ -59,12 +59,12 @@ def answers_of(task: Task, scores: NDArray[np.float32], size: int) -> Answers:
     rows: list[tuple[float, bool, bool]] = []
     total = len(task.references)
     for start in np.linspace(0, total - size, MAPS).astype(int):
-        kept = np.arange(start, start + size)
-        known = np.asarray(task.truth[:, kept].any(axis=1))
+        retained = np.arange(start, start + size)
+        known = np.asarray(task.truth[:, retained].any(axis=1))
         near = np.asarray(task.truth[:, max(0, start - FAR) : start + size + FAR].any(axis=1))
         strangers = np.asarray(~near & task.truth.any(axis=1))
         for query in thinned(known, KNOWN) + thinned(strangers, STRANGERS):
-            best = kept[np.argsort(-scores[query, kept], kind="stable")[:CANDIDATES]]
+            best = retained[np.argsort(-scores[query, retained], kind="stable")[:CANDIDATES]]
             found = verify(task.queries.keypoints[query], [task.references.keypoints[place] for place in best])
             shares = np.array([one.inlier_share for one in found])
             first = int((scores[query, best] + WEIGHT * shares).argmax())

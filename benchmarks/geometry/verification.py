@@ -166,11 +166,11 @@ def drive(camera: PictureEncoder, train: Path) -> Task:
     """Every second frame of a drive against the frames between, which are cut and disturbed."""
     generator = np.random.default_rng(2)
     paths = find_photographs(train / "camvid")
-    kept, queried = range(0, len(paths), 2), range(1, len(paths), 2)
+    retained, queried = range(0, len(paths), 2), range(1, len(paths), 2)
     queries = camera.take([zoomed(read(paths[index]), 0.35, (320, 240), generator) for index in queried])
     runs = [path.name[:6] for path in paths]
-    truth = [[abs(q - r) <= 1 and runs[q] == runs[r] for r in kept] for q in queried]
-    references = camera.take([read(paths[index]) for index in kept])
+    truth = [[abs(q - r) <= 1 and runs[q] == runs[r] for r in retained] for q in queried]
+    references = camera.take([read(paths[index]) for index in retained])
     return Task("drive", queries, references, np.array(truth), MapSettings().same_place_frames, True)
 
 
@@ -184,11 +184,11 @@ def webcams(camera: PictureEncoder, folder: Path, distractors: Pictures) -> list
     tasks = []
     for turn in range(3):
         daytime = [np.flatnonzero((cameras == number) & day) for number in range(cameras.max() + 1)]
-        kept = np.array([found[turn * len(found) // 3] for found in daytime])
-        queried = np.setdiff1d(np.arange(len(paths)), kept)
-        truth = np.zeros((len(queried), len(kept) + len(distractors)), np.bool_)
+        retained = np.array([found[turn * len(found) // 3] for found in daytime])
+        queried = np.setdiff1d(np.arange(len(paths)), retained)
+        truth = np.zeros((len(queried), len(retained) + len(distractors)), np.bool_)
         truth[np.arange(len(queried)), cameras[queried]] = True
-        references = pictures.take(kept).and_then(distractors)
+        references = pictures.take(retained).and_then(distractors)
         tasks.append(Task("webcams", pictures.take(queried), references, truth, 0, False))
     return tasks
 
@@ -238,27 +238,27 @@ class Verified:
     known: Flags
 
 
-def verified(encoder: Encoder, task: Task, kept: NDArray[np.int64], store: Store) -> Verified:
+def verified(encoder: Encoder, task: Task, retained: NDArray[np.int64], store: Store) -> Verified:
     """Verify the best candidates in a map of some of the references; ``store`` keeps pairs for other maps."""
-    queried, shown = task.queries.encodings, task.references.take(kept).encodings
+    queried, shown = task.queries.encodings, task.references.take(retained).encodings
     scores = score_matrix(encoder, queried.descriptors @ shown.descriptors.T, queried.local, shown.local)
     order = np.argsort(-scores, axis=1, kind="stable")
     best = order[:, :CANDIDATES]
     figures = np.zeros((5, *best.shape))
-    for row, places in enumerate(kept[best]):
+    for row, places in enumerate(retained[best]):
         missing = [place for place in places.tolist() if (row, place) not in store]
         found = verify(task.queries.keypoints[row], [task.references.keypoints[place] for place in missing])
         for place, one in zip(missing, found, strict=True):
             share = one.inlier_share
             store[row, place] = (len(one.matches), one.inlier_count, one.evidence, one.spread, share)
         figures[:, row] = np.array([store[row, place] for place in places.tolist()]).T
-    apart = np.abs(kept[order] - kept[order[:, :1]]) > task.frames
+    apart = np.abs(retained[order] - retained[order[:, :1]]) > task.frames
     ranked = np.take_along_axis(scores, order, axis=1)
     others = [ranked[row, far][:OTHERS].mean() for row, far in enumerate(apart)]
-    truth = task.truth[:, kept]
+    truth = task.truth[:, retained]
     return Verified(
         task,
-        kept[best],
+        retained[best],
         ranked[:, :CANDIDATES].astype(np.float64),
         ranked[:, 0] - np.array(others),
         figures[0],
@@ -438,8 +438,8 @@ def tables(encoder: Encoder, found: Sequence[Verified], parts: Sequence[Verified
         figures[f"{count} candidates"] = by_task
     columns = ["", *(f"{v} (fitted)" if any(f.task.name == v and f.task.fitted for f in found) else v for v in names)]
     title = "recall@1 / AUC-PR / precision at recall 0.5"
-    kept = {"encoder": encoder.identity, "weight": weight, "figures": figures}
-    report("geometry_verification", title, columns, rows, kept)
+    retained = {"encoder": encoder.identity, "weight": weight, "figures": figures}
+    report("geometry_verification", title, columns, rows, retained)
     quantiles = {name: evidence_quantiles([v for v in found if v.task.name == name]) for name in names}
     report(
         "geometry_evidence",

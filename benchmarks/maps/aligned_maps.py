@@ -66,15 +66,15 @@ def environments(
     """Queries, references and which of these they show, by name."""
 
     def encoded(name: str, sides: Callable[[], Sequence[list[Pixels]]]) -> tuple[Encodings, Encodings]:
-        kept = None if cache is None else cache / f"{name}-{encoder.identity.replace('@', '-')}.npz"
-        if kept is not None and kept.is_file():
-            with np.load(kept) as read_:
+        stored = None if cache is None else cache / f"{name}-{encoder.identity.replace('@', '-')}.npz"
+        if stored is not None and stored.is_file():
+            with np.load(stored) as read_:
                 return Encodings(read_["qd"], read_["ql"]), Encodings(read_["rd"], read_["rl"])
         queries, references = (describe(encoder, side) for side in sides())
-        if kept is not None:
-            kept.parent.mkdir(parents=True, exist_ok=True)
+        if stored is not None:
+            stored.parent.mkdir(parents=True, exist_ok=True)
             both = (queries.descriptors, queries.local, references.descriptors, references.local)
-            np.savez(kept, qd=both[0], ql=both[1], rd=both[2], rl=both[3])
+            np.savez(stored, qd=both[0], ql=both[1], rd=both[2], rl=both[3])
         return queries, references
 
     for name, task in corridor_and_lip6(datasets):

@@ -243,12 +243,12 @@ def _timed(chosen: Sequence[FirstStage | Table], questions: dict[str, Array], ro
     for turn in range(rounds + 1):
         for stage, of_stage in zip(chosen, times, strict=True):
             queried = np.roll(questions[stage.name], -7 * turn, axis=0)
-            for some, kept in zip((1, TOGETHER), of_stage, strict=True):
+            for some, stored in zip((1, TOGETHER), of_stage, strict=True):
                 time.sleep(PAUSE)
                 began = time.thread_time()
                 stage.search(np.ascontiguousarray(queried[:some]))
                 if turn:
-                    kept.append(1e3 * (time.thread_time() - began) / some)
+                    stored.append(1e3 * (time.thread_time() - began) / some)
     return [(statistics.median(alone), statistics.median(beside)) for alone, beside in times]
 
 

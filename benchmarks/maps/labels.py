@@ -154,11 +154,11 @@ def measure(client: httpx.Client, of: LabelledWalk, other: LabelledWalk) -> list
             query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
-        for kept, verdicts in KEPT.items():
+        for stored, verdicts in KEPT.items():
             labels = label_kept(client, map_id, queried, verdicts)
             for order, body in (LABELLED if labels else UNLABELLED).items():
                 client.patch(f"/v1/maps/{map_id}", json={"calibration": None}).raise_for_status()
-                done = {"map": of.name, "kept": kept, "labels": labels, "half": turn, "order": order}
+                done = {"map": of.name, "kept": stored, "labels": labels, "half": turn, "order": order}
                 if body is not None:
                     response = client.post(f"/v1/maps/{map_id}/calibrate", json=body, timeout=600)
                     if response.status_code != 200:
@@ -183,8 +183,8 @@ def main(
                 if only in (None, name):
                     found += measure(process.client, walks[name], walks[other])
     rows: list[list[object]] = []
-    for name, kept, order in dict.fromkeys((one["map"], one["kept"], one["order"]) for one in found):
-        some = [one for one in found if (one["map"], one["kept"], one["order"]) == (name, kept, order)]
+    for name, stored, order in dict.fromkeys((one["map"], one["kept"], one["order"]) for one in found):
+        some = [one for one in found if (one["map"], one["kept"], one["order"]) == (name, stored, order)]
         held = [one for one in some if "brier" in one]
         total = sum(one["frames"] for one in held)
         figures = {
@@ -193,7 +193,7 @@ def main(
         }
         brier = f"{figures['brier']:.4f}" if len(held) == len(some) else f"refused for {len(some) - len(held)}"
         labels = sum(one["labels"] for one in some)
-        rows.append([name, kept, labels, order, brier, figures["recall"], figures["precision"]])
+        rows.append([name, stored, labels, order, brier, figures["recall"], figures["precision"]])
     columns = ["map", "labelled", "labels", "calibrated by", "Brier", "recall", "precision"]
     report("labels", "Held-out halves, with half as many strangers", columns, rows, {"found": found})
 

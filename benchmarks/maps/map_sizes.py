@@ -64,9 +64,9 @@ MODES: tuple[Verify, ...] = ("never", "auto", "always")
 
 def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool) -> dict[str, ScoredTraverse]:
     """The traverses by name, from the cache if they are there."""
-    kept = None if cache is None else cache / f"{encoder.identity.replace('@', '-')}{'-fitted' if fitted else ''}.npz"
-    if kept is not None and kept.is_file():
-        with np.load(kept) as read:
+    stored = None if cache is None else cache / f"{encoder.identity.replace('@', '-')}{'-fitted' if fitted else ''}.npz"
+    if stored is not None and stored.is_file():
+        with np.load(stored) as read:
             names = sorted({name.rsplit(":", 1)[0] for name in read.files})
             columns = {name: {part: read[f"{name}:{part}"] for part in PARTS} for name in names}
             return {
@@ -79,10 +79,10 @@ def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool
     }
     if fitted:
         made.update(fitting_traverses(encoder, datasets))
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
+    if stored is not None:
+        stored.parent.mkdir(parents=True, exist_ok=True)
         np.savez(
-            kept,
+            stored,
             **{f"{name}:{part}": getattr(one, part) for name, one in made.items() for part in PARTS},
         )
     return made
@@ -92,9 +92,9 @@ def with_pairs(made: dict[str, ScoredTraverse], datasets: Path, cache: Path | No
     """The traverses that are judged, with keypoints, from the cache if they are there; others as they are."""
     found = dict(made)
     for name, task in corridor_and_lip6(datasets):
-        kept = None if cache is None else cache / f"{name}-keypoints.npz"
-        if kept is not None and kept.is_file():
-            with np.load(kept) as read:
+        stored = None if cache is None else cache / f"{name}-keypoints.npz"
+        if stored is not None and stored.is_file():
+            with np.load(stored) as read:
                 queries, references = (
                     [keypoints_of(record.tobytes()) for record in np.split(read[side], read[f"{side}_ends"])]
                     for side in ("queries", "references")
@@ -178,9 +178,9 @@ def halves(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) -
 
 def whole(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) -> dict[str, Any]:
     """All references: recall@1, and the verdicts."""
-    kept = np.arange(traverse.truth.shape[1])
+    stored = np.arange(traverse.truth.shape[1])
     queried = np.flatnonzero(traverse.truth.any(axis=1)).tolist()
-    found = [traverse.judged(query, kept, calibration, np.zeros(len(kept), np.int64), verify) for query in queried]
+    found = [traverse.judged(query, stored, calibration, np.zeros(len(stored), np.int64), verify) for query in queried]
     right = np.array([traverse.truth[query, one.best] for query, one in zip(queried, found, strict=True)])
     recognized = np.array([one.judgement.verdict == "recognized" for one in found])
     return {
@@ -193,14 +193,14 @@ def whole(traverse: ScoredTraverse, calibration: Calibration, verify: Verify) ->
 
 def verdicts(
     traverse: ScoredTraverse,
-    kept: NDArray[np.int64],
+    stored: NDArray[np.int64],
     sequence: NDArray[np.int64],
     calibration: Calibration,
     verify: Verify,
 ) -> Any:
     """The shares of the verdicts on all frames whose place is there."""
-    queried = np.flatnonzero(traverse.truth[:, kept].any(axis=1)).tolist()
-    found = [traverse.judged(query, kept, calibration, sequence, verify).judgement.verdict for query in queried]
+    queried = np.flatnonzero(traverse.truth[:, stored].any(axis=1)).tolist()
+    found = [traverse.judged(query, stored, calibration, sequence, verify).judgement.verdict for query in queried]
     return {name: found.count(name) / len(found) for name in ("recognized", "ambiguous", "unknown")}
 
 

@@ -64,8 +64,8 @@ def encoded(encoder: Encoder, folder: Path) -> Side:
 def sides(encoder: Encoder, queries: Path, references: Path, cache: Path | None) -> tuple[Side, Side]:
     """Queries and references, from ``cache`` if it is there."""
     if cache is not None and cache.is_file():
-        with np.load(cache) as kept:
-            return (kept["qd"], kept["ql"]), (kept["rd"], kept["rl"])
+        with np.load(cache) as stored:
+            return (stored["qd"], stored["ql"]), (stored["rd"], stored["rl"])
     queried, known = encoded(encoder, queries), encoded(encoder, references)
     if cache is not None:
         np.savez(cache, qd=queried[0], ql=queried[1], rd=known[0], rl=known[1])
@@ -77,12 +77,12 @@ def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side
     descriptors, local = side
     if precision == "float32":
         return side, descriptors[0].nbytes + local[0].nbytes
-    kept, kept_local = pack_descriptors(descriptors, precision), pack_local(local, precision)
+    stored, kept_local = pack_descriptors(descriptors, precision), pack_local(local, precision)
     back = (
-        unpack_descriptors(kept, precision, descriptors.shape[1]),
+        unpack_descriptors(stored, precision, descriptors.shape[1]),
         unpack_local(kept_local, precision, local.shape[1:]),
     )
-    return back, kept[0].nbytes + kept_local[0].nbytes
+    return back, stored[0].nbytes + kept_local[0].nbytes
 
 
 def faiss_index(low: Array, high: Array) -> faiss.IndexScalarQuantizer:
@@ -200,10 +200,10 @@ def main(
     report("precision", f"{len(queried[0])} queries, {len(known[0])} references", columns, rows, more)
 
 
-def _products(kept: NDArray[Any], precision: str, queries: Array) -> Array:
+def _products(stored: NDArray[Any], precision: str, queries: Array) -> Array:
     if precision == "float32":
-        return np.asarray(queries @ kept.T)
-    return inner_products(queries, kept, COMPRESSED if precision == COMPRESSED else "half")
+        return np.asarray(queries @ stored.T)
+    return inner_products(queries, stored, COMPRESSED if precision == COMPRESSED else "half")
 
 
 def area(scores: NDArray[np.float32], truth: Truth) -> float:

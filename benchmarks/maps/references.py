@@ -163,9 +163,9 @@ def _role(name: str, turns: dict[str, int]) -> str:
 
 def _encoded(paths: Sequence[Path], encoder: Encoder, cache: Path) -> NDArray[np.float16]:
     """Descriptors of photographs, float16 [n, D]."""
-    kept = cache / f"descriptors-{encoder.identity[-16:]}.npy"
-    if kept.exists():
-        descriptors: NDArray[np.float16] = np.load(kept, mmap_mode="r")
+    stored = cache / f"descriptors-{encoder.identity[-16:]}.npy"
+    if stored.exists():
+        descriptors: NDArray[np.float16] = np.load(stored, mmap_mode="r")
         if len(descriptors) == len(paths):
             return descriptors
     cache.mkdir(parents=True, exist_ok=True)
@@ -173,14 +173,14 @@ def _encoded(paths: Sequence[Path], encoder: Encoder, cache: Path) -> NDArray[np
     for start in track(range(0, len(paths), 8), "encoding photographs"):
         frames = [decode(path.read_bytes()) for path in paths[start : start + 8]]
         made[start : start + 8] = [encoding.descriptor for encoding in encoder.encode_batch(frames)]
-    np.save(kept, made)
+    np.save(stored, made)
     return made
 
 
-def _neighbours(sources: Array, kinds: NDArray[np.int64], kept: Path) -> NDArray[np.int64]:
+def _neighbours(sources: Array, kinds: NDArray[np.int64], stored: Path) -> NDArray[np.int64]:
     """Of each source the ten of its kind that score highest against it, int64 [s, 10]."""
-    if kept.exists():
-        found: NDArray[np.int64] = np.load(kept)
+    if stored.exists():
+        found: NDArray[np.int64] = np.load(stored)
         if len(found) == len(sources):
             return found
     found = np.empty((len(sources), NEIGHBOURS), np.int64)
@@ -189,5 +189,5 @@ def _neighbours(sources: Array, kinds: NDArray[np.int64], kept: Path) -> NDArray
         scores = sources[members] @ sources[members].T
         np.fill_diagonal(scores, -np.inf)
         found[members] = members[np.argsort(-scores, axis=1, kind="stable")[:, :NEIGHBOURS]]
-    np.save(kept, found)
+    np.save(stored, found)
     return found

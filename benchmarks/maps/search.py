@@ -90,8 +90,8 @@ def write_map(folder: Path, encoder: Encoder, of: Material, places: int, precisi
     done = folder / f"truth-{places}.npz"
     best, first = Best(np.full(len(of.queries), -np.inf, np.float32), np.zeros(len(of.queries), np.int64)), 0
     if done.exists():
-        with np.load(done) as kept:
-            best, first = Best(kept["products"], kept["rows"]), int(kept["seen"])
+        with np.load(done) as stored:
+            best, first = Best(stored["products"], stored["rows"]), int(stored["seen"])
     if first == places:
         return
     atlas = Atlas(folder)
@@ -244,9 +244,9 @@ def show(name: str, rows: Sequence[dict[str, Any]], figures: dict[str, Any]) -> 
     for row in rows:
         row["faster"] = flat[row["places"]] / row["milliseconds"]
         scaled = ", scaled" if row["scaled_by"] > 1 else ""
-        kept = [f"{row['memory']:.0f}", f"{row.get('disk', 0):.0f}"]
+        stored = [f"{row['memory']:.0f}", f"{row.get('disk', 0):.0f}"]
         what = f"{row['places']:,} {row['tier']}{scaled}"
-        table.append([what, row["milliseconds"], f"{row['faster']:.1f}", f"{row['recall']:.4f}", *kept])
+        table.append([what, row["milliseconds"], f"{row['faster']:.1f}", f"{row['recall']:.4f}", *stored])
     columns = ["places and tier", "ms", "times faster", "recall@1", "memory, B", "disk, B"]
     title = f"one query; medians of {figures['rounds']} rounds; memory and disk of a place"
     report(name, title, columns, table, {"rows": rows, **figures})

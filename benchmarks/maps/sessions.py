@@ -210,7 +210,7 @@ def main(
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {"encoder": chosen.identity}
     for name, task in tasks.items():
-        kept = figures[name] = {}
+        stored = figures[name] = {}
         frames, references = encoded[name]
         walk = SequenceMap(chosen, references)
         looks = walk.looks(task.queries, frames, task.truth)
@@ -220,15 +220,15 @@ def main(
         single = sum(not look.right[look.best] for look in looks)
         wrong = sum(not look.right[found.candidates[0].row] for look, found, _ in steps)
         believed = [(look, found) for look, found, _ in steps if found.verdict == "recognized"]
-        kept["errors"] = {"queries": len(looks), "single": single, "session": wrong}
-        kept["recognized"] = {
+        stored["errors"] = {"queries": len(looks), "single": single, "session": wrong}
+        stored["recognized"] = {
             "single": float(np.mean([look.verdict == "recognized" for look in looks])),
             "session": len(believed) / len(steps),
             "right": float(np.mean([look.right[found.candidates[0].row] for look, found in believed])),
         }
         bar = "errors " + verdict(wrong / single, HALVED) if name == "lip6" else ""
         rows.append((f"{name}: wrong places, single frames and session", f"{single}, {wrong} of {len(looks)}", bar))
-        shares = kept["recognized"]
+        shares = stored["recognized"]
         rows.append(
             (f"{name}: recognized, single frames and session", "{single:.3f}, {session:.3f}".format(**shares), "")
         )
@@ -255,7 +255,7 @@ def main(
                         best = found.candidates[0]
                         stated.append((best.probability, bool(look.right[best.row])))
             says = np.array([one for one, _ in results])
-            kept[kind] = {"runs": len(says), "frames that say so": np.bincount(says).tolist()}
+            stored[kind] = {"runs": len(says), "frames that say so": np.bincount(says).tolist()}
             share = float((says <= WITHIN).mean())
             spread = "/".join(f"{np.percentile(says, q):.0f}" for q in (50, 90, 100))
             rows.append(
@@ -278,7 +278,7 @@ def main(
                 last = max((n for n, one in enumerate(verdicts, 1) if one != "unknown"), default=0)
                 frames_until.append(last + 1)
                 sights.add(covered_steps[-1][2].sight)
-            kept[f"covered: {kind}"] = {
+            stored[f"covered: {kind}"] = {
                 "unknown from frame": np.bincount(frames_until).tolist(),
                 "view": sorted(map(str, sights)),
             }
@@ -294,14 +294,14 @@ def main(
             still = walk.looks(pictures, describe(chosen, pictures))
             whole = list(walk.followed([*looks[row - 5 : row + 1], *still]))
             gained.append(abs(whole[-1][1].candidates[0].probability - whole[5][1].candidates[0].probability))
-        kept["standing"] = {"change of probability": gained}
+        stored["standing"] = {"change of probability": gained}
         rows.append(
             (f"{name}: {STANDS} frames of a robot that stands change its probability by", f"{max(gained):.4f}", "")
         )
 
         probabilities, right = zip(*stated, strict=True)
         calibrated = reliability(probabilities, right)
-        kept["reliability"] = calibrated.model_dump()
+        stored["reliability"] = calibrated.model_dump()
         rows.append((f"{name}: calibration error, whole and spliced runs", f"{calibrated.ece:.3f}", ""))
     report("sessions", chosen.name, ["", "", ""], rows, figures)
 
@@ -311,13 +311,13 @@ def halved(
 ) -> tuple[SequenceMap, list[FrameEvidence], list[FrameEvidence]]:
     """A map of the middle half of the references: the looks of frames that it has, and of frames far from all of it."""
     count = truth.shape[1]
-    kept = np.arange(count // 4, count - count // 4)
+    stored = np.arange(count // 4, count - count // 4)
     wide = np.zeros(count, np.bool_)
-    wide[max(0, kept[0] - APART) : kept[-1] + APART + 1] = True
-    walk = SequenceMap(encoder, references.at(kept))
-    there = np.flatnonzero(truth[:, kept].any(axis=1))
+    wide[max(0, stored[0] - APART) : stored[-1] + APART + 1] = True
+    walk = SequenceMap(encoder, references.at(stored))
+    there = np.flatnonzero(truth[:, stored].any(axis=1))
     apart = np.flatnonzero(~truth[:, wide].any(axis=1) & truth.any(axis=1))
-    known = walk.looks([pictures[row] for row in there.tolist()], frames.at(there), truth[np.ix_(there, kept)])
+    known = walk.looks([pictures[row] for row in there.tolist()], frames.at(there), truth[np.ix_(there, stored)])
     return walk, known, walk.looks([pictures[row] for row in apart.tolist()], frames.at(apart))
 
 

@@ -32,14 +32,14 @@ Array = NDArray[np.float32]
 TOGETHER = (1, 2, 4, 8, 16)
 
 
-def runs(kept: Array, of_map: Snapshot, queries: Array) -> dict[str, Callable[[], object]]:
-    """All that are compared: ``kept``, float32 [n, D], of values that half precision says, with ``queries`` [B, D]."""
-    places, dimension = kept.shape
+def runs(retained: Array, of_map: Snapshot, queries: Array) -> dict[str, Callable[[], object]]:
+    """All that are compared: ``retained``, float32 [n, D], of half-precision values, with ``queries`` [B, D]."""
+    places, dimension = retained.shape
     flat = faiss.IndexFlatIP(dimension)
     halved = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
     halved.is_trained = True
     for index in (flat, halved):
-        index.add(kept)
+        index.add(retained)
     exact = replace(of_map, table=None)
     return {
         "IndexFlatIP, float32": lambda: flat.search(queries, places),
@@ -66,11 +66,11 @@ def main(places: int = 2000, rounds: int = 25) -> None:
     share_cores(1)
     random = np.random.default_rng(0)
     dimension = EncoderCatalogue().get(DEFAULT_ENCODER).dimension
-    kept = random.standard_normal((places, dimension), np.float32).astype(np.float16).astype(np.float32)
+    retained = random.standard_normal((places, dimension), np.float32).astype(np.float16).astype(np.float32)
     queries = random.standard_normal((max(TOGETHER), dimension), np.float32)
     snapshot = Snapshot(dimension, ROWS_PER_SEGMENT, table=CodeTable.empty(Coder.of(dimension)), halves=True)
-    snapshot = snapshot.appended(list(kept), [Location(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places)
-    found = {count: processor_medians(runs(kept, snapshot, queries[:count]), rounds) for count in TOGETHER}
+    snapshot = snapshot.appended(list(retained), [Location(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places)
+    found = {count: processor_medians(runs(retained, snapshot, queries[:count]), rounds) for count in TOGETHER}
     table = [[name, *(found[count][name] for count in TOGETHER)] for name in found[1]]
     columns = ["milliseconds for", *(f"{count} together" for count in TOGETHER)]
     level = faiss.SIMDConfig.get_level_name()

@@ -357,8 +357,8 @@ class Run:
             given[places[places >= 0]] = np.maximum(state.masses[places >= 0], given[0])
             lost = float(state.masses[places < 0].sum(dtype=np.float64))
             unknown = state.unknown + (1 - state.unknown) * min(lost, 1.0)
-            kept = np.flatnonzero(places[: len(state.shares)] >= 0)
+            retained = np.flatnonzero(places[: len(state.shares)] >= 0)
             given /= np.float32(given.sum(dtype=np.float64))
-            speeds = Speeds(places[kept], state.shares[kept], PRIOR)
+            speeds = Speeds(places[retained], state.shares[retained], PRIOR)
             run.belief = Belief(given, unknown, speeds=replace(speeds, elsewhere=speeds.expected(given)))
         return run

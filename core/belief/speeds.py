@@ -97,8 +97,8 @@ class Speeds:
         """The same of the ``count`` places with most mass."""
         if len(self.places) <= count:
             return self
-        kept = np.argpartition(-masses[self.places], count)[:count]
-        return Speeds(self.places[kept], self.shares[kept], self.elsewhere)
+        retained = np.argpartition(-masses[self.places], count)[:count]
+        return Speeds(self.places[retained], self.shares[retained], self.elsewhere)
 
     def overall(self, masses: Masses) -> Masses:
         """The probability of each speed wherever the robot is, float32 [S]."""

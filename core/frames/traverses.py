@@ -111,10 +111,10 @@ def read_kept_references(path: Path, references: int) -> NDArray[np.int64]:
     Raises:
         InvalidGroundTruth: the file cannot be read, a line is no index, or there is none.
     """
-    kept = {_index(line.strip(), references, "reference", path, number) for number, line in _lines(path)}
-    if not kept:
+    retained = {_index(line.strip(), references, "reference", path, number) for number, line in _lines(path)}
+    if not retained:
         raise InvalidGroundTruth(f"{path.name} lists no reference.")
-    return np.array(sorted(kept), np.int64)
+    return np.array(sorted(retained), np.int64)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

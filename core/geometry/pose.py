@@ -327,11 +327,11 @@ def _starts(p: Array, q: Array, pixel: float) -> list[_Model]:
         if matrix is not None:
             found += _planes_of(np.asarray(matrix, np.float64), p)
     with suppress(cv2.error):
-        essential, kept = cv2.findEssentialMat(
+        essential, inliers = cv2.findEssentialMat(
             images[0], images[1], np.eye(3), cv2.USAC_MAGSAC, CONFIDENCE, THRESHOLD * pixel, ITERATIONS
         )
         if essential is not None and essential.shape == (3, 3):
-            _, rotation, translation, _ = cv2.recoverPose(essential, *images, np.eye(3), mask=kept)
+            _, rotation, translation, _ = cv2.recoverPose(essential, *images, np.eye(3), mask=inliers)
             attitude = np.asarray(rotation, np.float64)
             found.append(_RigidScene(attitude, -attitude.T @ np.asarray(translation, np.float64)[:, 0]))
     return found

@@ -93,9 +93,9 @@ def verify(query: Keypoints, candidates: Sequence[Keypoints]) -> list[Verificati
 
     The candidates are shared out among as many threads as torch has in the calling thread.
     """
-    asked = query.descriptors.astype(np.float32)
+    queried = query.descriptors.astype(np.float32)
     shown = points_of(query)
-    return each(lambda candidate: _verify(query, asked, shown, candidate), candidates, torch.get_num_threads())
+    return each(lambda candidate: _verify(query, queried, shown, candidate), candidates, torch.get_num_threads())
 
 
 def mutual_matches(query: NDArray[np.float32], candidate: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -193,9 +193,9 @@ def evidence(matches: int, inliers: int, chance: float) -> float:
 
 
 def _verify(
-    query: Keypoints, asked: NDArray[np.float32], shown: NDArray[np.float64], candidate: Keypoints
+    query: Keypoints, queried: NDArray[np.float32], shown: NDArray[np.float64], candidate: Keypoints
 ) -> Verification:
-    matches = mutual_matches(asked, candidate.descriptors.astype(np.float32))
+    matches = mutual_matches(queried, candidate.descriptors.astype(np.float32))
     ours, theirs = shown[matches[:, 0]], points_of(candidate)[matches[:, 1]]
     inliers = fitting(ours, theirs)
     chance = max(chance_of(query), chance_of(candidate))

@@ -214,20 +214,20 @@ def _fused(
     prior[:3, :3] = found.covariance[:3, :3]
     prior[3, 3], prior[4, 4] = found.covariance[5, 5], DISTANCE_DEVIATION**2
     begin = np.r_[np.zeros(3), yaw, DISTANCE]
-    kept = [
+    retained = [
         number
         for number in range(len(place_views.views))
         if _contradiction(begin, prior, place_views, number) < CONTRADICTION
     ]
-    if not kept:
+    if not retained:
         return found
     information = np.linalg.inv(prior)
     state, normal = begin, information
     for _ in range(_STEPS):
         normal, gradient = information.copy(), information @ (state - begin)
-        for number in kept:
+        for number in retained:
             residual, jacobian, noise = _missed(state, place_views, number)
-            weighed = jacobian.T @ np.linalg.inv(noise * len(kept))
+            weighed = jacobian.T @ np.linalg.inv(noise * len(retained))
             normal, gradient = normal + weighed @ jacobian, gradient + weighed @ residual
         state = state - np.linalg.solve(normal, gradient)
     covariance = found.covariance.copy()
@@ -239,7 +239,7 @@ def _fused(
         pose = _geographic(position, (90 - degrees) % 360)
     else:
         pose = Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
-    sources = {place_views.views[number].source for number in kept}
+    sources = {place_views.views[number].source for number in retained}
     return replace(
         found,
         pose=pose,

@@ -99,15 +99,15 @@ def strongest(activations, step, wanted):  # type: ignore[no-untyped-def]
     parents, channels, sizes = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32)
     boxes, totals = np.empty((most, 4), np.int32), np.empty(most, np.float64)
     begun = _label(activations, levels, numbers, parents, channels, boxes, sizes, totals)
-    kept = np.flatnonzero(parents[:begun] == np.arange(begun))
-    energies = totals[kept] / sizes[kept]
-    if len(kept) > wanted:  # only these are sorted
+    retained = np.flatnonzero(parents[:begun] == np.arange(begun))
+    energies = totals[retained] / sizes[retained]
+    if len(retained) > wanted:  # only these are sorted
         strong = energies >= -np.partition(-energies, wanted - 1)[wanted - 1]
-        kept, energies = kept[strong], energies[strong]
-    order = np.argsort(channels[kept], kind="mergesort")
+        retained, energies = retained[strong], energies[strong]
+    order = np.argsort(channels[retained], kind="mergesort")
     order = order[np.argsort(-energies[order], kind="mergesort")][:wanted]
-    kept, energies = kept[order], energies[order]
-    return boxes[kept], energies.astype(np.float32), channels[kept]
+    retained, energies = retained[order], energies[order]
+    return boxes[retained], energies.astype(np.float32), channels[retained]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -279,9 +279,9 @@ def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFiel
     document = fields.model_dump(include=set(PlaceFields.model_fields), exclude={"pose"})
     if fields.pose is not None:
         document["pose"] = fields.pose.model_dump(exclude_none=True)
-    kept = {} if "sequence" in changes else {"sequence": document.pop("sequence")}  # which may be a name of old
+    stored = {} if "sequence" in changes else {"sequence": document.pop("sequence")}  # which may be a name of old
     try:
-        return PlaceFields.model_validate(merge_patch(document, changes)).model_copy(update=kept)
+        return PlaceFields.model_validate(merge_patch(document, changes)).model_copy(update=stored)
     except ValidationError as error:
         raise InvalidField(f"The place cannot be changed like this: {validation_message(error)}.") from error
     except RecursionError as error:

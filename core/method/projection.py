@@ -110,5 +110,5 @@ def discriminant(within: NDArray[np.float64], between: NDArray[np.float64], valu
     variances, directions = np.linalg.eigh(shrunk)
     whitening = directions / np.sqrt(variances)
     importance, rotation = np.linalg.eigh(whitening.T @ between @ whitening)
-    kept = np.argsort(-importance)[:values]
-    return np.ascontiguousarray(whitening @ rotation[:, kept], np.float32)
+    retained = np.argsort(-importance)[:values]
+    return np.ascontiguousarray(whitening @ rotation[:, retained], np.float32)

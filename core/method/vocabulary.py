@@ -89,11 +89,11 @@ def pool_features(
         InvalidModel: no frame has a feature.
     """
     generator = np.random.default_rng(seed)
-    kept = []
+    retained = []
     for features in frames:
         if len(features) > per_frame:
             features = features[generator.choice(len(features), per_frame, replace=False)]
-        kept.append(features)
-    if not any(len(features) for features in kept):
+        retained.append(features)
+    if not any(len(features) for features in retained):
         raise InvalidModel("no frame has a region of interest; give other images or a smaller step.")
-    return np.concatenate([features for features in kept if len(features)])
+    return np.concatenate([features for features in retained if len(features)])

@@ -63,13 +63,15 @@ def fit_whitening(descriptors: Array, values: int) -> Whitening:
     centred = descriptors - mean
     products = centred @ centred.T if len(centred) < centred.shape[1] else centred.T @ centred
     squares, vectors = np.linalg.eigh(products)
-    kept = np.argsort(-squares)[:values]
-    if len(kept) < values or squares[kept[-1]] <= 1e-9 * max(1e-12, squares[kept[0]]):
+    retained = np.argsort(-squares)[:values]
+    if len(retained) < values or squares[retained[-1]] <= 1e-9 * max(1e-12, squares[retained[0]]):
         raise InvalidModel(
             f"{len(descriptors)} frames do not differ in {values} directions; give more, or whiten to fewer."
         )
     directions = (
-        centred.T @ vectors[:, kept] / np.sqrt(squares[kept]) if len(products) == len(centred) else vectors[:, kept]
+        centred.T @ vectors[:, retained] / np.sqrt(squares[retained])
+        if len(products) == len(centred)
+        else vectors[:, retained]
     )
-    deviations = np.sqrt(squares[kept] / len(centred))
+    deviations = np.sqrt(squares[retained] / len(centred))
     return Whitening(mean.astype(np.float32), np.ascontiguousarray(directions / deviations, np.float32))

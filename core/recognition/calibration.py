@@ -225,9 +225,11 @@ def run_trials(
                 scope = snapshot.among(allowed)
                 if len(ranking[0]) < places and left_out[ranking[0]].any():  # a shortlist, others take their places
                     (ranking,) = scope.search(query.descriptor[np.newaxis])
-                kept = allowed[ranking[0]]
+                retained = allowed[ranking[0]]
                 known = bool((there & ~left_out).any())
-                found += _trial(map_, encoder, scope, query, (ranking[0][kept], ranking[1][kept]), base, known, number)
+                found += _trial(
+                    map_, encoder, scope, query, (ranking[0][retained], ranking[1][retained]), base, known, number
+                )
             number += 1
             advance(number, queries.count)
     return gathered(found)

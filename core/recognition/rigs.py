@@ -47,11 +47,15 @@ def locate_rig(
         if None not in places:
             break
     # A place that is deleted all the same is not listed; the verdict holds unless it was the best one.
-    kept = [position for position, place in enumerate(places) if place is not None]
-    judgement = fused.judgement if kept[:1] == [0] else replace(fused.judgement, verdict="unknown", probability=None)
-    matches = [(float(fused.scores[position]), place) for position in kept if (place := places[position]) is not None]
+    retained = [position for position, place in enumerate(places) if place is not None]
+    judgement = (
+        fused.judgement if retained[:1] == [0] else replace(fused.judgement, verdict="unknown", probability=None)
+    )
+    matches = [
+        (float(fused.scores[position]), place) for position in retained if (place := places[position]) is not None
+    ]
     candidates = _candidates_of_rig(fused, ranked[0], decision_slope(calibration))
-    weights = None if ranked[0].weights is None else np.exp(fused.weights[kept]).tolist()
+    weights = None if ranked[0].weights is None else np.exp(fused.weights[retained]).tolist()
     pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
     milliseconds = 1e3 * (time.perf_counter() - began)
     return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates)

@@ -83,19 +83,19 @@ class Candidates:
         """The candidates, which are in the order of three stages, with the results of their verification."""
         return replace(self, geometry=geometry, verifications=verifications)
 
-    def take(self, kept: Positions) -> Candidates:
+    def take(self, retained: Positions) -> Candidates:
         """The candidates at some positions, int64 [m]."""
         return replace(
             self,
-            rows=self.rows[kept],
-            scores=self.scores[kept],
-            first=None if self.first is None else self.first[kept],
-            whereabouts=self.whereabouts.take(kept),
-            examined=self.examined[kept],
-            weights=None if self.weights is None else self.weights[kept],
-            ordered=self.ordered[kept],
-            geometry=None if self.geometry is None else self.geometry.take(kept),
-            verifications=tuple(self.verifications[at] for at in kept.tolist() if at < len(self.verifications)),
+            rows=self.rows[retained],
+            scores=self.scores[retained],
+            first=None if self.first is None else self.first[retained],
+            whereabouts=self.whereabouts.take(retained),
+            examined=self.examined[retained],
+            weights=None if self.weights is None else self.weights[retained],
+            ordered=self.ordered[retained],
+            geometry=None if self.geometry is None else self.geometry.take(retained),
+            verifications=tuple(self.verifications[at] for at in retained.tolist() if at < len(self.verifications)),
         )
 
 

@@ -118,18 +118,18 @@ def verify_candidates(
         if some.start and not worth_verifying(judgement, calibration):
             break
         there = [(at, keypoints) for at in some if (keypoints := stored[at]) is not None]
-        for (at, _), one in zip(there, verify(verifier.keypoints, [kept for _, kept in there]), strict=True):
+        for (at, _), one in zip(there, verify(verifier.keypoints, [keypoints for _, keypoints in there]), strict=True):
             found[at] = one
         if there:
             ranked = verified(candidates, found)
             judgement = judged(ranked)
     milliseconds = 1e3 * (time.perf_counter() - began)
-    kept = {
+    compared = {
         row: keypoints
         for row, keypoints, one in zip(candidates.rows.tolist(), stored, found, strict=False)
         if keypoints is not None and one is not None
     }
-    return ranked, judgement, ThirdStage("verified", verifier.keypoints, kept, milliseconds)
+    return ranked, judgement, ThirdStage("verified", verifier.keypoints, compared, milliseconds)
 
 
 def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifier: Verifier) -> bool:
@@ -151,16 +151,16 @@ def relative_views(
         return [], None
     near = candidates.whereabouts.near(0, neighborhood_of(map_))
     views: list[RelativeView | None] = []
-    note, told = None, 0
+    note, used = None, 0
     for row, one, belongs in zip(candidates.rows.tolist(), candidates.verifications, near.tolist(), strict=False):
         place = stage.stored.get(row)
-        if one is None or place is None or not belongs or told == MOST_VIEWS:
+        if one is None or place is None or not belongs or used == MOST_VIEWS:
             views.append(None)
             continue
         (known,) = map_.places_at([row])
         names = verifier.camera, None if known is None else known.camera
         cameras = [map_.cameras.intrinsics(name) for name in names]
-        if None in cameras and told:  # without intrinsics only the best match's heading is known
+        if None in cameras and used:  # without intrinsics only the best match's heading is known
             views.append(None)
             continue
         try:
@@ -168,7 +168,7 @@ def relative_views(
         except UnfitIntrinsics as error:
             view, note = relative_view(query, place, one), str(error)
         views.append(view)
-        told += view is not None
+        used += view is not None
     return views, note
 
 

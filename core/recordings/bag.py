@@ -178,7 +178,7 @@ class Bag:
 
     def _once(self, name: str, entries: Sequence[tuple[int, Entry]]) -> list[tuple[int, Entry]]:
         """Entries in the order of their times, each message once; messages of one time are compared by their bytes."""
-        kept, repeated, alike = list[tuple[int, Entry]](), 0, 0
+        retained, repeated, alike = list[tuple[int, Entry]](), 0, 0
         for _, group in groupby(entries, lambda one: one[1].stamp or one[1].received):
             together, seen = list(group), set[bytes]()
             for number, (file, entry) in enumerate(together):
@@ -189,7 +189,7 @@ class Bag:
                         continue
                     seen.add(digest)
                     alike += number > 0
-                kept.append((file, entry))
+                retained.append((file, entry))
         if repeated:
             self.remarks.append(
                 f"{repeated} messages of {name} repeat another one, with its stamp and its bytes, and are left out."
@@ -199,7 +199,7 @@ class Bag:
                 f"{alike} messages of {name} have the stamp of another one, but other bytes: they are taken, and their "
                 "ids end with ~2 and so on."
             )
-        return kept
+        return retained
 
     def _digest(self, file: int, entry: Entry) -> bytes:
         """The digest of a message; one that cannot be read is like no other."""

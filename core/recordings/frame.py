@@ -45,8 +45,8 @@ class RecordedFrame:
         if not self.embedded:
             return self
         pose, timestamp = read_pose_and_time(self.load() if data is None else data)
-        told = None if timestamp is None else 1000 * microseconds(timestamp)
-        return replace(self, pose=pose, timestamp=timestamp, nanoseconds=told, embedded=False)
+        taken = None if timestamp is None else 1000 * microseconds(timestamp)
+        return replace(self, pose=pose, timestamp=timestamp, nanoseconds=taken, embedded=False)
 
 
 def utc(nanoseconds: int) -> datetime | None:

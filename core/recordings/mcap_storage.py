@@ -45,17 +45,19 @@ class McapStorage(ChunkedStorage):
         except InvalidRecording as error:
             self.problem = self.problem or f"is damaged ({error})"
 
-    def _learn(self, told: Any, key: Key) -> None:
+    def _learn(self, record: Any, key: Key) -> None:
         from mcap.records import Channel, Schema
 
-        if isinstance(told, Schema):
-            self._schemas[told.id] = type_name(told.name)
-        elif isinstance(told, Channel):
-            coding = CODINGS.get(told.message_encoding)
-            self._connections[told.id] = TopicConnection(told.topic, self._schemas.get(told.schema_id, ""), coding)
+        if isinstance(record, Schema):
+            self._schemas[record.id] = type_name(record.name)
+        elif isinstance(record, Channel):
+            coding = CODINGS.get(record.message_encoding)
+            self._connections[record.id] = TopicConnection(
+                record.topic, self._schemas.get(record.schema_id, ""), coding
+            )
         else:
-            channel = self._connections.get(told.channel_id)
-            self._note(told.channel_id, told.log_time, told.data, channel and channel.coding, key)
+            channel = self._connections.get(record.channel_id)
+            self._note(record.channel_id, record.log_time, record.data, channel and channel.coding, key)
 
     def _chunk(self, record: Record, data: bytes) -> tuple[bytes, str, int]:
         try:

@@ -40,9 +40,9 @@ class Ros1Storage(ChunkedStorage):
             self._note(number, seconds * NANOSECONDS + nanoseconds, start, "ros1", key)
         elif record.kind == _CONNECTION:
             file.seek(record.start)
-            told = _fields(file.read(min(LARGEST_HEADER, record.end - record.start))) or {}
+            fields = _fields(file.read(min(LARGEST_HEADER, record.end - record.start))) or {}
             topic, kind = (
-                one.decode(errors="replace") for one in (record.fields.get("topic", b""), told.get("type", b""))
+                one.decode(errors="replace") for one in (record.fields.get("topic", b""), fields.get("type", b""))
             )
             self._connections[number] = TopicConnection(topic, type_name(kind), "ros1")
 

@@ -111,8 +111,8 @@ class Trajectory:
     def _pose(self, place: NDArray[np.float64], heading: float) -> Pose:
         if self.geographic:
             return Pose(latitude=float(place[0]), longitude=float(place[1]))
-        told = None if math.isnan(heading) else float(heading)
-        return Pose(x=float(place[0]), y=float(place[1]), z=float(place[2]), heading=told)
+        turn = None if math.isnan(heading) else float(heading)
+        return Pose(x=float(place[0]), y=float(place[1]), z=float(place[2]), heading=turn)
 
     def span(self) -> str:
         """From when to when it reaches, in seconds, for messages."""

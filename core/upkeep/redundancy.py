@@ -102,10 +102,10 @@ def thinned(
     least: float,
     free: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """Choose the places to keep, such that every removed one has a kept neighbour of the same place that looks alike.
+    """Choose the places to retain, such that every removed one has a retained neighbour of its place that looks alike.
 
     The choice is greedy: places are considered by the similarity of their most similar neighbour, highest first.  A
-    place is removed if it has a kept neighbour that replaces it, and if every removed place that it replaces has
+    place is removed if it has a retained neighbour that replaces it, and if every removed place that it replaces has
     another.
 
     Args:
@@ -116,10 +116,10 @@ def thinned(
         free: bool [places], which may be removed; None: all.
 
     Returns:
-        bool [places], which are kept.
+        bool [places], which are retained.
     """
     may_go = np.ones(places, np.bool_) if free is None else free
-    kept = np.ones(places, np.bool_)
+    retained = np.ones(places, np.bool_)
     near: list[list[int]] = [[] for _ in range(places)]
     best = np.full(places, -np.inf)
     for (a, b), score in zip(pairs.tolist(), similarity.tolist(), strict=True):
@@ -127,15 +127,15 @@ def thinned(
             near[a].append(b)
             near[b].append(a)
             best[a], best[b] = max(best[a], score), max(best[b], score)
-    stand_ins = [len(others) for others in near]  # of each place, how many kept neighbours replace it
+    stand_ins = [len(others) for others in near]  # of each place, how many retained neighbours replace it
     for place in np.argsort(-best, kind="stable").tolist():
         if not (may_go[place] and stand_ins[place]):
             continue
-        if not any(not kept[other] and stand_ins[other] == 1 for other in near[place]):
-            kept[place] = False
+        if not any(not retained[other] and stand_ins[other] == 1 for other in near[place]):
+            retained[place] = False
             for other in near[place]:
                 stand_ins[other] -= 1
-    return kept
+    return retained
 
 
 @dataclass(frozen=True)
@@ -155,13 +155,13 @@ class RemovalTrial:
     right: NDArray[np.bool_]
     candidates: int
 
-    def found(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """For which queries the best match among the kept places is right; bool [q].
+    def found(self, retained: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """For which queries the best match among the retained places is right; bool [q].
 
         Args:
-            kept: bool [places].
+            retained: bool [places].
         """
-        there = (self.positions != NONE) & kept[np.maximum(self.positions, 0)]
+        there = (self.positions != NONE) & retained[np.maximum(self.positions, 0)]
         examined = there & (there.cumsum(axis=1) <= self.candidates)
         values = np.where(there, self.scores + np.where(examined, self.gains, 0), -np.inf)
         if self.candidates:  # places that were not examined rank after those that were
@@ -175,12 +175,12 @@ class Thinning:
     """A map with some of its places removed, and the effect.
 
     least: the score from which one place replaces another.
-    kept: bool [places].
-    before, after: bool [q], which queries the whole map and the kept places answer rightly.
+    retained: bool [places].
+    before, after: bool [q], which queries the whole map and the retained places answer rightly.
     """
 
     least: float
-    kept: NDArray[np.bool_]
+    retained: NDArray[np.bool_]
     before: NDArray[np.bool_]
     after: NDArray[np.bool_]
 

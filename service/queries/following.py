@@ -8,7 +8,7 @@ from contextlib import suppress
 from core.errors import PlacerecError
 from core.maps import Map
 from service.engine.engine import Engine
-from service.queries.given_answers import AskedFrame, GivenAnswer
+from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics, map_key
 
@@ -19,7 +19,7 @@ def follow_answer(
     map_: Map,
     answer: QueryAnswer,
     frame: bytes,
-    asked: AskedFrame,
+    queried: QueriedFrame,
     file: str | None = None,
     milliseconds: Mapping[str, float] | None = None,
     count: bool = True,
@@ -37,18 +37,18 @@ def follow_answer(
         count: whether the answer says something of the map, in whose statistics it is counted.
         review: whether the map may store the frame.
     """
-    record, given = map_.record, GivenAnswer.of(answer, asked, milliseconds)
+    record, given = map_.record, GivenAnswer.of(answer, queried, milliseconds)
     engine.metrics.observe_answer(record.id, answer.verdict, answer.score)
     if "search" in answer.milliseconds:
         engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
     if count:
         _count(engine, statistics, record.id, given)
-    is_kept = review and record.review is not None and answer.verdict in record.review.verdicts
-    if not is_kept and not engine.events.heard(record.id):
+    is_stored = review and record.review is not None and answer.verdict in record.review.verdicts
+    if not is_stored and not engine.events.heard(record.id):
         return
     event = given.event(record.id, file, None if answer.explanation is None else answer.explanation.picture)
     engine.events.publish(event, frame if record.keep != "none" else None)
-    if is_kept:
+    if is_stored:
         engine.review_keeper.offer(map_, frame, given.for_review(event))
 
 

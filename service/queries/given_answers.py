@@ -26,7 +26,7 @@ MapKey = tuple[str, str]
 """The id of a map and the time of its creation: a new map of the same id has answers of its own."""
 
 
-class AskedFrame(NamedTuple):
+class QueriedFrame(NamedTuple):
     """The origin of a queried frame; None where it is not known.
 
     camera: the name of the camera that took it.
@@ -49,7 +49,7 @@ class GivenAnswer(NamedTuple):
     """
 
     at: datetime
-    frame: AskedFrame
+    frame: QueriedFrame
     verdict: Verdict
     probability: float | None
     place: str | None
@@ -65,7 +65,9 @@ class GivenAnswer(NamedTuple):
     asker: Asker
 
     @classmethod
-    def of(cls, answer: QueryAnswer, frame: AskedFrame, milliseconds: Mapping[str, float] | None = None) -> GivenAnswer:
+    def of(
+        cls, answer: QueryAnswer, frame: QueriedFrame, milliseconds: Mapping[str, float] | None = None
+    ) -> GivenAnswer:
         """An answer that is being given now.
 
         Args:
@@ -119,8 +121,8 @@ class GivenAnswer(NamedTuple):
 
     def for_review(self, event: QueryEvent) -> dict[str, Any]:
         """The part of the answer that is stored with a frame for review, as JSON values."""
-        told = event.model_dump(mode="json", include=REVIEWED)
-        return told | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
+        shown = event.model_dump(mode="json", include=REVIEWED)
+        return shown | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
 
     def rank_of(self, place_id: str) -> int | None:
         """The rank of a place among the matches; None if it is not among the stored ones."""
@@ -139,24 +141,24 @@ class RecentAnswers:
     """The latest answers of each map, bounded in number.  Any thread may use it."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[MapKey, deque[GivenAnswer]] = OrderedDict()
+        self._stored: OrderedDict[MapKey, deque[GivenAnswer]] = OrderedDict()
         self._count = 0
         self._lock = threading.Lock()
 
     def add(self, key: MapKey, answer: GivenAnswer) -> None:
         """Store an answer of a map."""
         with self._lock:
-            of_map = self._kept.get(key)
+            of_map = self._stored.get(key)
             if of_map is None:
-                of_map = self._kept[key] = deque(maxlen=MOST_OF_MAP)
+                of_map = self._stored[key] = deque(maxlen=MOST_OF_MAP)
             else:
-                self._kept.move_to_end(key)
+                self._stored.move_to_end(key)
             self._count += len(of_map) < MOST_OF_MAP
             of_map.append(answer)
             while self._count > MOST:
-                self._count -= len(self._kept.popitem(last=False)[1])
+                self._count -= len(self._stored.popitem(last=False)[1])
 
     def of_map(self, key: MapKey) -> list[GivenAnswer]:
         """The answers of a map, the latest first."""
         with self._lock:
-            return list(reversed(self._kept.get(key, ())))
+            return list(reversed(self._stored.get(key, ())))

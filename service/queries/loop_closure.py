@@ -41,7 +41,7 @@ from service.places.place_events import tell_enrolment
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of
 from service.queries.following import follow_answer
-from service.queries.given_answers import AskedFrame
+from service.queries.given_answers import QueriedFrame
 from service.queries.parameters import ClosureParameters
 from service.queries.schemas import ClosureAnswer
 from service.worker_threads import in_thread
@@ -162,6 +162,6 @@ async def query_or_enrol(
     response.status_code = 201 if change == "created" else 200
     request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
-    follow_answer(engine, statistics, map_, answer, data, AskedFrame(options.camera))
+    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera))
     shown = None if enrolled is None else PlaceView.of(enrolled)
     return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)

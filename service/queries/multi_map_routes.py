@@ -34,7 +34,7 @@ from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, estimated_pose
 from service.queries.following import follow_answer
-from service.queries.given_answers import AskedFrame
+from service.queries.given_answers import QueriedFrame
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
@@ -82,7 +82,7 @@ async def query_maps(
     recognized = together.best if together.verdict == "recognized" else None
     wholes = [_whole_answer(report) for report in reports]
     answers = [_map_answer(request, report, whole) for report, whole in zip(reports, wholes, strict=True)]
-    asked, data = AskedFrame(frames[0].camera), frames[0].data
+    queried, data = QueriedFrame(frames[0].camera), frames[0].data
     total = rounded({"total": milliseconds_since(started(request))})
     for report, whole in zip(reports, wholes, strict=True):
         if report.map_ is None or whole is None:
@@ -92,7 +92,7 @@ async def query_maps(
         # A frame whose place is recognized is in no doubt for the maps that do not know the place.
         in_doubt_here = together.verdict != "recognized" or report is recognized
         follow_answer(
-            engine, statistics, report.map_, whole, data, asked,
+            engine, statistics, report.map_, whole, data, queried,
             milliseconds=total, count=counts, review=in_doubt_here,
         )  # fmt: skip
     matches = _matches(reports, options.k)

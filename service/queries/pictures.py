@@ -111,16 +111,16 @@ class ExplanationPictures:
     """The pictures of the latest explanations, in memory.  Thread-safe."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()
+        self._stored: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()
         self._lock = threading.Lock()
 
     def keep(self, key: MapKey, picture: bytes) -> str:
         """Store a PNG for ``SECONDS``, or until its map is deleted; returns the name by which it can be fetched."""
         name = secrets.token_urlsafe(12)
         with self._lock:
-            self._kept[key, name] = (time.monotonic() + SECONDS, picture)
-            while len(self._kept) > MOST:
-                self._kept.popitem(last=False)
+            self._stored[key, name] = (time.monotonic() + SECONDS, picture)
+            while len(self._stored) > MOST:
+                self._stored.popitem(last=False)
         return name
 
     def fetch(self, key: MapKey, name: str) -> bytes:
@@ -130,7 +130,7 @@ class ExplanationPictures:
             UnknownExplanation: there is no such picture, or it is not stored any more.
         """
         with self._lock:
-            until, picture = self._kept.get((key, name), (0.0, b""))
+            until, picture = self._stored.get((key, name), (0.0, b""))
         if time.monotonic() > until:
             raise UnknownExplanation(
                 f"There is no picture {name[:40]!r}; the latest {MOST} are stored for {SECONDS / 60:.0f} minutes."

@@ -35,7 +35,7 @@ from service.places.batches import frame_problem
 from service.queries.answers import StatisticsDep, answer_of
 from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.following import follow_answer
-from service.queries.given_answers import AskedFrame
+from service.queries.given_answers import QueriedFrame
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
@@ -82,7 +82,7 @@ async def query(
         answer.explanation = await explain_match(engine, pictures, map_, encoded, answered.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
-    follow_answer(engine, statistics, map_, answer, data, AskedFrame(options.camera))
+    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera))
     return answer
 
 
@@ -132,10 +132,10 @@ async def query_batch(
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     answered = await engine.searches.answer(map_, list(encoded.values()), question)
-    asked = AskedFrame(options.camera)
+    queried = QueriedFrame(options.camera)
     for index, one in zip(encoded, answered, strict=True):
         answer = items[index].answer = answer_of(map_, one.frame, one.answer)
-        follow_answer(engine, statistics, map_, answer, files[index].data, asked, file=files[index].name)
+        follow_answer(engine, statistics, map_, answer, files[index].data, queried, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)

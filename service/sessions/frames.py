@@ -19,7 +19,7 @@ from service.http.routing import rounded
 from service.places.schemas import PlaceView
 from service.queries.answers import answer_of
 from service.queries.following import follow_answer
-from service.queries.given_answers import AskedFrame
+from service.queries.given_answers import QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -72,7 +72,7 @@ async def process_frame(
             return repeated
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
-        asked = AskedFrame(session.options.camera, session.id, options.frame)
+        queried = QueriedFrame(session.options.camera, session.id, options.frame)
         single = answer_of(map_, answered.frame, answered.answer)
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
@@ -91,7 +91,7 @@ async def process_frame(
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
     total = {"total": answer.milliseconds["total"]}
-    follow_answer(engine, statistics, map_, single, data, asked, milliseconds=total)
+    follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total)
     tell_belief(engine, map_, session, answer)
     return answer
 

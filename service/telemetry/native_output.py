@@ -32,13 +32,13 @@ def logged_stderr() -> Iterator[None]:
     """
     before = sys.stderr
     before.flush()
-    kept = os.dup(2)
+    original = os.dup(2)
     reading, writing = os.pipe()
     # If the pipe is full, a library loses its line instead of waiting for a thread that may wait for it.
     os.set_blocking(writing, False)
     os.dup2(writing, 2)
     os.close(writing)
-    own = os.fdopen(os.dup(kept), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
+    own = os.fdopen(os.dup(original), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
     sys.stderr = own
     faulthandler.enable(own)
     thread = threading.Thread(target=_log_lines, args=(reading,), name="native-log", daemon=True)
@@ -46,9 +46,9 @@ def logged_stderr() -> Iterator[None]:
     try:
         yield
     finally:
-        os.dup2(kept, 2)  # this closes the last writing end of the pipe
+        os.dup2(original, 2)  # this closes the last writing end of the pipe
         thread.join(1.0)
-        faulthandler.enable(kept)
+        faulthandler.enable(original)
         sys.stderr = before
         # Both descriptors stay open: a log handler may still use one, and the crash handler the other.
 

@@ -145,16 +145,18 @@ def _new_names(
         conflicts.append(f"Both maps have the sequences {_listed(shared)}.")
     if taken := [name for name in sequences.values() if name in ours or len(name) > 128]:
         conflicts.append(f"The names {_listed(taken)} of sequences are taken or too long; choose another prefix.")
-    kept = {camera.name: (camera.mask, camera.intrinsics) for camera in map_.cameras.all()}
+    stored = {camera.name: (camera.mask, camera.intrinsics) for camera in map_.cameras.all()}
     used = {place.camera for place in coming}
-    known = [camera for camera in other.cameras.all() if camera.name in used and camera.name in kept]
-    unlike = [camera for camera in known if kept[camera.name] != (camera.mask, camera.intrinsics)]
+    known = [camera for camera in other.cameras.all() if camera.name in used and camera.name in stored]
+    unlike = [camera for camera in known if stored[camera.name] != (camera.mask, camera.intrinsics)]
     cameras = {camera.name: prefix + camera.name for camera in unlike} if rule == "rename" else {}
     if unlike and rule != "rename":
         conflicts.append(
             f"The cameras {_listed([camera.name for camera in unlike])} have other masks or intrinsics here."
         )
-    if taken := [new for name, new in cameras.items() if len(new) > 64 or kept.get(new, (None, None)) != (None, None)]:
+    if taken := [
+        new for name, new in cameras.items() if len(new) > 64 or stored.get(new, (None, None)) != (None, None)
+    ]:
         conflicts.append(f"The names {_listed(taken)} of cameras are taken or too long; choose another prefix.")
     return sequences, cameras
 

@@ -92,12 +92,14 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
     for least, scores in _choices(similarity, len(looks), options["similarity"]):
         context.check_cancelled()
         # Places that must stay can stand in for others, but not the other way round.
-        kept = thinned(len(own), pairs, scores, least, removable)
-        tried.append(Thinning(least, kept, before, trial.found(kept & references)))
+        retained = thinned(len(own), pairs, scores, least, removable)
+        tried.append(Thinning(least, retained, before, trial.found(retained & references)))
     most_loss = 1.0 if options["similarity"] is not None else options["max_recall_loss"]
     chosen = best_thinning(tried, most_loss)
     going = (
-        {} if chosen is None else {own.places[i].id: own.places[i].digest.hex() for i in np.flatnonzero(~chosen.kept)}
+        {}
+        if chosen is None
+        else {own.places[i].id: own.places[i].digest.hex() for i in np.flatnonzero(~chosen.retained)}
     )
     after = before if chosen is None else chosen.after
     report = {
@@ -110,7 +112,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         "recall_after": _share(after),
         "recall_loss": float(before.mean() - after.mean()),
         "tried": [
-            {"similarity": one.least, "removed": int((~one.kept).sum()), "recall": float(one.after.mean())}
+            {"similarity": one.least, "removed": int((~one.retained).sum()), "recall": float(one.after.mean())}
             for one in tried
         ],
         "named": list(going)[:MOST_LISTED],

@@ -22,8 +22,8 @@ def camera_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
     """The lines of cameras by name."""
     query = "SELECT name, mask, intrinsics, updated_at FROM cameras ORDER BY name"
     for name, mask, intrinsics, updated_at in connection.execute(query):
-        kept = {"mask": mask, "intrinsics": intrinsics}
-        parsed = {field: None if text is None else json.loads(text) for field, text in kept.items()}
+        stored = {"mask": mask, "intrinsics": intrinsics}
+        parsed = {field: None if text is None else json.loads(text) for field, text in stored.items()}
         yield written_line({"name": name, **parsed, "updated_at": updated_at})
 
 

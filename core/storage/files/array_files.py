@@ -131,7 +131,9 @@ def _listed(described: bytes, kind: str, made_of: str) -> list[tuple[str, np.dty
             raise StaleArrays("it is of another kind")
         if content["made_of"] != made_of:
             raise StaleArrays("it was made of other descriptors")
-        listed = [(str(name), np.dtype(str(kept)), tuple(map(int, shape))) for name, kept, shape in content["arrays"]]
+        listed = [
+            (str(name), np.dtype(str(stored)), tuple(map(int, shape))) for name, stored, shape in content["arrays"]
+        ]
     except (ValueError, KeyError, TypeError) as error:
         raise StaleArrays("its description cannot be read") from error
     if any(dtype.kind not in _KINDS or min(shape, default=0) < 0 for _, dtype, shape in listed):

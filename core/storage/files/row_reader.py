@@ -73,8 +73,8 @@ class RowReader:
 
     def inner_products(self, queries: NDArray[np.float32], rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
         """Inner products of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
-        kept = self._first_parts(rows, checksums)["descriptor"]
-        return inner_products(queries, kept, self._layout.precision)
+        stored = self._first_parts(rows, checksums)["descriptor"]
+        return inner_products(queries, stored, self._layout.precision)
 
     def locals(self, rows: Rows, checksums: Checksums) -> Local:
         """The local descriptors of rows: int8 [k, C, L]."""

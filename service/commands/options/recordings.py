@@ -179,13 +179,13 @@ def without_standing(
             except (InvalidImage, InvalidRecording, OSError):
                 return None  # what is wrong with it is said where it is sent
 
-        kept = list(moving(frames, look, lambda one, other: one.change(other) < STILL))
-    if left_out := len(frames) - len(kept):
+        retained = list(moving(frames, look, lambda one, other: one.change(other) < STILL))
+    if left_out := len(frames) - len(retained):
         remark(
             f"{left_out} of {len(frames)} frames show the same as the frame before them, as where the robot stood, and "
             "are left out; --keep-standing enrols them."
         )
-    return kept
+    return retained
 
 
 def describer(encoder: str | None, mask: Mask | None = None) -> Describe:

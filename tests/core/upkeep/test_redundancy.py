@@ -92,17 +92,17 @@ def graphs(draw: st.DrawFn) -> Graph:
 @settings(max_examples=300)
 def test_whatever_goes_has_a_stand_in_that_stays(graph: Graph) -> None:
     places, pairs, similarity, least = graph
-    kept = thinned(places, pairs, similarity, least)
+    retained = thinned(places, pairs, similarity, least)
     alike = {(int(a), int(b)) for (a, b), s in zip(pairs, similarity, strict=True) if s >= np.float32(least)}
-    for place in np.flatnonzero(~kept).tolist():
-        assert any(kept[other] for pair in alike if place in pair for other in pair if other != place)
+    for place in np.flatnonzero(~retained).tolist():
+        assert any(retained[other] for pair in alike if place in pair for other in pair if other != place)
 
 
 @given(graphs())
 def test_nothing_is_left_that_could_go(graph: Graph) -> None:
-    """Greedy, but to the end: no kept place with a stand-in could go without leaving another one alone."""
+    """Greedy, but to the end: no retained place with a stand-in could go without leaving another one alone."""
     places, pairs, similarity, least = graph
-    kept = thinned(places, pairs, similarity, least)
+    retained = thinned(places, pairs, similarity, least)
     near: list[set[int]] = [set() for _ in range(places)]
     for (a, b), score in zip(pairs.tolist(), similarity.tolist(), strict=True):
         if score >= least:
@@ -110,10 +110,10 @@ def test_nothing_is_left_that_could_go(graph: Graph) -> None:
             near[b].add(a)
 
     def count(place: int) -> int:
-        return sum(bool(kept[other]) for other in near[place])
+        return sum(bool(retained[other]) for other in near[place])
 
-    for place in np.flatnonzero(kept).tolist():
-        alone = any(not kept[other] and count(other) == 1 for other in near[place])
+    for place in np.flatnonzero(retained).tolist():
+        alone = any(not retained[other] and count(other) == 1 for other in near[place])
         assert count(place) == 0 or alone
 
 
@@ -121,8 +121,8 @@ def test_a_dense_line_is_thinned_and_a_sparse_one_is_not() -> None:
     dense = where([METRIC] * 30, [0.1 * n for n in range(30)])
     pairs = neighbour_pairs(dense, Neighborhood(0.15, 0))
     assert len(pairs) == 29
-    kept = thinned(30, pairs, np.full(29, 0.9, np.float32), 0.5)
-    assert 10 <= kept.sum() <= 20
+    retained = thinned(30, pairs, np.full(29, 0.9, np.float32), 0.5)
+    assert 10 <= retained.sum() <= 20
     assert thinned(30, pairs, np.full(29, 0.4, np.float32), 0.5).all()
 
 
@@ -139,7 +139,7 @@ def trial(positions: list[list[int]], right: list[list[bool]], candidates: int =
     )
 
 
-def test_the_best_of_those_kept_counts() -> None:
+def test_the_best_of_those_retained_counts() -> None:
     held = trial([[0, 1, 2], [2, 1, NONE]], [[True, False, False], [False, True, False]])
     assert held.found(np.array([True, True, True])).tolist() == [True, False]
     assert held.found(np.array([False, True, True])).tolist() == [False, False]
@@ -147,7 +147,7 @@ def test_the_best_of_those_kept_counts() -> None:
     assert held.found(np.array([False, False, False])).tolist() == [False, False], "nothing found is not right"
 
 
-def test_the_second_stage_examines_the_first_of_those_kept() -> None:
+def test_the_second_stage_examines_the_first_of_those_retained() -> None:
     gains = [[0.0, 0.5, 0.9]]
     held = trial([[0, 1, 2]], [[False, True, False]], candidates=2, scores=[[0.5, 0.4, 0.3]], gains=gains)
     assert held.found(np.ones(3, np.bool_)).tolist() == [True], "place 2 is not examined, for two come first"

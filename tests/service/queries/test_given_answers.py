@@ -9,7 +9,7 @@ import pytest
 
 from service.access.keys import KeyStore
 from service.queries import given_answers
-from service.queries.given_answers import AskedFrame, GivenAnswer, MapKey, RecentAnswers
+from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame, RecentAnswers
 from service.queries.schemas import QueryAnswer
 from tests.service.scenes import blank, encoded, jpeg, stranger
 from tests.service.server import Server, assert_problem
@@ -148,12 +148,12 @@ def test_the_answers_of_all_maps_together_are_bounded(monkeypatch: pytest.Monkey
     maps: list[MapKey] = [(f"map-{number}", "then") for number in range(4)]
     for one in (maps[0], maps[1], maps[0]):
         for _ in range(20):
-            kept.add(one, GivenAnswer.of(ANSWER, AskedFrame()))
+            kept.add(one, GivenAnswer.of(ANSWER, QueriedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [10, 10, 0, 0]
     for _ in range(6):
-        kept.add(maps[2], GivenAnswer.of(ANSWER, AskedFrame()))
+        kept.add(maps[2], GivenAnswer.of(ANSWER, QueriedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [10, 0, 6, 0], "those of the map asked least recently went"
     for _ in range(100):
-        kept.add(maps[3], GivenAnswer.of(ANSWER, AskedFrame()))
+        kept.add(maps[3], GivenAnswer.of(ANSWER, QueriedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [0, 0, 6, 10]
     assert kept._count == sum(len(kept.of_map(one)) for one in maps)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from service.queries.given_answers import MOST_OF_MAP, AskedFrame, GivenAnswer
+from service.queries.given_answers import MOST_OF_MAP, GivenAnswer, QueriedFrame
 from service.shared.database import SharedDatabase
 from service.shared.statistics import SharedAnswers, SharedStatistics
 from tests.service.queries import test_statistics as embedded
@@ -135,11 +135,11 @@ def _counted(server: Server, count: int) -> bool:
 def test_the_latest_answers_are_bounded(database: SharedDatabase) -> None:
     one, other = SharedAnswers(database), SharedAnswers(database)
     for number in range(MOST_OF_MAP + 20):
-        (one, other)[number % 2].add(("lab", "2026"), GivenAnswer.of(ANSWER, AskedFrame(number=number)))
-    other.add(("hall", "2026"), GivenAnswer.of(ANSWER, AskedFrame("front", "s-1", 7)))
+        (one, other)[number % 2].add(("lab", "2026"), GivenAnswer.of(ANSWER, QueriedFrame(number=number)))
+    other.add(("hall", "2026"), GivenAnswer.of(ANSWER, QueriedFrame("front", "s-1", 7)))
     other.flush()
     kept = one.of_map(("lab", "2026"))
     assert len(kept) == MOST_OF_MAP and {answer.reason for answer in kept} == {ANSWER.reason}
-    assert [answer.frame for answer in one.of_map(("hall", "2026"))] == [AskedFrame("front", "s-1", 7)]
+    assert [answer.frame for answer in one.of_map(("hall", "2026"))] == [QueriedFrame("front", "s-1", 7)]
     rows = database.execute("count", "SELECT count(*) FROM service.answers")
     assert rows == [(MOST_OF_MAP + 1,)]
