@@ -21,7 +21,7 @@ from itertools import count
 from urllib.parse import urlsplit
 
 PLACES_OF_A_TRAVERSE = 40
-KEPT_TRAVERSES = 4
+RETAINED_TRAVERSES = 4
 """Of each operator; older ones are deleted, those with an even number place by place, the others as a whole."""
 
 BATCH = 8
@@ -183,7 +183,7 @@ class Fleet:
         """The traverses that each operator keeps, at once."""
         for number in range(self.plan.operators):
             line = PersistentConnection(self.plan.url)
-            for _ in range(KEPT_TRAVERSES * PLACES_OF_A_TRAVERSE // BATCH):
+            for _ in range(RETAINED_TRAVERSES * PLACES_OF_A_TRAVERSE // BATCH):
                 await self._enrol_many(line, number, BATCH, time.perf_counter())
             line.close()
 
@@ -310,7 +310,7 @@ class Fleet:
 
     async def _deleter(self, line: PersistentConnection, _number: int) -> None:
         while time.perf_counter() < self.until:
-            old = [traverses for traverses in self._traverses.values() if len(traverses) > KEPT_TRAVERSES]
+            old = [traverses for traverses in self._traverses.values() if len(traverses) > RETAINED_TRAVERSES]
             if not old:
                 await asyncio.sleep(0.2)
             for traverses in old:
@@ -320,7 +320,7 @@ class Fleet:
                 else:
                     for place in oldest.places:
                         await self._delete(line, f"places/{place}", "delete place", [place])
-                        await asyncio.sleep(0.1 if len(traverses) <= KEPT_TRAVERSES else 0)
+                        await asyncio.sleep(0.1 if len(traverses) <= RETAINED_TRAVERSES else 0)
 
     async def _delete(self, line: PersistentConnection, path: str, kind: str, places: list[str]) -> None:
         due = time.perf_counter()

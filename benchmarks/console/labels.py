@@ -21,12 +21,22 @@ import httpx
 import typer
 from playwright.sync_api import Page, expect, sync_playwright
 
-from benchmarks.maps.labels import FOLDERS, KEPT, LabelledFrame, LabelledWalk, ask, halves, make_map, query, walk
+from benchmarks.maps.labels import (
+    FOLDERS,
+    STORED_VERDICTS,
+    LabelledFrame,
+    LabelledWalk,
+    ask,
+    halves,
+    make_map,
+    query,
+    walk,
+)
 from benchmarks.process import service
 from benchmarks.report import report
 
 
-def kept_frames(client: httpx.Client, map_id: str) -> dict[int, str]:
+def review_frames(client: httpx.Client, map_id: str) -> dict[int, str]:
     """The frames that are to be labelled: of each its SHA-256, the newest first."""
     found: dict[int, str] = {}
     cursor: str | None = ""
@@ -80,13 +90,13 @@ def measure(client: httpx.Client, page: Page, of: LabelledWalk, other: LabelledW
     parts = halves(of, other)
     for turn, (queried, held_out) in enumerate((parts, parts[::-1])):
         map_id = f"{of.name}-{turn}"
-        make_map(client, map_id, of, KEPT["doubtful"])
+        make_map(client, map_id, of, STORED_VERDICTS["doubtful"])
         for frame in queried:
             query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
         before = ask(client, map_id, held_out)
-        frames = kept_frames(client, map_id)
+        frames = review_frames(client, map_id)
         began = time.perf_counter()
         label_by_clicks(page, console, map_id, frames, queried)
         took = time.perf_counter() - began

@@ -128,9 +128,9 @@ def zoomed(pixels: Pixels, most: float, size: tuple[int, int], generator: np.ran
 def nights(camera: PictureEncoder, train: Path, distractors: Pictures, held_out: bool) -> list[Task]:
     """One day of each fixed camera and distractors against its nights: whole, and cut by 10 to 25 % on one side."""
     generator = np.random.default_rng(0)
-    kept_out = set(split_photographs(train).held_out)
+    held_out_paths = set(split_photographs(train).held_out)
     paths = [path for path in find_photographs(train / DAY_NIGHT) if path.parent.name not in MIXED_CAMERAS]
-    paths = [path for path in paths if (path in kept_out) == held_out]
+    paths = [path for path in paths if (path in held_out_paths) == held_out]
     days = {path.parent.name: path for path in reversed(paths) if path.name.startswith("day")}
     dark = [path for path in paths if path.name.startswith("night") and path.parent.name in days]
     names = sorted(days)

@@ -31,7 +31,7 @@ from benchmarks.report import report
 from lab.evaluation.data.datasets import find_dataset, open_dataset
 
 FOLDERS = {"corridor": "corridor", "lip6": "lip6_outdoor"}
-KEPT: Mapping[str, Sequence[str]] = {
+STORED_VERDICTS: Mapping[str, Sequence[str]] = {
     "none": (),
     "doubtful": ("ambiguous", "unknown"),
     "all": ("recognized", "ambiguous", "unknown"),
@@ -116,7 +116,9 @@ def query(client: httpx.Client, map_id: str, data: bytes) -> dict[str, Any]:
     return answer
 
 
-def make_map(client: httpx.Client, map_id: str, of: LabelledWalk, verdicts: Sequence[str] = KEPT["all"]) -> None:
+def make_map(
+    client: httpx.Client, map_id: str, of: LabelledWalk, verdicts: Sequence[str] = STORED_VERDICTS["all"]
+) -> None:
     """A map of a walk that keeps the frames with some verdicts for review."""
     review = {"verdicts": list(verdicts), "most_frames": 10_000}
     client.post("/v1/maps", json={"id": map_id, "keep": "none", "review": review}).raise_for_status()
@@ -126,7 +128,7 @@ def make_map(client: httpx.Client, map_id: str, of: LabelledWalk, verdicts: Sequ
         client.put(path, content=data, headers={"Content-Type": kind}).raise_for_status()
 
 
-def label_kept(client: httpx.Client, map_id: str, frames: Sequence[LabelledFrame], verdicts: Sequence[str]) -> int:
+def label_stored(client: httpx.Client, map_id: str, frames: Sequence[LabelledFrame], verdicts: Sequence[str]) -> int:
     """Label the stored frames with these verdicts by the truth; returns how many there are."""
     shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in frames}
     items: list[dict[str, Any]] = []
@@ -154,8 +156,8 @@ def measure(client: httpx.Client, of: LabelledWalk, other: LabelledWalk) -> list
             query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
-        for stored, verdicts in KEPT.items():
-            labels = label_kept(client, map_id, queried, verdicts)
+        for stored, verdicts in STORED_VERDICTS.items():
+            labels = label_stored(client, map_id, queried, verdicts)
             for order, body in (LABELLED if labels else UNLABELLED).items():
                 client.patch(f"/v1/maps/{map_id}", json={"calibration": None}).raise_for_status()
                 done = {"map": of.name, "kept": stored, "labels": labels, "half": turn, "order": order}

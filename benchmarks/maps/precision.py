@@ -77,12 +77,12 @@ def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side
     descriptors, local = side
     if precision == "float32":
         return side, descriptors[0].nbytes + local[0].nbytes
-    stored, kept_local = pack_descriptors(descriptors, precision), pack_local(local, precision)
+    stored, stored_local = pack_descriptors(descriptors, precision), pack_local(local, precision)
     back = (
         unpack_descriptors(stored, precision, descriptors.shape[1]),
-        unpack_local(kept_local, precision, local.shape[1:]),
+        unpack_local(stored_local, precision, local.shape[1:]),
     )
-    return back, stored[0].nbytes + kept_local[0].nbytes
+    return back, stored[0].nbytes + stored_local[0].nbytes
 
 
 def faiss_index(low: Array, high: Array) -> faiss.IndexScalarQuantizer:

@@ -49,7 +49,7 @@ FIRST = 2.5
 """Weight of a run's first look.  Evidence counts less than half of what a frame says, because frames that follow one
 another lead to the same mistakes (``evidence``); the first follows none."""
 
-STANDING = 0.1
+SAME_SPOT = 0.1
 """Weight of a further frame from the same spot: it shows the same things and leads to the same mistakes."""
 
 FADING = 0.8
@@ -275,7 +275,7 @@ class Run:
             return 1.0
         moved = step.odometry.distance / (0.5 * self.graph.spacing)
         turned = abs(step.odometry.turn) / TURN_NOTED
-        return float(min(1.0, max(STANDING, moved, turned)))
+        return float(min(1.0, max(SAME_SPOT, moved, turned)))
 
     def estimate(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
         """Where the robot is; this counts unrecognized frames, so call it once for each frame.

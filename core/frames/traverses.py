@@ -105,8 +105,8 @@ def read_ground_truth(path: Path, queries: int, references: int) -> Truth:
     return [np.array(sorted(true), np.int64) for true in found]
 
 
-def read_kept_references(path: Path, references: int) -> NDArray[np.int64]:
-    """Read the indices of the references to keep, one on each line; int64 [R'], ascending.
+def read_retained_references(path: Path, references: int) -> NDArray[np.int64]:
+    """Read the indices of the references to retain, one on each line; int64 [R'], ascending.
 
     Raises:
         InvalidGroundTruth: the file cannot be read, a line is no index, or there is none.

@@ -98,7 +98,7 @@ class Counterparts(Protocol):
 
 
 @dataclass(frozen=True)
-class Standing:
+class PlaceStation:
     """Where a place is along its sequence and its track, and whose pose it has.
 
     sequence, track: codes; NO_SEQUENCE without a sequence, no track where it is the place's own.
@@ -114,7 +114,10 @@ class Standing:
 
 
 def brought_over(
-    there: Mapping[str, Standing], here: Mapping[str, Standing], names: Mapping[str, str], new_track: Callable[[], int]
+    there: Mapping[str, PlaceStation],
+    here: Mapping[str, PlaceStation],
+    names: Mapping[str, str],
+    new_track: Callable[[], int],
 ) -> Iterator[tuple[str, int | None, int | None, str | None]]:
     """The changes that bring copied places to the stations of the map that they come from (``Counterparts.copy``).
 
@@ -131,7 +134,7 @@ def brought_over(
         if (twin := here.get(names.get(place.id, place.id))) is not None and twin.digest == place.digest
     }
     copied = [place for place in there.values() if place.id in names and place.id in twins]
-    frames: dict[int, list[tuple[int, Standing]]] = {p.track: [] for p in copied if p.track is not None}
+    frames: dict[int, list[tuple[int, PlaceStation]]] = {p.track: [] for p in copied if p.track is not None}
     for place in sorted((there[name] for name in twins), key=lambda place: place.ordinal):
         if place.sequence in frames and twins[place.id].sequence != NO_SEQUENCE:
             frames[place.sequence].append((place.ordinal, twins[place.id]))
@@ -139,7 +142,7 @@ def brought_over(
     for place in copied:
         track, station, pose_of = place.track, place.station, place.pose_of
         if track is not None and station is not None:
-            track, station = (lost[track], station) if track in lost else _told_by(frames[track], station)
+            track, station = (lost[track], station) if track in lost else _station_here(frames[track], station)
         if pose_of is not None:
             # The pose of a place that is not here is the place's own.
             pose_of = twins[pose_of].id if pose_of in twins else None
@@ -148,7 +151,7 @@ def brought_over(
             yield twin.id, track, station, pose_of
 
 
-def _told_by(frames: Sequence[tuple[int, Standing]], station: int) -> tuple[int, int]:
+def _station_here(frames: Sequence[tuple[int, PlaceStation]], station: int) -> tuple[int, int]:
     """Track and station here of a station in another map.
 
     Args:

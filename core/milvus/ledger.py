@@ -18,7 +18,7 @@ import psycopg
 from psycopg import Connection
 
 from core.errors import MapExists, UnknownMap
-from core.maps.counterparts import Standing
+from core.maps.counterparts import PlaceStation
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import MapRecord, Outline, PicturedPlace, SequenceSummary
 from core.milvus.pictures.stored import StoredObject, StoredPicture
@@ -479,10 +479,10 @@ def drop_if_empty(connection: Connection[Any], map_number: int, code: int) -> No
     connection.execute(query, (map_number, code))
 
 
-def standings(connection: Connection[Any], map_number: int) -> dict[str, Standing]:
+def place_stations(connection: Connection[Any], map_number: int) -> dict[str, PlaceStation]:
     """Where all places are along their sequences and tracks, by id, in the order of their enrolment."""
     query = "SELECT id, digest, sequence, ordinal, track, station, pose_of FROM places WHERE map = %s ORDER BY number"
-    return {values[0]: Standing(*values) for values in connection.execute(query, (map_number,))}
+    return {values[0]: PlaceStation(*values) for values in connection.execute(query, (map_number,))}
 
 
 def handed_over(connection: Connection[Any], map_number: int) -> dict[int, str]:

@@ -239,7 +239,7 @@ class MilvusScope:
         while True:
             snapshot.collection.expect(snapshot.state.collection)
             hits = snapshot.collection.search(queries, expression, limit, snapshot.state.inserted)
-            rankings = self._kept(hits, keep)
+            rankings = self._filtered(hits, keep)
             enough = all(
                 len(keys) < limit or len(ranking[0]) >= wanted
                 for (keys, _), ranking in zip(hits, rankings, strict=True)
@@ -248,7 +248,7 @@ class MilvusScope:
                 return [(rows[:wanted], products[:wanted]) for rows, products in rankings]
             limit = min(MOST_FOUND, _MORE * limit)
 
-    def _kept(self, hits: Sequence[tuple[NDArray[np.int64], NDArray[np.float32]]], keep: Keep) -> list[Ranking]:
+    def _filtered(self, hits: Sequence[tuple[NDArray[np.int64], NDArray[np.float32]]], keep: Keep) -> list[Ranking]:
         """The rows of the keys that are places' of the scope."""
         snapshot = self.snapshot
         keys = np.unique(np.concatenate([found for found, _ in hits])).tolist()

@@ -18,7 +18,7 @@ Describe = Callable[[RecordedFrame], NDArray[np.float32] | None]
 """Gives the descriptor of a frame, float32 [D], of length 1; None if it has none."""
 
 
-STANDING = 1.0
+STOP_METRES = 1.0
 """Metres: a robot whose poses are farther apart, and by more than their noise, has moved, with any view."""
 
 NOISE = 8.0
@@ -96,14 +96,14 @@ def moving(
     """The frames without those that show the same as the last frame before them that is not left out.
 
     A frame that shows the same stays where its pose says that the robot has moved, as in a tunnel: by more than
-    ``STANDING``, and by more than the noise of the recording's poses explains.
+    ``STOP_METRES``, and by more than the noise of the recording's poses explains.
 
     Args:
         look: gives what a frame shows; None: it cannot be read, and the frame stays.
         same: whether two frames show the same.
     """
     last: tuple[RecordedFrame, Look] | None = None
-    apart = max(STANDING, NOISE * pose_noise(frames))
+    apart = max(STOP_METRES, NOISE * pose_noise(frames))
     for frame in frames:
         shown = look(frame)
         if (

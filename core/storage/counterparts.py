@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping
 
-from core.maps.counterparts import Correspondence, Standing, brought_over, changes_by
+from core.maps.counterparts import Correspondence, PlaceStation, brought_over, changes_by
 from core.storage.cameras import Access
 from core.storage.database import ledger
 from core.storage.writing import Write
@@ -37,15 +37,15 @@ class Counterparts:
 
     def copy(self, other: Counterparts, names: Mapping[str, str]) -> None:
         with other._reading() as connection:
-            there = _standings(connection)
+            there = _place_stations(connection)
         with self._writing() as write:
-            here = _standings(write.connection)
+            here = _place_stations(write.connection)
             changes = brought_over(there, here, names, lambda: ledger.new_track(write.connection))
             for place_id, track, station, pose_of in changes:
                 stored = ledger.expect(write.connection, place_id)
                 write.set_counterpart(stored, track, station, stored.place.pose, pose_of)
 
 
-def _standings(connection: sqlite3.Connection) -> dict[str, Standing]:
+def _place_stations(connection: sqlite3.Connection) -> dict[str, PlaceStation]:
     query = "SELECT id, digest, sequence, ordinal, track, station, pose_of FROM places ORDER BY number"
-    return {values[0]: Standing(*values) for values in connection.execute(query)}
+    return {values[0]: PlaceStation(*values) for values in connection.execute(query)}

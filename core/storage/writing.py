@@ -116,7 +116,7 @@ class Write:
         """
         stored = ledger.find(self.connection, item.id)
         if stored is not None and stored.digest == item.digest:
-            if item.keypoints is not None and not keypoints.are_kept(self.connection, stored.number):
+            if item.keypoints is not None and not keypoints.are_stored(self.connection, stored.number):
                 self._put_keypoints(stored, item.keypoints)
             return self.set_fields(stored, item.fields)
         row = self._snapshot.rows + self._appended
@@ -204,7 +204,7 @@ class Write:
     def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
         stored = ledger.find(self.connection, frame.id)
-        if stored is None or stored.digest != frame.digest or keypoints.are_kept(self.connection, stored.number):
+        if stored is None or stored.digest != frame.digest or keypoints.are_stored(self.connection, stored.number):
             return False
         self._put_keypoints(stored, found)
         return self.record.verification

@@ -16,7 +16,7 @@ MOST_NEIGHBOURS = 32
 
 _STEPS = MOST_NEIGHBOURS // 2
 
-FEWEST_STANDING = 10
+FEWEST_FRAMES_OF_STOP = 10
 """From this number on, frames of one view are a stop: fewer are those of a slow robot or a fast camera."""
 
 
@@ -55,11 +55,11 @@ class Stop:
 
 
 def stops(where: Whereabouts) -> list[Stop]:
-    """Where a robot stood while it mapped: the views with ``FEWEST_STANDING`` frames or more, those of most first."""
+    """Where a robot stood while it mapped: the views with ``FEWEST_FRAMES_OF_STOP`` frames or more, largest first."""
     found = np.flatnonzero(where.sequence != NO_SEQUENCE)
     order = found[np.lexsort((where.ordinal[found], where.sequence[found]))]
     begins = np.flatnonzero((np.diff(where.sequence[order]) != 0) | (np.diff(where.ordinal[order]) != 0)) + 1
-    views = [np.sort(view) for view in np.split(order, begins) if len(view) >= FEWEST_STANDING]
+    views = [np.sort(view) for view in np.split(order, begins) if len(view) >= FEWEST_FRAMES_OF_STOP]
     return sorted(map(Stop, views), key=lambda stop: (-len(stop.places), int(stop.places[0])))
 
 

@@ -43,11 +43,11 @@ def _run(path: Path, pair: TraversePair) -> SystemRun:
             f"{path.name} has {scores.shape[0]} rows and {scores.shape[1]} columns; {pair.name} has {expected[0]} "
             f"queries and {expected[1]} references."
         )
-    scores = scores[:, pair.kept]
-    outcomes = judge(scores, pair.kept, pair.truth, pair.excluded)
-    evaluation = summarize(f"{path.stem} ({MARK})", outcomes, len(pair.kept), {})
-    matched = matched_scores(scores, pair.kept, pair.excluded)
-    evaluation = evaluation.model_copy(update=trust_figures(matched, pair.kept, outcomes, evaluation.notes))
+    scores = scores[:, pair.retained]
+    outcomes = judge(scores, pair.retained, pair.truth, pair.excluded)
+    evaluation = summarize(f"{path.stem} ({MARK})", outcomes, len(pair.retained), {})
+    matched = matched_scores(scores, pair.retained, pair.excluded)
+    evaluation = evaluation.model_copy(update=trust_figures(matched, pair.retained, outcomes, evaluation.notes))
     return SystemRun(
         about=About(path.stem, f"{path.stem} ({SHORT_MARK})", "not computed here", {"similarities": path.name}),
         identity=f"{path.stem} ({MARK})",

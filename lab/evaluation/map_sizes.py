@@ -42,7 +42,7 @@ APART = 8
 MAPS = 6
 """Maps of each size, but one of all references."""
 
-ASKED = 20
+MOST_QUERIES = 20
 """The largest number of queries of either kind on a map; they are drawn at random."""
 
 CANDIDATES = 10
@@ -66,13 +66,13 @@ def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[S
         calibration=system.encoder.calibration.model_dump(),
         candidates=CANDIDATES,
         truth=arrays_digest(subject.pair.truth),
-        kept=subject.pair.kept.tolist(),
+        retained=subject.pair.retained.tolist(),
     )
     entry = cache.load(key)
     if entry is not None:
         return [SizePoint(**point) for point in entry.values["points"]]
     maps = _Maps(subject, system.encoder)
-    references = len(subject.pair.kept)
+    references = len(subject.pair.retained)
     sizes = [size for size in SIZES if size < references] + [references]
     points = [point for size in sizes if (point := maps.point(size, np.random.default_rng((seed, size)))) is not None]
     cache.store(key, CacheEntry({"points": [asdict(point) for point in points]}))
@@ -83,7 +83,7 @@ class _Maps:
     """Maps of the references of one subject, and the queries against them."""
 
     def __init__(self, subject: Subject, encoder: Encoder) -> None:
-        self.encoder, self.name, self.kept = encoder, subject.about.name, subject.pair.kept
+        self.encoder, self.name, self.retained = encoder, subject.about.name, subject.pair.retained
         self.truth = [np.asarray(true, np.int64) for true in subject.pair.truth]
         references, queries = subject.references.descriptions, subject.queries.descriptions
         self.products = stack(queries) @ stack(references).T
@@ -98,10 +98,12 @@ class _Maps:
         """The figures of maps of one size; None if no query has its place in one."""
         knowns: list[bool] = []
         outcomes: list[list[tuple[bool, bool, float]]] = []
-        for start in generator.integers(0, len(self.kept) - size + 1, MAPS if size < len(self.kept) else 1).tolist():
+        for start in generator.integers(
+            0, len(self.retained) - size + 1, MAPS if size < len(self.retained) else 1
+        ).tolist():
             part = np.arange(start, start + size)
             for queries, there in self._queries(part):
-                for query in generator.permutation(queries)[:ASKED].tolist():
+                for query in generator.permutation(queries)[:MOST_QUERIES].tolist():
                     knowns.append(there)
                     outcomes.append(
                         [
@@ -123,7 +125,7 @@ class _Maps:
 
     def _queries(self, part: Positions) -> Iterator[tuple[Positions, bool]]:
         """The queries whose place is among the references, and the strangers; int64 each."""
-        held = self.kept[part]
+        held = self.retained[part]
         around = np.arange(held.min() - APART, held.max() + APART + 1)
         yield np.flatnonzero([bool(np.isin(true, held).any()) for true in self.truth]), True
         yield np.flatnonzero([bool(len(true)) and not np.isin(true, around).any() for true in self.truth]), False
@@ -137,13 +139,13 @@ class _Maps:
         scores = np.asarray(encoder.scores_from_inner_products(self.products[query, part]), np.float32)
         order = np.argsort(-scores, kind="stable")
         rows = part[order]
-        places = Whereabouts.along_sequence(self.kept[rows])
+        places = Whereabouts.along_sequence(self.retained[rows])
 
         stage = second_stage(encoder, self.queried[query], lambda at: self.local[rows[at]])
         seen = examine(scores[order], places, self.neighborhood, *stage)
         ranked, places = rows[seen.order], places.take(seen.order)
         judged = judge(seen.scores, places, encoder.calibration, self.neighborhood, seen.examined)
-        found = [(judged, int(self.kept[ranked[0]]))]
+        found = [(judged, int(self.retained[ranked[0]]))]
         if self.pairs is not None:
             evidence, share = self.pairs.verified(query, ranked[:CANDIDATES])
             behind = np.full(len(ranked) - len(share), np.nan)
@@ -157,18 +159,18 @@ class _Maps:
                 seen.examined[best],
                 geometry=geometry.take(best),
             )
-            found.append((judged, int(self.kept[ranked[best[0]]])))
+            found.append((judged, int(self.retained[ranked[best[0]]])))
         return found
 
 
 def _pairs(subject: Subject) -> Pairs:
-    """The keypoints of the queries and of the kept references."""
+    """The keypoints of the queries and of the retained references."""
     network = load_xfeat()
 
     def keypoints(paths: Sequence[Path]) -> list[Keypoints]:
         return [find_keypoints(network, subject.frame(path)) for path in paths]
 
-    return Pairs(keypoints(subject.pair.queries), keypoints(subject.pair.kept_references))
+    return Pairs(keypoints(subject.pair.queries), keypoints(subject.pair.retained_references))
 
 
 def _figures(

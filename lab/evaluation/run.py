@@ -91,7 +91,7 @@ def compare_systems(
         name=pair.name,
         references=pair.references,
         queries=pair.queries,
-        kept=pair.kept,
+        retained=pair.retained,
         truth=pair.truth,
         runs=ranked,
         regions=None if seeing is None else lambda path: seeing.region_boxes(load(path)),
@@ -112,18 +112,18 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> SystemRun:
     if measured is None:
         measured = measure(subject)
         cache.store(key, _entry(measured))
-    outcomes = judge(measured.scores, subject.pair.kept, subject.pair.truth, subject.pair.excluded)
+    outcomes = judge(measured.scores, subject.pair.retained, subject.pair.truth, subject.pair.excluded)
     evaluation = summarize(
         measured.identity,
         outcomes,
-        len(subject.pair.kept),
+        len(subject.pair.retained),
         measured.milliseconds,
         describe_milliseconds=measured.describe_milliseconds,
         bytes_per_place=measured.bytes_per_place,
         trained_on=subject.trained_on,
     )
-    matched = matched_scores(measured.scores, subject.pair.kept, subject.pair.excluded)
-    trusted = trust_figures(matched, subject.pair.kept, outcomes, evaluation.notes)
+    matched = matched_scores(measured.scores, subject.pair.retained, subject.pair.excluded)
+    trusted = trust_figures(matched, subject.pair.retained, outcomes, evaluation.notes)
     evaluation = evaluation.model_copy(update=trusted)
     return SystemRun(
         about=subject.about,
@@ -156,7 +156,7 @@ class SystemMeasurement:
 
 
 def measure(subject: Subject) -> SystemMeasurement:
-    """Describe the kept references, describe the queries, score each query against all references.
+    """Describe the retained references, describe the queries, score each query against all references.
 
     Raises:
         InvalidModel: the system gives no finite scores, or cannot learn from the training images.
@@ -216,5 +216,5 @@ def _loaded(entry: CacheEntry | None, subject: Subject) -> SystemMeasurement | N
         measured = SystemMeasurement(scores=np.asarray(entry.arrays["scores"], np.float32), **entry.values)
     except (KeyError, TypeError):
         return None
-    expected = (len(subject.pair.queries), len(subject.pair.kept))
+    expected = (len(subject.pair.queries), len(subject.pair.retained))
     return measured if measured.scores.shape == expected else None

@@ -29,11 +29,11 @@ def scale_sizes(references: int, points: int = POINTS) -> list[int]:
 def scalability(subject: Subject, cache: EvaluationCache) -> list[ScalePoint]:
     """The system on the first few places of the traverses, on more, on all.
 
-    A point has the first kept references, and the queries with a true one among them: both
+    A point has the first retained references, and the queries with a true one among them: both
     traverses grow together, and no query becomes a new place because its reference is not reached.
     """
-    sizes = scale_sizes(len(subject.pair.kept))
-    key = subject.key("scalability", sizes=sizes, kept=subject.pair.kept.tolist(), **subject.judged_by)
+    sizes = scale_sizes(len(subject.pair.retained))
+    key = subject.key("scalability", sizes=sizes, retained=subject.pair.retained.tolist(), **subject.judged_by)
     entry = cache.load(key)
     if entry is not None:
         return [ScalePoint(**point) for point in entry.values["points"]]
@@ -44,23 +44,23 @@ def scalability(subject: Subject, cache: EvaluationCache) -> list[ScalePoint]:
 
 def scale_steps(subject: Subject) -> int:
     """How many queries are scored for the points."""
-    return sum(len(_answerable(subject.pair, size)) for size in scale_sizes(len(subject.pair.kept)))
+    return sum(len(_answerable(subject.pair, size)) for size in scale_sizes(len(subject.pair.retained)))
 
 
 def _answerable(pair: TraversePair, size: int) -> list[int]:
-    """The queries with a true reference among the first ``size`` that are kept."""
-    kept = pair.kept[:size]
-    return [number for number, true in enumerate(pair.truth) if np.isin(true, kept).any()]
+    """The queries with a true reference among the first ``size`` that are retained."""
+    retained = pair.retained[:size]
+    return [number for number, true in enumerate(pair.truth) if np.isin(true, retained).any()]
 
 
 def _point(subject: Subject, size: int) -> ScalePoint:
-    """The point of the first ``size`` kept references."""
-    kept, answerable = subject.pair.kept[:size], _answerable(subject.pair, size)
+    """The point of the first ``size`` retained references."""
+    retained, answerable = subject.pair.retained[:size], _answerable(subject.pair, size)
     index = subject.system.index(subject.references.descriptions[:size])
     scored = subject.score(index, [subject.queries.descriptions[number] for number in answerable])
     truth, excluded = subject.pair.truth, subject.pair.excluded
     left_out = None if excluded is None else [excluded[number] for number in answerable]
-    outcomes = judge(scored.scores, kept, [truth[number] for number in answerable], left_out)
+    outcomes = judge(scored.scores, retained, [truth[number] for number in answerable], left_out)
     return ScalePoint(
         system=subject.about.name,
         references=size,

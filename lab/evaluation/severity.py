@@ -28,7 +28,7 @@ def severity(
             disturbance=disturbance.name,
             levels=disturbance.levels,
             seed=seed,
-            kept=subject.pair.kept.tolist(),
+            retained=subject.pair.retained.tolist(),
             **subject.judged_by,
         )
         curve = _loaded(cache.load(key), disturbance, subject)
@@ -69,7 +69,7 @@ def _disturbed(subject: Subject, disturbance: Disturbance, level: float, seed: i
 def _point(subject: Subject, index: ReferenceIndex, queries: Described) -> tuple[float, float]:
     """recall@1 (0 where no query has a true reference) and AUC-PR."""
     scores = subject.score(index, queries.descriptions).scores
-    outcomes = judge(scores, subject.pair.kept, subject.pair.truth, subject.pair.excluded)
+    outcomes = judge(scores, subject.pair.retained, subject.pair.truth, subject.pair.excluded)
     area = auc_pr(best_scores(outcomes), best_matched(outcomes))
     return recall_at_k(outcomes, 1) or 0.0, area
 

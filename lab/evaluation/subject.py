@@ -93,7 +93,7 @@ class Subject:
     def steps(self) -> int:
         """How often ``advance`` is called in a measurement: images learned from or described, and queries scored."""
         learned = len(self.training.images) if self._learns else 0
-        return learned + len(self.pair.kept) + 2 * len(self.pair.queries)
+        return learned + len(self.pair.retained) + 2 * len(self.pair.queries)
 
     def key(self, kind: str, **parts: object) -> str:
         """The cache key of a measurement of this subject.
@@ -108,7 +108,7 @@ class Subject:
             system=self._untrained_identity,
             configuration=dict(self.system.about.configuration),
             training=training,
-            references=files_digest(self.pair.kept_references),
+            references=files_digest(self.pair.retained_references),
             queries=files_digest(self.pair.queries),
             **parts,
         )
@@ -121,8 +121,8 @@ class Subject:
 
     @cached_property
     def references(self) -> Described:
-        """The descriptions of the kept references."""
-        return self.describe(self.pair.kept_references)
+        """The descriptions of the retained references."""
+        return self.describe(self.pair.retained_references)
 
     @cached_property
     def queries(self) -> Described:

@@ -56,9 +56,9 @@ def half_trials(encoder: Encoder, queries: Encodings, references: Encodings, tru
             seen = examine(scores[number, order], places, NEIGHBORHOOD, *stage)
             judgement = judge(seen.scores, places.take(seen.order), encoder.calibration, NEIGHBORHOOD, seen.examined)
             best = order[seen.order[0]]
-            for truth, kept in zip(truths, found, strict=True):
-                kept.append(Trial(judgement, bool(truth[number, half].any()), bool(truth[number, best]), number))
-    return [gathered(kept) for kept in found]
+            for truth, retained in zip(truths, found, strict=True):
+                retained.append(Trial(judgement, bool(truth[number, half].any()), bool(truth[number, best]), number))
+    return [gathered(retained) for retained in found]
 
 
 def figures(held: Held) -> dict[str, Any]:

@@ -75,11 +75,11 @@ def _batches(loader: DataLoader[Any], device: torch.device) -> Iterator[tuple[Te
 
 @torch.no_grad()
 def _update_average(average: Student, student: Student, decay: float) -> None:
-    for kept, new in zip(average.state_dict().values(), student.state_dict().values(), strict=True):
-        if kept.dtype.is_floating_point:
-            kept.lerp_(new, 1 - decay)
+    for retained, new in zip(average.state_dict().values(), student.state_dict().values(), strict=True):
+        if retained.dtype.is_floating_point:
+            retained.lerp_(new, 1 - decay)
         else:
-            kept.copy_(new)
+            retained.copy_(new)
 
 
 def distill(

@@ -67,7 +67,7 @@ NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
 STRETCHES = ((300, 700), (2200, 2600))
 """Frames of nordland_tiny that are two environments."""
 
-MOST_ASKED = 60
+MOST_QUERIES = 60
 """The largest number of frames of either kind that query a map."""
 
 
@@ -79,7 +79,7 @@ SUPPORT = 0.5
 right there, and the two stages would have 0.13.  Hallways at 160 x 120 pixels would give them 0.4, nordland_tiny 0.9.
 With 0.25 to 0.75 the verdicts on corridor and lip6 stay within their bars."""
 
-STANDING = 1000
+STATIONARY_EVIDENCE = 1000
 """Two frames of camvid with more evidence than this were taken by a car that stood still, and count as one."""
 
 
@@ -117,24 +117,24 @@ class ScoredTraverse:
     promised: Array = field(default_factory=_nothing)
     screened: int = 0
 
-    def strangers(self, kept: Positions) -> Positions:
-        """The queries whose true references are all more than APART frames from the references ``kept``, int64."""
+    def strangers(self, retained: Positions) -> Positions:
+        """The queries whose true references are all more than APART frames from the references ``retained``, int64."""
         near = np.zeros(self.truth.shape[1], np.bool_)
-        for place in kept.tolist():
+        for place in retained.tolist():
             near[max(0, place - APART) : place + APART + 1] = True
         return np.flatnonzero(~self.truth[:, near].any(axis=1) & self.truth.any(axis=1))
 
     def judged(
-        self, query: int, kept: Positions, calibration: Calibration, sequence: Positions, verify: Verify = "never"
+        self, query: int, retained: Positions, calibration: Calibration, sequence: Positions, verify: Verify = "never"
     ) -> Judged:
-        """The judgement of a query against a map of the references ``kept``, int64 [n].
+        """The judgement of a query against a map of the references ``retained``, int64 [n].
 
         Args:
             sequence: int64 [n], the code of each place's sequence; -1: it has none.
             verify: ``auto`` verifies the best candidate where two stages leave doubt, and the others where that does.
         """
-        order = np.argsort(-self.first[query, kept], kind="stable")
-        rows = kept[order]
+        order = np.argsort(-self.first[query, retained], kind="stable")
+        rows = retained[order]
         count = len(rows)
         places = Whereabouts(
             np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), sequence[order].astype(np.int32), rows
@@ -228,13 +228,13 @@ def trials_of_size(
     trials: list[Trial] = []
     judgements: list[Judged] = []
     for _ in range(repeats):
-        kept = cut(traverse, size, how, generator)
+        retained = cut(traverse, size, how, generator)
         sequence = np.zeros(size, np.int64)
-        known = np.flatnonzero(traverse.truth[:, kept].any(axis=1))
-        for queried, there in ((known, True), (traverse.strangers(kept), False)):
-            chosen = generator.choice(queried, MOST_ASKED, replace=False) if len(queried) > MOST_ASKED else queried
+        known = np.flatnonzero(traverse.truth[:, retained].any(axis=1))
+        for queried, there in ((known, True), (traverse.strangers(retained), False)):
+            chosen = generator.choice(queried, MOST_QUERIES, replace=False) if len(queried) > MOST_QUERIES else queried
             for query in chosen.tolist():
-                found = traverse.judged(query, kept, calibration, sequence, verify)
+                found = traverse.judged(query, retained, calibration, sequence, verify)
                 right = there and bool(traverse.truth[query, found.best])
                 trials.append(Trial(found.judgement, there, right, len(trials)))
                 judgements.append(found)
@@ -248,10 +248,10 @@ def trials_of_halves(
     middle, end = traverse.truth.shape[1] // 2, traverse.truth.shape[1]
     trials: list[Trial] = []
     judgements: list[Judged] = []
-    for kept in (np.arange(middle), np.arange(middle, end)):
+    for retained in (np.arange(middle), np.arange(middle, end)):
         for query, true in enumerate(traverse.truth):
-            found = traverse.judged(query, kept, calibration, np.zeros(len(kept), np.int64), verify)
-            trials.append(Trial(found.judgement, bool(true[kept].any()), bool(true[found.best]), query))
+            found = traverse.judged(query, retained, calibration, np.zeros(len(retained), np.int64), verify)
+            trials.append(Trial(found.judgement, bool(true[retained].any()), bool(true[found.best]), query))
             judgements.append(found)
     return gathered(trials), judgements
 
@@ -281,11 +281,13 @@ def _drive(encoder: Encoder, frames: Sequence[Pixels], keypoints: Sequence[Keypo
     """
     described = describe(encoder, frames)
     queried = np.flatnonzero(np.arange(len(frames)) % 3)
-    kept = np.arange(0, len(frames), 3)
+    retained = np.arange(0, len(frames), 3)
     pairs = None
     if keypoints is not None:
-        pairs = Pairs([keypoints[one] for one in queried.tolist()], [keypoints[one] for one in kept.tolist()])
-    return scored(encoder, described.at(queried), described.at(kept), np.abs(queried[:, None] - kept) <= 2, pairs)
+        pairs = Pairs([keypoints[one] for one in queried.tolist()], [keypoints[one] for one in retained.tolist()])
+    return scored(
+        encoder, described.at(queried), described.at(retained), np.abs(queried[:, None] - retained) <= 2, pairs
+    )
 
 
 def verifiable_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, ScoredTraverse]]:
@@ -299,7 +301,7 @@ def verifiable_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str
         moving = [0]
         for number in range(1, len(frames)):
             (found,) = verification.verify(keypoints[number], [keypoints[moving[-1]]])
-            if found.evidence <= STANDING:
+            if found.evidence <= STATIONARY_EVIDENCE:
                 moving.append(number)
         yield f"camvid {name}", _drive(encoder, [frames[at] for at in moving], [keypoints[at] for at in moving])
 

@@ -107,10 +107,10 @@ def with_second_stage(
     Raises:
         WrongVocabulary: the definition changes the first stage, too.
     """
-    kept = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
+    retained = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
     plain = _untaught(definition)
-    extractor = FeatureExtractor(network_of(weights, plain.outputs), plain, kept.extractor.projections)
-    vocabulary = Vocabulary(kept.centers, kept.extractor.origin)
+    extractor = FeatureExtractor(network_of(weights, plain.outputs), plain, retained.extractor.projections)
+    vocabulary = Vocabulary(retained.centers, retained.extractor.origin)
     encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
     return taught(encoder, definition, photographs, seed), vocabulary
 

@@ -50,13 +50,13 @@ def split_photographs(folder: Path) -> PhotographSplit:
     The rule depends on names alone, so every machine and every later stage sees the same split.
     """
     cameras = sorted({path.parent.name for path in folder.glob(f"{DAY_NIGHT}/*/*")})
-    kept_out = set(cameras[::3])
+    held_out_cameras = set(cameras[::3])
     train: list[Path] = []
     held_out: list[Path] = []
     for path in find_photographs(folder):
         relative = path.relative_to(folder)
         if relative.parts[0] == DAY_NIGHT:
-            out = relative.parts[1] in kept_out
+            out = relative.parts[1] in held_out_cameras
         else:
             digest = hashlib.sha256(relative.as_posix().encode()).digest()
             out = digest[0] * 256 + digest[1] < 65536 // 50

@@ -98,8 +98,8 @@ def fit_projections(
             clean[layer].append(unit_length(cells[0, chosen]))
             augmented[layer].append(unit_length(cells[1, chosen]))
     return {
-        layer: fit_projection(np.concatenate(clean[layer]), np.concatenate(augmented[layer]), kept)
-        for layer, kept in values.items()
+        layer: fit_projection(np.concatenate(clean[layer]), np.concatenate(augmented[layer]), retained)
+        for layer, retained in values.items()
     }
 
 

@@ -25,7 +25,7 @@ LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
 """A repeated refusal is logged once in this time, with the number of repetitions."""
 
-KEPT_LINES = 1000
+RECENT_LINES = 1000
 """Lines that are held in memory while there is no file."""
 
 MOST_REFUSALS = 1024
@@ -126,7 +126,7 @@ class LatestLines(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._lines: deque[str] = deque(maxlen=KEPT_LINES)
+        self._lines: deque[str] = deque(maxlen=RECENT_LINES)
         self._written = 0
         self.setFormatter(JsonLines())
 

@@ -32,7 +32,7 @@ from service.commands.options.recordings import (
     Topic,
     TrajectoryFile,
     TrajectoryTimes,
-    without_standing,
+    without_stops,
 )
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def enrol(
 
         def choose(used: str | None, mask: Mask | None) -> list[FrameToSend]:
             chosen = options.choose(opened, used, mask)
-            chosen = chosen if keep_standing else without_standing(opened, chosen, mask)
+            chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             return [FrameToSend(taken, name, camera) for taken in chosen]
 
         report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))

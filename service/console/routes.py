@@ -37,14 +37,14 @@ HEADERS = {
     "Vary": "Accept-Encoding",
 }
 
-ALWAYS_ASKED = "no-cache"
-KEPT_FOR_GOOD = "public, max-age=31536000, immutable"
+REVALIDATED = "no-cache"
+IMMUTABLE = "public, max-age=31536000, immutable"
 
 
 @router.get("/console")
 async def read_console(request: Request) -> Response:
     """Read the page of the console."""
-    return _answer(request, console_files().page, ALWAYS_ASKED)
+    return _answer(request, console_files().page, REVALIDATED)
 
 
 @router.get("/console/")
@@ -60,7 +60,7 @@ async def read_console_file(build: str, file: str, request: Request) -> Response
     found = files.others.get(file) if build == files.build else None
     if found is None:
         raise HTTPException(404)
-    return _answer(request, found, KEPT_FOR_GOOD)
+    return _answer(request, found, IMMUTABLE)
 
 
 def _answer(request: Request, file: ConsoleFile, caching: str) -> Response:

@@ -42,7 +42,7 @@ class Event(BaseModel):
         return cls(at=datetime.now(UTC), map=map_id, request_id=asker.request_id, key=key, **fields)
 
 
-NOBODY_ASKED = Asker("")
+NO_ASKER = Asker("")
 """For what happens by itself, such as the end of a session that nobody used."""
 
 

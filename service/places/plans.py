@@ -20,7 +20,7 @@ MOST_PLACES = 200_000
 MOST_BYTES = 64 * 1024 * 1024
 """Bytes of all cached plans together, compressed."""
 
-MOST_KEPT = 64
+MOST_CACHED = 64
 """Number of cached plans: small ones, such as those of many steps, weigh more than their bytes."""
 
 FAST = 1
@@ -97,7 +97,7 @@ class Plans:
             before = self._cached.pop(key, None)
             self._bytes += len(plan.compressed) - (0 if before is None else len(before.compressed))
             self._cached[key] = plan
-            while self._bytes > MOST_BYTES or len(self._cached) > MOST_KEPT:
+            while self._bytes > MOST_BYTES or len(self._cached) > MOST_CACHED:
                 _, oldest = self._cached.popitem(last=False)
                 self._bytes -= len(oldest.compressed)
 

@@ -312,7 +312,7 @@ class QueryStatistics:
         found = self._last_hours(key)
         return {one: sum(hours.values(), VerdictCounts()) for one, hours in found.items()}
 
-    def _kept_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
+    def _stored_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
         """The stored counts from an hour on: id and creation time of the map, hour, and count of each verdict.
 
         Args:
@@ -332,7 +332,7 @@ class QueryStatistics:
         oldest = hour_of(datetime.now(UTC) - timedelta(hours=HOURS - 1))
         found: dict[MapKey, dict[int, VerdictCounts]] = {}
         with self._file:  # so that no counts are on their way from memory to the file
-            for map_id, made, hour, *counts in self._kept_hours(oldest, key):
+            for map_id, made, hour, *counts in self._stored_hours(oldest, key):
                 known = dict(zip(("recognized", "ambiguous", "unknown"), counts, strict=True))
                 found.setdefault((map_id, made), {})[hour] = VerdictCounts(**known)
             with self._lock:

@@ -27,7 +27,7 @@ from core.recognition.stages import neighborhood_of
 from service.access.audit import ASKER
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
-from service.events.schemas import NOBODY_ASKED, SessionEvent
+from service.events.schemas import NO_ASKER, SessionEvent
 from service.sessions.schemas import NewSession
 from service.sessions.store import SessionRecords, SessionStore, StoredSession
 from service.settings import Settings
@@ -324,7 +324,7 @@ class Sessions:
         """Tell the listeners of a session's map, if it has any; a session that ends by itself was ended by nobody."""
         if not self._events.heard(session.map_id):
             return
-        by = NOBODY_ASKED if reason in (EXPIRED, MAP_GONE, STATE_LOST) else None
+        by = NO_ASKER if reason in (EXPIRED, MAP_GONE, STATE_LOST) else None
         camera = session.options.camera
         event = SessionEvent.now(
             session.map_id, by, session=session.id, change=change, reason=reason, camera=camera, frame=session.number

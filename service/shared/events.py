@@ -30,7 +30,7 @@ AT_ONCE = 500
 LOOK_BACK = 1000
 """Events may become visible in another order than that of their numbers, if they are written at the same time."""
 
-KEPT_SECONDS = 30
+RETENTION_SECONDS = 30
 
 log = logging.getLogger("placerec.shared")
 
@@ -131,7 +131,7 @@ class SharedEvents(Events):
         self._something.set()  # feeds that nobody listens to any more go away by themselves
         self._look(None)
         query = "DELETE FROM service.events WHERE at < clock_timestamp() - make_interval(secs => %s)"
-        self._database.execute("forget events", query, (KEPT_SECONDS,))
+        self._database.execute("forget events", query, (RETENTION_SECONDS,))
 
     def _look(self, _said: str | None) -> None:
         query = (

@@ -160,7 +160,7 @@ class SharedStatistics(QueryStatistics):
         found = self._read(query, *key)
         return (datetime.fromisoformat(found[0][0]), found[0][1], found[0][2]) if found else None
 
-    def _kept_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
+    def _stored_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
         query = (
             "SELECT m.id, m.made, h.hour, h.recognized, h.ambiguous, h.unknown FROM service.hour_counts h"
             " JOIN service.counted_maps m ON m.code = h.map WHERE h.hour >= %s"

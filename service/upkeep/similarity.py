@@ -80,7 +80,7 @@ class Matrices:
 
     def __init__(self) -> None:
         self.turn = CapacityLimiter(1)
-        self._kept: OrderedDict[tuple[str, str], Matrix] = OrderedDict()
+        self._cached: OrderedDict[tuple[str, str], Matrix] = OrderedDict()
 
     def of(self, map_: Map, traverses: TraversesToAlign, encoder: Encoder, queries: Rows, references: Rows) -> Matrix:
         """The matrix of two traverses; call it in the turn.
@@ -90,12 +90,12 @@ class Matrices:
         """
         rows = hashlib.sha256(queries.tobytes() + b"/" + references.tobytes()).hexdigest()
         key = (f"{map_.record.id} {creation_time(map_)}", rows)
-        found = self._kept.pop(key, None)
+        found = self._cached.pop(key, None)
         if found is None:
             found = Matrix(score_pairs(traverses.snapshot, encoder, queries, references))
-        self._kept[key] = found
-        while len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
+        self._cached[key] = found
+        while len(self._cached) > KEPT:
+            self._cached.popitem(last=False)
         return found
 
 

@@ -12,14 +12,14 @@ from typing import Any
 from placerec_client import Odometry
 from placerec_ros.planar import Planar, wrapped, yaw_of
 
-KEPT_SECONDS = 10.0
+HISTORY_SECONDS = 10.0
 LARGEST_GAP = 0.5
 """Seconds between two messages of odometry across which a pose is interpolated."""
 LATEST = 0.1
 """Seconds by which the last message may be older than a frame: odometry may come a little later than the frame."""
 CLOCK_JUMP = 1.0
 """Seconds by which a stamp may be older than the last one before the clock counts as set back."""
-MOST_KEPT = 10_000
+MOST_POSES = 10_000
 FASTEST = 100.0
 """Metres a second. No robot is faster, whatever is known of it."""
 GAINED = 2.0
@@ -101,9 +101,9 @@ class Odometer:
                 self._poses.append(reading)
             else:
                 insort(self._poses, reading, key=_stamp)
-            oldest = self._poses[-1].stamp - int(KEPT_SECONDS * NANOSECONDS)
-            if self._poses[0].stamp < oldest - NANOSECONDS or len(self._poses) > MOST_KEPT:
-                first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_KEPT)
+            oldest = self._poses[-1].stamp - int(HISTORY_SECONDS * NANOSECONDS)
+            if self._poses[0].stamp < oldest - NANOSECONDS or len(self._poses) > MOST_POSES:
+                first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_POSES)
                 del self._poses[:first]
 
     def clear(self) -> None:

@@ -37,9 +37,9 @@ class MilvusCounterparts:
 
     def copy(self, other: MilvusCounterparts, names: Mapping[str, str]) -> None:
         with other._reading() as connection:
-            there = ledger.standings(connection, other._map)
+            there = ledger.place_stations(connection, other._map)
         with self._writing() as write:
-            here = ledger.standings(write.connection, self._map)
+            here = ledger.place_stations(write.connection, self._map)
             changes = brought_over(there, here, names, lambda: ledger.new_code(write.connection, self._map))
             for place_id, track, station, pose_of in changes:
                 stored = write.expect(place_id)

@@ -64,7 +64,7 @@ class Exporter:
             StorageFull, StorageFailure.
         """
         # Deleting the map waits for its readers, so this ends as soon as the map is closed.
-        with self._guarded("export"), self._reading() as connection, self._files_kept():
+        with self._guarded("export"), self._reading() as connection, self._files_retained():
             connection.execute("BEGIN")
             try:
                 record, layout = read_layout(connection)
@@ -78,7 +78,7 @@ class Exporter:
                 if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
                     connection.execute("ROLLBACK")
 
-    def _files_kept(self) -> AbstractContextManager[None]:
+    def _files_retained(self) -> AbstractContextManager[None]:
         """No segment file is deleted during the block."""
         opened = self._opened()
         return nullcontext() if opened is None else opened.removed_segments.retained()

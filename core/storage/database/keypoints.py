@@ -57,7 +57,7 @@ def at_rows(connection: sqlite3.Connection, rows: Sequence[int]) -> dict[int, Ke
     return found
 
 
-def are_kept(connection: sqlite3.Connection, number: int) -> bool:
+def are_stored(connection: sqlite3.Connection, number: int) -> bool:
     """Whether a place has keypoints that are not damaged."""
     query = f"SELECT 1 FROM keypoints k JOIN places p ON p.number = k.place WHERE k.place = ? AND {_IS_SOUND}"
     return connection.execute(query, (number,)).fetchone() is not None

@@ -55,7 +55,7 @@ _HEADER = struct.Struct("<8sI8sIIQH")
 _LOCAL_SHAPE = struct.Struct("<II")
 _MAGIC = b"PLRCSEG\x00"
 _VERSION = 3
-_KEPT: dict[Precision, bytes] = {"half": b"<f2", "compressed": b"6 bits"}
+_CODES: dict[Precision, bytes] = {"half": b"<f2", "compressed": b"6 bits"}
 _IDENTITY_BYTES = 1024
 _CHUNK_BYTES = 8 << 20
 
@@ -88,7 +88,7 @@ class Layout:
         identity = self.identity.encode()
         first_row = number * self.rows_per_segment
         fixed = _HEADER.pack(
-            _MAGIC, _VERSION, _KEPT[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
+            _MAGIC, _VERSION, _CODES[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
         )
         content = (fixed + _LOCAL_SHAPE.pack(*self.local_shape) + identity).ljust(HEADER_BYTES - 4, b"\x00")
         return content + struct.pack("<I", zlib.crc32(content))

@@ -85,7 +85,7 @@ def evaluate(options: EvaluateOptions) -> None:
     NAME.two-stages judge fewer.
 
     Images of a directory (not of its subfolders) are taken in natural order; one
-    that cannot be decoded stops the run. A query without a kept true reference is
+    that cannot be decoded stops the run. A query without a retained true reference is
     a true negative. Results are cached: a second run measures only what is new and
     repeats the times of the first. Of bags and videos, indices are those of the
     frames that are taken: in the order of their times, keyframes only where the
@@ -117,11 +117,11 @@ def _compare(options: EvaluateOptions) -> None:
         elsewhere = [] if traverses.others is None else read_others(traverses.others, pair)
         lessons = choose_training(systems_options.training, pair, traverses.seed)
         systems = systems_options.build()
-        kept = output.open_cache()
+        cache = output.open_cache()
         with progress() as bar:
             extras = output.extras(traverses.seed)
-            comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras, elsewhere)
-        _show(comparison, kept)
+            comparison = compare_systems(systems, pair, lessons, load_image, cache, _Bar(bar), extras, elsewhere)
+        _show(comparison, cache)
         by_name = {run.about.name: run for run in comparison.runs if not run.elsewhere}
         output.write(comparison, [by_name[system.about.name] for system in systems], elsewhere)
 

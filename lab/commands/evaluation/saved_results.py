@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from core.errors import InvalidGroundTruth
-from core.frames.traverses import read_kept_references
+from core.frames.traverses import read_retained_references
 from lab.commands.evaluation.output import remark_notes, show_figures, show_thresholds, write_json, write_results
 from lab.commands.evaluation.truth import TruthOptions
 from lab.evaluation import Evaluation, Outcome, judge, summarize
@@ -49,7 +49,7 @@ class SavedOptions:
         """Check that no option is given that needs images or systems.
 
         Args:
-            limit: lists the kept references.
+            limit: lists the retained references.
             output: where rows would be written.
             others: the options that need images or systems, by name, with their values.
 
@@ -77,7 +77,7 @@ class SavedOptions:
         """Write the table and the files that the options name.
 
         Args:
-            limit: lists the kept references of matrices.
+            limit: lists the retained references of matrices.
             json_file: where figures are written.
             output: where rows are written.
         """
@@ -99,15 +99,17 @@ class SavedOptions:
 
         scores = read_similarity(path, self.transposed)
         queries, references = scores.shape
-        kept = np.arange(references, dtype=np.int64) if limit is None else read_kept_references(limit, references)
+        retained = (
+            np.arange(references, dtype=np.int64) if limit is None else read_retained_references(limit, references)
+        )
         try:
             true = truth.of_counts(queries, references)
         except InvalidGroundTruth as error:
             raise Failure(
                 f"{error} {path.name} was read as {queries} queries by {references} references; --transposed turns it."
             ) from error
-        outcomes = judge(scores[:, kept], kept, true)
-        return summarize(path.name, outcomes, len(kept), {}), outcomes
+        outcomes = judge(scores[:, retained], retained, true)
+        return summarize(path.name, outcomes, len(retained), {}), outcomes
 
 
 def _show(figures: Sequence[Evaluation], title: str, json_file: Path | None) -> None:

@@ -54,7 +54,7 @@ class SystemOptions:
         Path | None,
         _option(
             metavar="DIR",
-            help="Images (subdirectories included) for systems that learn. Default: the kept references.",
+            help="Images (subdirectories included) for systems that learn. Default: the retained references.",
         ),
     ] = None
     models_dir: ModelsDir = None

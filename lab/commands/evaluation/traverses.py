@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from core.frames.traverses import find_images, find_images_below, read_kept_references
+from core.frames.traverses import find_images, find_images_below, read_retained_references
 from lab.commands.evaluation.systems import SYSTEMS
 from lab.commands.evaluation.truth import TruthOptions
 from service.commands.console import progress
@@ -158,12 +158,12 @@ class TraverseOptions:
             assert self.reference is not None and self.query is not None, "checked"
             references = _images(self.reference, recordings.of_reference, stack, encoder)
             queries = _images(self.query, recordings.of_query, stack, encoder)
-            true, kept = truth.of_images(queries, references), all_references(references)
-            pair = TraversePair(name_pair(self.reference, self.query), references, queries, true, kept)
+            true, retained = truth.of_images(queries, references), all_references(references)
+            pair = TraversePair(name_pair(self.reference, self.query), references, queries, true, retained)
         if self.limit_references is None:
             return pair
-        kept = read_kept_references(self.limit_references, len(pair.references))
-        return limit(pair, kept)
+        retained = read_retained_references(self.limit_references, len(pair.references))
+        return limit(pair, retained)
 
 
 def _images(path: Path, options: RecordingOptions, stack: ExitStack, encoder: str | None) -> list[Path]:
@@ -190,7 +190,7 @@ def name_pair(reference: Path, query: Path) -> str:
 
 
 def choose_training(directory: Path | None, pair: TraversePair, seed: int) -> Training:
-    """The images to learn from: those of a directory, or else the kept references.
+    """The images to learn from: those of a directory, or else the retained references.
 
     Raises:
         InvalidTraverse: the directory holds no image.
@@ -198,6 +198,6 @@ def choose_training(directory: Path | None, pair: TraversePair, seed: int) -> Tr
     from lab.evaluation.subject import Training
 
     if directory is None:
-        return Training(pair.kept_references, "the kept references", seed)
+        return Training(pair.retained_references, "the retained references", seed)
     images = find_images_below(directory)
     return Training(images, f"{len(images)} images of {directory.resolve().name}", seed)

@@ -29,7 +29,7 @@ def open_dataset(dataset: Dataset, folder: Path, reduced: bool = False, seed: in
 
     Args:
         folder: holds the folders of the traverses, or is any folder of a published tree above or around them.
-        reduced: leave references out until Table 2.2's R' are kept; ``seed`` draws which.
+        reduced: leave references out until Table 2.2's R' are retained; ``seed`` draws which.
 
     Raises:
         InvalidTraverse: a folder or an image is missing, or the traverses have another size than the reduced
@@ -45,17 +45,17 @@ def open_dataset(dataset: Dataset, folder: Path, reduced: bool = False, seed: in
     notes = [*_size_notes(dataset, base, queries, references), *found.notes]
     if excluded is not None:
         notes.append(f"A query is not matched against {dataset.excluded}.")
-    kept = all_references(references)
+    retained = all_references(references)
     if reduced:
         answerable, keep = _reduced_sizes(dataset, queries, references)
-        kept = leave_run_out(truth, len(references), keep, answerable, seed)
-        left = len(queries) - count_negatives(truth, kept)
+        retained = leave_run_out(truth, len(references), keep, answerable, seed)
+        left = len(queries) - count_negatives(truth, retained)
         notes.append(
-            f"{keep} of {len(references)} references are kept, and {left} queries keep a true one (Table 2.2: {keep} "
-            f"and {answerable}): one contiguous run is left out. The table gives counts only; which run is our choice, "
-            f"drawn with the seed {seed}."
+            f"{keep} of {len(references)} references are retained, and {left} queries have a true one (Table 2.2: "
+            f"{keep} and {answerable}): one contiguous run is left out. The table gives counts only; which run is our "
+            f"choice, drawn with the seed {seed}."
         )
-    return TraversePair(dataset.title, references, queries, truth, kept, notes, excluded, dataset.name)
+    return TraversePair(dataset.title, references, queries, truth, retained, notes, excluded, dataset.name)
 
 
 def _find(dataset: Dataset, folder: Path) -> tuple[DatasetLayout, Path]:

@@ -18,8 +18,8 @@ class TraversePair:
 
     name: of the data set.
     references, queries: the full traverses, in order.
-    truth: of each query, indices into ``references``, kept or not.
-    kept: int64 [R'], ascending, indices of the references to match against.
+    truth: of each query, indices into ``references``, retained or not.
+    retained: int64 [R'], ascending, indices of the references to match against.
     notes: sentences about the data that a reader of the figures must know.
     excluded: of each query, indices into ``references`` that it is not matched against; None where there are none.
     protocol: the name of the data set that ``placerec evaluate --list`` shows; empty for two folders.
@@ -29,19 +29,19 @@ class TraversePair:
     references: list[Path]
     queries: list[Path]
     truth: Truth
-    kept: NDArray[np.int64]
+    retained: NDArray[np.int64]
     notes: list[str] = field(default_factory=list)
     excluded: Truth | None = None
     protocol: str = ""
 
     @property
-    def kept_references(self) -> list[Path]:
+    def retained_references(self) -> list[Path]:
         """The images to match against."""
-        return [self.references[index] for index in self.kept]
+        return [self.references[index] for index in self.retained]
 
     def negatives(self) -> int:
-        """Queries without a kept true reference."""
-        return count_negatives(self.truth, self.kept)
+        """Queries without a retained true reference."""
+        return count_negatives(self.truth, self.retained)
 
 
 def all_references(references: list[Path]) -> NDArray[np.int64]:
@@ -49,24 +49,26 @@ def all_references(references: list[Path]) -> NDArray[np.int64]:
     return np.arange(len(references), dtype=np.int64)
 
 
-def limit(pair: TraversePair, kept: NDArray[np.int64]) -> TraversePair:
-    """The pair with other kept references.
+def limit(pair: TraversePair, retained: NDArray[np.int64]) -> TraversePair:
+    """The pair with other retained references.
 
     Args:
-        kept: int64 [R'], ascending.
+        retained: int64 [R'], ascending.
 
     Raises:
         InvalidTraverse: a query would be matched against none of them.
     """
     for query, left_out in enumerate(pair.excluded or []):
-        if np.isin(kept, left_out).all():
-            raise InvalidTraverse(f"query {query} is matched against none of the {len(kept)} references that are kept.")
-    return replace(pair, kept=kept)
+        if np.isin(retained, left_out).all():
+            raise InvalidTraverse(
+                f"query {query} is matched against none of the {len(retained)} references that are retained."
+            )
+    return replace(pair, retained=retained)
 
 
-def count_negatives(truth: Truth, kept: NDArray[np.int64]) -> int:
-    """Queries without a kept true reference."""
-    return sum(not np.isin(true, kept).any() for true in truth)
+def count_negatives(truth: Truth, retained: NDArray[np.int64]) -> int:
+    """Queries without a retained true reference."""
+    return sum(not np.isin(true, retained).any() for true in truth)
 
 
 def leave_run_out(truth: Truth, references: int, keep: int, answerable: int, seed: int) -> NDArray[np.int64]:
@@ -85,11 +87,11 @@ def leave_run_out(truth: Truth, references: int, keep: int, answerable: int, see
         int64 [R'], ascending.
 
     Raises:
-        InvalidGroundTruth: there are not more references than are to be kept.
+        InvalidGroundTruth: there are not more references than are to be retained.
     """
     if not 0 < keep < references:
         raise InvalidGroundTruth(
-            f"{keep} of {references} references cannot be kept: it must be fewer, and one at least."
+            f"{keep} of {references} references cannot be retained: it must be fewer, and one at least."
         )
     removed = references - keep
     starts = np.arange(keep + 1)

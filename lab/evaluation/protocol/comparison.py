@@ -26,9 +26,9 @@ class SystemRun:
 
     identity: of the system, ``<name>@<sha256>``.
     outcomes: one for each query, in their order.
-    scores: float32 [Q, R'], higher is more alike; column j belongs to reference ``kept[j]`` of the comparison.
-    bytes_per_place: mean over the kept references; None where the scores were computed elsewhere.
-    milliseconds: medians per query, by stage; ``match`` is one query against all kept references.  None
+    scores: float32 [Q, R'], higher is more alike; column j belongs to reference ``retained[j]`` of the comparison.
+    bytes_per_place: mean over the retained references; None where the scores were computed elsewhere.
+    milliseconds: medians per query, by stage; ``match`` is one query against all retained references.  None
         for a stage that the system lacks.
     cached: the figures, times included, are those of an earlier run.
     elsewhere: the scores were not computed here but read from a file.
@@ -106,8 +106,8 @@ class SystemComparison:
 
     name: of the data set.
     references, queries: the full traverses.
-    kept: int64 [R'], ascending, indices of the references that were matched against.
-    truth: of each query, indices into ``references``, kept or not.
+    retained: int64 [R'], ascending, indices of the references that were matched against.
+    truth: of each query, indices into ``references``, retained or not.
     runs: best AUC-PR first.
     regions: gives the regions of interest of an image, by the best run whose system has some; None without one.
     regions_of: identity of that run; only its matches are shown with regions.
@@ -118,7 +118,7 @@ class SystemComparison:
     name: str
     references: list[Path]
     queries: list[Path]
-    kept: NDArray[np.int64]
+    retained: NDArray[np.int64]
     truth: Truth
     runs: list[SystemRun]
     regions: Callable[[Path], Sequence[Box] | None] | None = None

@@ -31,8 +31,8 @@ OneClass = Literal["all right", "none right"]
 
 ALL_RIGHT = "every best match is right: the curve has one class only, and its area is 1 whatever the scores."
 NONE_RIGHT = "no best match is right: there is no precision-recall curve, and 0 stands for its area."
-NO_NEGATIVES = "every query has a kept true reference: true negatives come from leaving references out."
-NO_POSITIVES = "no query has a kept true reference."
+NO_NEGATIVES = "every query has a retained true reference: true negatives come from leaving references out."
+NO_POSITIVES = "no query has a retained true reference."
 
 
 class Evaluation(BaseModel):
@@ -53,8 +53,8 @@ class Evaluation(BaseModel):
     extended_precision: float | None
     right: int = Field(description="Queries whose best match is right.")
     queries: int
-    negatives: int | None = Field(description="Queries without a kept true reference.")
-    references: int | None = Field(description="Those that were kept.")
+    negatives: int | None = Field(description="Queries without a retained true reference.")
+    references: int | None = Field(description="Those that were retained.")
     thresholds: list[Thresholding]
     bytes_per_place: int | None = None
     milliseconds: dict[str, float | None] = Field(description="Medians per query.")
@@ -123,7 +123,7 @@ def summarize(
     bytes_per_place: int | None = None,
     trained_on: str | None = None,
 ) -> Evaluation:
-    """All figures of a run over ``references`` kept references; stages without a time are added as None."""
+    """All figures of a run over ``references`` retained references; stages without a time are added as None."""
     scores, matched, positive = best_scores(outcomes), best_matched(outcomes), has_true_reference(outcomes)
     return Evaluation(
         encoder=encoder,

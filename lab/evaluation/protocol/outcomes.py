@@ -29,13 +29,13 @@ class Outcome:
     rank: int | None
 
 
-def judge_ranking(scores: Scores, kept: NDArray[np.int64], true: NDArray[np.int64]) -> Outcome:
+def judge_ranking(scores: Scores, retained: NDArray[np.int64], true: NDArray[np.int64]) -> Outcome:
     """The outcome of one query; of equal scores the lower reference index comes first.
 
     Args:
-        scores: [R'], against each kept reference.
-        kept: int64 [R'], their indices, ascending.
-        true: int64, indices of the query's true references, kept or not.
+        scores: [R'], against each retained reference.
+        retained: int64 [R'], their indices, ascending.
+        true: int64, indices of the query's true references, retained or not.
 
     Raises:
         ValueError: there is no score, or one that is not finite.
@@ -43,21 +43,21 @@ def judge_ranking(scores: Scores, kept: NDArray[np.int64], true: NDArray[np.int6
     if len(scores) == 0 or not np.isfinite(scores).all():
         raise ValueError("a ranking needs at least one score, all of them finite")
     best = int(np.argmax(scores))
-    right = np.flatnonzero(np.isin(kept, true))
+    right = np.flatnonzero(np.isin(retained, true))
     rank = None
     if len(right):
         first = right[np.argmax(scores[right])]
-        ahead = (scores > scores[first]) | ((scores == scores[first]) & (kept < kept[first]))
+        ahead = (scores > scores[first]) | ((scores == scores[first]) & (retained < retained[first]))
         rank = 1 + int(np.count_nonzero(ahead))
-    return Outcome(int(kept[best]), float(scores[best]), rank == 1, rank)
+    return Outcome(int(retained[best]), float(scores[best]), rank == 1, rank)
 
 
-def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth, excluded: Truth | None = None) -> list[Outcome]:
+def judge(scores: Scores, retained: NDArray[np.int64], truth: Truth, excluded: Truth | None = None) -> list[Outcome]:
     """The outcomes of all queries.
 
     Args:
         scores: [Q, R'].
-        kept: int64 [R'], ascending.
+        retained: int64 [R'], ascending.
         truth: of each query.
         excluded: of each query, the references that it is not matched against.
 
@@ -65,27 +65,27 @@ def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth, excluded: Truth
         ValueError: a query is matched against no reference, or a score is not finite.
     """
     if excluded is None:
-        return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
+        return [judge_ranking(row, retained, true) for row, true in zip(scores, truth, strict=True)]
     outcomes = []
     for row, true, left_out in zip(scores, truth, excluded, strict=True):
-        matched = ~np.isin(kept, left_out)
-        outcomes.append(judge_ranking(row[matched], kept[matched], true))
+        matched = ~np.isin(retained, left_out)
+        outcomes.append(judge_ranking(row[matched], retained[matched], true))
     return outcomes
 
 
-def matched_scores(scores: Scores, kept: NDArray[np.int64], excluded: Truth | None) -> Scores:
+def matched_scores(scores: Scores, retained: NDArray[np.int64], excluded: Truth | None) -> Scores:
     """The scores with -inf for the references that a query is not matched against; the array itself without any.
 
     Args:
         scores: [Q, R'].
-        kept: int64 [R'].
+        retained: int64 [R'].
         excluded: of each query.
     """
     if excluded is None:
         return scores
     matched = scores.copy()
     for row, left_out in zip(matched, excluded, strict=True):
-        row[np.isin(kept, left_out)] = -np.inf
+        row[np.isin(retained, left_out)] = -np.inf
     return matched
 
 
@@ -100,10 +100,10 @@ def best_matched(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
 
 
 def has_true_reference(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
-    """Whether each query has a kept true reference, bool [Q]; the others are true negatives."""
+    """Whether each query has a retained true reference, bool [Q]; the others are true negatives."""
     return np.array([outcome.rank is not None for outcome in outcomes], np.bool_)
 
 
 def answerable(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The outcomes of queries with a kept true reference; the others are true negatives."""
+    """The outcomes of queries with a retained true reference; the others are true negatives."""
     return [outcome for outcome in outcomes if outcome.rank is not None]

@@ -18,8 +18,8 @@ class Counts(BaseModel):
 
     true_positives: int = Field(description="Accepted, and the match is right.")
     false_positives: int = Field(description="Accepted, and the match is wrong.")
-    false_negatives: int = Field(description="Rejected although a true reference is kept.")
-    true_negatives: int = Field(description="Rejected, and no true reference is kept.")
+    false_negatives: int = Field(description="Rejected although a true reference is retained.")
+    true_negatives: int = Field(description="Rejected, and no true reference is retained.")
 
 
 class Thresholding(BaseModel):

@@ -40,16 +40,18 @@ class Trust(BaseModel):
     believed_recall: Share = Field(description="Right and believed, of the queries with a true reference.")
 
 
-def decisions(scores: NDArray[np.floating[Any]], kept: NDArray[np.int64]) -> NDArray[np.float64]:
+def decisions(scores: NDArray[np.floating[Any]], retained: NDArray[np.int64]) -> NDArray[np.float64]:
     """The decision value of each query, float64 [Q].
 
     Args:
         scores: [Q, R'], higher is more alike.
-        kept: int64 [R'], indices of the references.
+        retained: int64 [R'], indices of the references.
     """
     best = scores.argmax(axis=1)
     top = scores.max(axis=1).astype(np.float64)
-    others = np.where(np.abs(kept[None, :] - kept[best][:, None]) > SAME_PLACE, scores, -np.inf).astype(np.float64)
+    others = np.where(np.abs(retained[None, :] - retained[best][:, None]) > SAME_PLACE, scores, -np.inf).astype(
+        np.float64
+    )
     count = min(TOP_PLACES, scores.shape[1])
     highest = -np.sort(-others, axis=1)[:, :count]
     there = np.isfinite(highest)
@@ -60,19 +62,19 @@ def decisions(scores: NDArray[np.floating[Any]], kept: NDArray[np.int64]) -> NDA
 
 
 def trust(
-    scores: NDArray[np.floating[Any]], kept: NDArray[np.int64], outcomes: Sequence[Outcome]
+    scores: NDArray[np.floating[Any]], retained: NDArray[np.int64], outcomes: Sequence[Outcome]
 ) -> tuple[Trust | None, str | None]:
     """The figures of a run, or why there are none.
 
     Args:
         scores: [Q, R'].
-        kept: int64 [R'].
+        retained: int64 [R'].
         outcomes: one for each query, in the order in which they were taken.
     """
     right = np.array([outcome.matched for outcome in outcomes], np.bool_)
     if min(right.sum(), (~right).sum()) < FEWEST_OUTCOMES:
         return None, TOO_FEW
-    values, probabilities = decisions(scores, kept), np.zeros(len(right))
+    values, probabilities = decisions(scores, retained), np.zeros(len(right))
     try:
         for block in blocks_of(np.arange(len(right))):
             probabilities[block] = fit_curve(values[~block], right[~block]).probabilities(values[block])
@@ -89,10 +91,10 @@ def trust(
 
 
 def trust_figures(
-    scores: NDArray[np.floating[Any]], kept: NDArray[np.int64], outcomes: Sequence[Outcome], notes: dict[str, str]
+    scores: NDArray[np.floating[Any]], retained: NDArray[np.int64], outcomes: Sequence[Outcome], notes: dict[str, str]
 ) -> dict[str, Any]:
     """The same as fields of an evaluation, whose notes say why a figure is missing."""
-    found, why = trust(scores, kept, outcomes)
+    found, why = trust(scores, retained, outcomes)
     if found is None:
         return {"notes": {**notes, "ece": why or TOO_FEW}}
     worth = found.reliability

@@ -53,8 +53,8 @@ def closeup(comparison: SystemComparison, run: SystemRun, mark: Mark, stem: str,
     """
     drawn = layers(
         run.scores,
-        true_cells(comparison.truth, comparison.kept),
-        comparison.kept,
+        true_cells(comparison.truth, comparison.retained),
+        comparison.retained,
         run.outcomes,
         longest=640 if len(comparison.runs) <= 6 else 448,
     )
@@ -77,7 +77,7 @@ def closeup(comparison: SystemComparison, run: SystemRun, mark: Mark, stem: str,
             comparison.regions if comparison.regions_of in (None, run.identity) else None,
             most=min(12, max(4, 36 // len(comparison.runs) * 2)),
         ),
-        matrix_file(mark.label, drawn, (len(run.outcomes), len(comparison.kept))),
+        matrix_file(mark.label, drawn, (len(run.outcomes), len(comparison.retained))),
     )
 
 

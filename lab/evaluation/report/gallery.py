@@ -28,7 +28,7 @@ class Case:
     """One query of the gallery.
 
     truth: index of the true reference shown beside it; None where the query has none.
-    truth_score: of that reference; None where it was not kept.
+    truth_score: of that reference; None where it was not retained.
     """
 
     query: int
@@ -56,16 +56,16 @@ def case(comparison: SystemComparison, run: SystemRun, query: int) -> Case:
     Of a wrong match the best true reference, the one that was nearly chosen; of a right one the
     middle of the true ones, to see how far aside the match lies.
     """
-    outcome, true, kept = run.outcomes[query], comparison.truth[query], comparison.kept
+    outcome, true, retained = run.outcomes[query], comparison.truth[query], comparison.retained
     if len(true) == 0:
         return Case(query, outcome, None, None)
-    columns = np.flatnonzero(np.isin(kept, true))
+    columns = np.flatnonzero(np.isin(retained, true))
     shown = int(true[len(true) // 2])
     if not outcome.matched and len(columns):
-        shown = int(kept[columns[np.argmax(run.scores[query, columns])]])
-    column = int(np.searchsorted(kept, shown))
-    is_kept = column < len(kept) and int(kept[column]) == shown
-    return Case(query, outcome, shown, float(run.scores[query, column]) if is_kept else None)
+        shown = int(retained[columns[np.argmax(run.scores[query, columns])]])
+    column = int(np.searchsorted(retained, shown))
+    is_retained = column < len(retained) and int(retained[column]) == shown
+    return Case(query, outcome, shown, float(run.scores[query, column]) if is_retained else None)
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,11 @@ def _panels(
         panel("Best match", found.outcome.retrieved, references, score),
         Panel("True reference", None)
         if found.truth is None
-        else panel("Truth", found.truth, references, _standing(found)),
+        else panel("Truth", found.truth, references, _nearness(found)),
     )
 
 
-def _standing(found: Case) -> str:
+def _nearness(found: Case) -> str:
     """How near the true reference came."""
     if found.truth_score is None:
         return "left out of the references"

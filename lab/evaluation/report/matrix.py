@@ -24,7 +24,7 @@ TRUTH, RIGHT, WRONG = "#F5C400", "#35B6FF", "#FF6A3D"
 
 @dataclass(frozen=True)
 class Layers:
-    """One drawing of a matrix: rows are queries from the top, columns kept references from the left.
+    """One drawing of a matrix: rows are queries from the top, columns retained references from the left.
 
     heat: uint8 [H, W], the brighter the more alike.
     truth: uint8 [H, W, 4] RGBA, the outline of the true references, transparent elsewhere.
@@ -38,15 +38,15 @@ class Layers:
     shrunk: bool
 
 
-def true_cells(truth: Truth, kept: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which kept reference is true of which query; bool [Q, R']."""
-    return np.stack([np.isin(kept, true) for true in truth])
+def true_cells(truth: Truth, retained: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which retained reference is true of which query; bool [Q, R']."""
+    return np.stack([np.isin(retained, true) for true in truth])
 
 
 def layers(
     scores: NDArray[np.float32],
     true: NDArray[np.bool_],
-    kept: NDArray[np.int64],
+    retained: NDArray[np.int64],
     outcomes: Sequence[Outcome],
     longest: int = 640,
 ) -> Layers:
@@ -55,7 +55,7 @@ def layers(
     Args:
         scores: float32 [Q, R'].
         true: bool [Q, R'].
-        kept: int64 [R'], index of each column in the full list of references, ascending.
+        retained: int64 [R'], index of each column in the full list of references, ascending.
         outcomes: Q of them.
         longest: pixels of the drawing's longer side, at most.
     """
@@ -63,7 +63,9 @@ def layers(
     factor = longest / max(height, width)
     factor = float(max(1, int(factor))) if factor >= 1 else factor
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    return Layers(_heat(scores, size), _outline(true, size), _matches(kept, outcomes, size, factor), shrunk=factor < 1)
+    return Layers(
+        _heat(scores, size), _outline(true, size), _matches(retained, outcomes, size, factor), shrunk=factor < 1
+    )
 
 
 def _heat(scores: NDArray[np.float32], size: tuple[int, int]) -> Drawing:
@@ -90,13 +92,13 @@ def _outline(true: NDArray[np.bool_], size: tuple[int, int]) -> Drawing:
     return drawn
 
 
-def _matches(kept: NDArray[np.int64], outcomes: Sequence[Outcome], size: tuple[int, int], factor: float) -> Drawing:
+def _matches(retained: NDArray[np.int64], outcomes: Sequence[Outcome], size: tuple[int, int], factor: float) -> Drawing:
     """A square for each best match, within its cell where that is large enough; the wrong ones over the right ones."""
     drawn = np.zeros((size[1], size[0], 4), np.uint8)
     for wanted, color in ((True, RIGHT), (False, WRONG)):
         for query, outcome in enumerate(outcomes):
             if outcome.matched == wanted:
-                column = int(np.searchsorted(kept, outcome.retrieved))
+                column = int(np.searchsorted(retained, outcome.retrieved))
                 drawn[_cell(query, factor), _cell(column, factor)] = (*rgb(color), 255)
     return drawn
 
@@ -139,7 +141,7 @@ def matrix_file(system: str, drawn: Layers, shape: tuple[int, int]) -> bytes:
     height, width = (round(400 * side / max(drawn.heat.shape)) for side in drawn.heat.shape)
     with house_style("similarity"):
         figure = make_figure(max(260, width + 80), height + 110)
-        axes = figure.add_subplot(title=f"Similarity, {system}", xlabel="kept references", ylabel="queries")
+        axes = figure.add_subplot(title=f"Similarity, {system}", xlabel="retained references", ylabel="queries")
         axes.grid(False)
         extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
         for layer in (cv2.cvtColor(drawn.heat, cv2.COLOR_GRAY2RGB), drawn.truth, drawn.matches):

@@ -68,7 +68,7 @@ def write_report(folder: Path, comparison: SystemComparison) -> None:
         cached=[mark.label for run, mark in zip(runs, cast.runs, strict=True) if run.cached],
         trusted=trusted(runs, cast),
         closeups=closeups,
-        pictures=thumbnails.kept,
+        pictures=thumbnails.retained,
     )
     every = [chart for some in [*charts.values(), *(one.fates for one in closeups)] for chart in some]
     files = {f"{chart.name}.png": chart.png for chart in every}

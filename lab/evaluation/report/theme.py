@@ -123,7 +123,7 @@ class Cast:
     """
 
     def __init__(self, runs: Sequence[SystemRun]) -> None:
-        labels = _told_apart([plain(run.about.title) for run in runs], [plain(run.about.name) for run in runs])
+        labels = _distinguished([plain(run.about.title) for run in runs], [plain(run.about.name) for run in runs])
         self.runs = [Mark(label, place) for place, label in enumerate(labels)]
         self._names: dict[str, Mark] = {}
         for run, mark in zip(runs, self.runs, strict=True):
@@ -136,7 +136,7 @@ class Cast:
         return self._names[system]
 
 
-def _told_apart(titles: list[str], names: list[str]) -> list[str]:
+def _distinguished(titles: list[str], names: list[str]) -> list[str]:
     labels = [
         f"{title} ({name})" if titles.count(title) > 1 and name != title else title
         for title, name in zip(titles, names, strict=True)

@@ -33,7 +33,7 @@ class Thumbnails:
 
     def __init__(self, budget: int = BUDGET) -> None:
         self.left = budget
-        self.kept: list[Thumbnail] = []
+        self.retained: list[Thumbnail] = []
         self._known: dict[Path, Thumbnail | None] = {}
 
     @property
@@ -53,8 +53,8 @@ class Thumbnails:
         except (OSError, InvalidImage):
             return None
         header = read_header(jpeg)
-        made = Thumbnail(f"picture-{len(self.kept)}", header.width, header.height, data_uri(jpeg, "image/jpeg"))
-        self.kept.append(made)
+        made = Thumbnail(f"picture-{len(self.retained)}", header.width, header.height, data_uri(jpeg, "image/jpeg"))
+        self.retained.append(made)
         self.left -= len(jpeg)
         return made
 

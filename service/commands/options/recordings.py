@@ -152,9 +152,7 @@ class RecordingOptions:
         return chosen
 
 
-def without_standing(
-    recording: Recording, frames: list[RecordedFrame], mask: Mask | None = None
-) -> list[RecordedFrame]:
+def without_stops(recording: Recording, frames: list[RecordedFrame], mask: Mask | None = None) -> list[RecordedFrame]:
     """The frames of a bag or a video without those in which nothing has changed; says how many these are.
 
     The frames of a folder all stay, for somebody chose them.

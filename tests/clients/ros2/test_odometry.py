@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from core.belief import OdometryPose
-from placerec_ros.odometry import MOST_KEPT, NANOSECONDS, Odometer
+from placerec_ros.odometry import MOST_POSES, NANOSECONDS, Odometer
 from placerec_ros.planar import Planar, map_to_odom, quaternion, wrapped, yaw_of
 from tests.clients.ros2.ros_messages import odometry
 
@@ -61,9 +61,9 @@ def test_messages_out_of_order_are_sorted_and_a_clock_that_is_set_back_begins_an
 
 def test_stored_readings_are_bounded() -> None:
     odometer = Odometer()
-    for number in range(3 * MOST_KEPT // 2):
+    for number in range(3 * MOST_POSES // 2):
         odometer.add(odometry(100 + number * 1e-4, 0.0, 0.0))
-    assert len(odometer._poses) <= MOST_KEPT
+    assert len(odometer._poses) <= MOST_POSES
     for number in range(3000):
         odometer.add(odometry(200 + number * 0.02, 0.0, 0.0))
     assert len(odometer._poses) < 700, "ten seconds and a little"

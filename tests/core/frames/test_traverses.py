@@ -9,7 +9,7 @@ from core.frames.traverses import (
     find_images_below,
     natural_key,
     read_ground_truth,
-    read_kept_references,
+    read_retained_references,
     tolerance_truth,
 )
 
@@ -107,13 +107,13 @@ def test_a_ground_truth_that_is_no_text_is_refused(tmp_path: Path) -> None:
 def test_kept_references_are_sorted_and_counted_once(tmp_path: Path) -> None:
     path = tmp_path / "kept.txt"
     path.write_text("4\n0\n\n 2 \n4\n")
-    kept = read_kept_references(path, 5)
+    kept = read_retained_references(path, 5)
     assert kept.tolist() == [0, 2, 4]
     with pytest.raises(InvalidGroundTruth, match="no reference 4"):
-        read_kept_references(path, 4)
+        read_retained_references(path, 4)
     path.write_text("\n")
     with pytest.raises(InvalidGroundTruth, match="lists no reference"):
-        read_kept_references(path, 4)
+        read_retained_references(path, 4)
     path.write_text("1,2\n")
     with pytest.raises(InvalidGroundTruth, match="'1,2' is not the index"):
-        read_kept_references(path, 4)
+        read_retained_references(path, 4)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import (
-    FEWEST_STANDING,
+    FEWEST_FRAMES_OF_STOP,
     MOST_NEIGHBOURS,
     RemovalTrial,
     Thinning,
@@ -64,9 +64,9 @@ def test_where_a_robot_stood_still_pairs_are_bounded() -> None:
 
 
 def test_the_first_frame_of_a_stop_stands_for_the_others() -> None:
-    frames = [0, 1, *[2] * FEWEST_STANDING, 3, *[4] * (FEWEST_STANDING - 1)]
+    frames = [0, 1, *[2] * FEWEST_FRAMES_OF_STOP, 3, *[4] * (FEWEST_FRAMES_OF_STOP - 1)]
     there = Whereabouts.along_sequence(frames)
-    expected = [0, 1, *[2] * FEWEST_STANDING, *range(2 + FEWEST_STANDING, len(frames))]
+    expected = [0, 1, *[2] * FEWEST_FRAMES_OF_STOP, *range(2 + FEWEST_FRAMES_OF_STOP, len(frames))]
     assert first_looks(there, Neighborhood(5.0, 3)).tolist() == expected, "fewer frames are no stop"
     there.kind[:] = METRIC
     there.position[5, 0] = 1000.0

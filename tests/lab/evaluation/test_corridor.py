@@ -147,14 +147,14 @@ def test_sequence_matching_pairs_the_two_traverses(
 def test_verdicts_with_the_second_half_of_the_references_left_out(
     encoder: Encoder, queries: list[Encoding], references: list[Encoding], truth: NDArray[np.bool_]
 ) -> None:
-    kept = len(references) // 2
-    scores = answers(encoder, queries, references[:kept])
-    known = [bool(row.any()) for row in truth[:, :kept]]
+    retained = len(references) // 2
+    scores = answers(encoder, queries, references[:retained])
+    known = [bool(row.any()) for row in truth[:, :retained]]
     refused, found = 0, 0
     for query, row in enumerate(scores):
         order = np.argsort(-row, kind="stable")
         frames = Whereabouts(
-            np.zeros(kept, np.int8), np.zeros((kept, 3)), np.zeros(kept, np.int32), order.astype(np.int64)
+            np.zeros(retained, np.int8), np.zeros((retained, 3)), np.zeros(retained, np.int32), order.astype(np.int64)
         )
         judgement = judge(row[order], frames, encoder.calibration, MAP_DEFAULTS, encoder.candidates)
         recognized = judgement.verdict == "recognized"

@@ -194,7 +194,7 @@ def test_systems_are_ranked_and_watched(pair: TraversePair) -> None:
     assert watch.begun == [("worse", 30), ("better", 30), ("learner", 40)]
     assert (watch.steps, watch.ended) == (100, 3)
     assert (comparison.name, comparison.notes) == ("made", ["a note"])
-    assert comparison.references == pair.references and comparison.kept.tolist() == list(range(10))
+    assert comparison.references == pair.references and comparison.retained.tolist() == list(range(10))
     assert (comparison.scalability, comparison.severity, comparison.regions) == (None, None, None)
     assert comparison.runs[1].about.configuration["trained on"] == "the references"
 

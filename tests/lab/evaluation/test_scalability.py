@@ -47,8 +47,8 @@ def test_both_traverses_grow(tmp_path: Path) -> None:
 
 def test_a_query_counts_where_a_true_reference_is_kept(tmp_path: Path) -> None:
     pair, table = made(tmp_path)
-    kept = np.arange(4, 16)
-    reduced = TraversePair(pair.name, pair.references, pair.queries, pair.truth, kept)
+    retained = np.arange(4, 16)
+    reduced = TraversePair(pair.name, pair.references, pair.queries, pair.truth, retained)
     points = scalability(Subject(Lookup(table), reduced, Training([], "nothing"), load), EvaluationCache(None))
     assert (points[0].references, points[0].queries) == (8, 8)
     assert points[0].recall_at_1 == 6 / 8  # references 4 to 11; queries 10 and 11 look like 9

@@ -111,12 +111,12 @@ def test_the_key_covers_all_that_a_score_depends_on(pair: TraversePair, tmp_path
         return Subject(system, pair, training or lessons(pair), load).key("run")
 
     more = write_images(tmp_path / "more", [3, 1, 5])
-    queries = TraversePair(pair.name, pair.references, more, pair.truth, pair.kept)
-    kept = TraversePair(pair.name, pair.references, pair.queries, pair.truth, np.array([0, 1]))
-    others = [key(Lookup(TABLE), queries), key(Lookup(TABLE), kept), key(Lookup(TABLE, "other"))]
+    queries = TraversePair(pair.name, pair.references, more, pair.truth, pair.retained)
+    retained = TraversePair(pair.name, pair.references, pair.queries, pair.truth, np.array([0, 1]))
+    others = [key(Lookup(TABLE), queries), key(Lookup(TABLE), retained), key(Lookup(TABLE, "other"))]
     assert len({key(Lookup(TABLE)), *others}) == 4
     # The truth and the name are no part of a score; training is only where something learns.
-    elsewhere = TraversePair("b", pair.references, pair.queries, tolerance_truth(3, 4, 1), pair.kept)
+    elsewhere = TraversePair("b", pair.references, pair.queries, tolerance_truth(3, 4, 1), pair.retained)
     assert key(Lookup(TABLE), elsewhere) == key(Lookup(TABLE))
     other_lessons = [Training(pair.references[:1], "one", 1), Training(pair.references[:2], "two", 2)]
     assert all(key(Lookup(TABLE), pair, training) == key(Lookup(TABLE)) for training in other_lessons)

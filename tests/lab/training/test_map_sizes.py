@@ -134,10 +134,11 @@ def test_a_pair_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_verification_puts_the_candidates_into_another_order() -> None:
-    one, kept, sequence = verifiable(0.1, 0), np.arange(COUNT), np.zeros(COUNT, np.int64)
+    one, retained, sequence = verifiable(0.1, 0), np.arange(COUNT), np.zeros(COUNT, np.int64)
     calibration = CALIBRATION.model_copy(update={"geometry": TERMS})
     never, always = (
-        [one.judged(query, kept, calibration, sequence, how) for query in range(COUNT)] for how in ("never", "always")
+        [one.judged(query, retained, calibration, sequence, how) for query in range(COUNT)]
+        for how in ("never", "always")
     )
     assert all(found.verified == 0 and found.judgement.evidence is None for found in never)
     assert all(found.verified == CANDIDATES for found in always)

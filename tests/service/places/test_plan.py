@@ -130,7 +130,7 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
 def test_only_the_plans_that_were_requested_last_are_cached(tmp_path: Path) -> None:
     atlas = Atlas(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
-    made, steps = plans.Plans(), range(1, plans.MOST_KEPT + 3)
+    made, steps = plans.Plans(), range(1, plans.MOST_CACHED + 3)
     for step in steps:
         made.make(lab, step)
     assert [step for step in steps if made.cached(lab, step) is not None] == list(steps[2:])

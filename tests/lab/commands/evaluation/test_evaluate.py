@@ -81,13 +81,21 @@ def test_the_figures_by_hand(placerec: Placerec, traverses: tuple[Path, Path], t
 def test_references_that_are_left_out_make_true_negatives(
     placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    kept = tmp_path / "kept.txt"
-    kept.write_text("3\n0\n1\n")
+    retained = tmp_path / "retained.txt"
+    retained.write_text("3\n0\n1\n")
     truth = tmp_path / "truth.csv"
     truth.write_text("0,0\n1,2\n2,2\n3,3\n")
 
     figures, rows = evaluated(
-        placerec, traverses, tmp_path, "--ground-truth", truth, "--limit-references", kept, "--encoder", "region-vlad"
+        placerec,
+        traverses,
+        tmp_path,
+        "--ground-truth",
+        truth,
+        "--limit-references",
+        retained,
+        "--encoder",
+        "region-vlad",
     )
 
     # Reference 2 is gone: queries 1 and 2 have no right answer, whatever they retrieve.
@@ -174,8 +182,8 @@ def test_a_second_run_takes_what_was_measured(placerec: Placerec, traverses: tup
     words = ("--tolerance", 0, "--encoder", "hog")
     first, rows = evaluated(placerec, traverses, tmp_path, *words)
     assert not first["cached"]
-    kept = list((tmp_path / "cache/placerec/evaluations").iterdir())
-    assert len(kept) == 1
+    retained = list((tmp_path / "cache/placerec/evaluations").iterdir())
+    assert len(retained) == 1
 
     second, again = evaluated(placerec, traverses, tmp_path, *words, "--encoder", "seqslam")
     assert again == rows
@@ -190,7 +198,7 @@ def test_a_second_run_takes_what_was_measured(placerec: Placerec, traverses: tup
     assert not fresh["cached"]
     elsewhere, _ = evaluated(placerec, traverses, tmp_path, *words, "--cache", tmp_path / "mine")
     assert not elsewhere["cached"] and len(list((tmp_path / "mine").iterdir())) == 1
-    kept[0].write_bytes(b"damaged")
+    retained[0].write_bytes(b"damaged")
     mended, rows_again = evaluated(placerec, traverses, tmp_path, *words)
     assert not mended["cached"] and rows_again == rows
 
@@ -206,7 +214,7 @@ def test_a_cache_that_cannot_be_written_is_reported(
 def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
     words = ("--tolerance", 0, "--encoder", "fabmap")
     own, _ = evaluated(placerec, traverses, tmp_path, *words)
-    assert own["trained_on"] == own["configuration"]["trained on"] == "the kept references"
+    assert own["trained_on"] == own["configuration"]["trained on"] == "the retained references"
     lessons = tmp_path / "lessons"
     for seed in range(6):
         folder = lessons / f"day{seed % 2}"

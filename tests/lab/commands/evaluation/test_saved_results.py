@@ -50,7 +50,7 @@ def test_several_files_are_compared(placerec: Placerec, tmp_path: Path) -> None:
 
 
 def saved_matrix(folder: Path) -> tuple[Path, Path]:
-    """Three queries against five references: right, wrong and, with references 0 to 3 kept, a new place."""
+    """Three queries against five references: right, wrong and, with references 0 to 3 retained, a new place."""
     matrix = np.full((3, 5), 0.1)
     matrix[0, 1], matrix[1, 0], matrix[2, 4] = 0.9, 0.8, 0.7
     np.save(folder / "matrix.npy", matrix)
@@ -70,8 +70,8 @@ def test_a_matrix_and_a_truth(placerec: Placerec, tmp_path: Path) -> None:
     assert (figures["queries"], figures["references"]) == (3, 5)
     assert rows.read_text().splitlines()[1:] == ["0,1,0.9,1", "1,0,0.8,0", "2,4,0.7,1"]
 
-    (tmp_path / "kept.txt").write_text("0\n1\n2\n3\n")
-    shown = placerec("evaluate", *words, "--limit-references", tmp_path / "kept.txt")
+    (tmp_path / "retained.txt").write_text("0\n1\n2\n3\n")
+    shown = placerec("evaluate", *words, "--limit-references", tmp_path / "retained.txt")
     figures = json.loads(out.read_text())
     assert (figures["negatives"], figures["auc_roc"]) == (1, 1.0)
     assert "mean of true negatives" in shown.stdout

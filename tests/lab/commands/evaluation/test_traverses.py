@@ -41,8 +41,8 @@ def test_a_data_set_brings_its_traverses_and_its_truth(placerec: Placerec, garde
 
 
 def test_a_limit_goes_with_a_data_set(placerec: Placerec, gardens: Path, tmp_path: Path) -> None:
-    (tmp_path / "kept.txt").write_text("0\n1\n")
-    words = ("--dataset", "gardens-point", "--data", gardens, "--limit-references", tmp_path / "kept.txt")
+    (tmp_path / "retained.txt").write_text("0\n1\n")
+    words = ("--dataset", "gardens-point", "--data", gardens, "--limit-references", tmp_path / "retained.txt")
     found = figures(placerec, tmp_path, *words)
     assert (found["references"], found["negatives"]) == (2, 3)  # queries 5, 6 and 7 lost all of ±3
     assert found["auc_roc"] is not None
@@ -57,8 +57,8 @@ def test_poses_and_a_distance(placerec: Placerec, gardens: Path, tmp_path: Path)
     wide = figures(placerec, tmp_path, *both, "--metres", 15)
     narrow = figures(placerec, tmp_path, *both, "--metres", 15, "--degrees", 20)
     assert wide["recall_at"]["1"] == narrow["recall_at"]["1"] == 1.0
-    (tmp_path / "kept.txt").write_text("".join(f"{place}\n" for place in range(0, 8, 2)))
-    limit = ("--limit-references", tmp_path / "kept.txt")
+    (tmp_path / "retained.txt").write_text("".join(f"{place}\n" for place in range(0, 8, 2)))
+    limit = ("--limit-references", tmp_path / "retained.txt")
     assert figures(placerec, tmp_path, *both, "--metres", 15, *limit)["negatives"] == 0
     assert figures(placerec, tmp_path, *both, "--metres", 15, "--degrees", 20, *limit)["negatives"] == 4
 
@@ -81,7 +81,7 @@ def test_missing_data_names_the_folder(placerec: Placerec, tmp_path: Path) -> No
 def test_what_does_not_go_together_is_refused(placerec: Placerec, gardens: Path, tmp_path: Path) -> None:
     both = ("--reference", gardens / "night_right", "--query", gardens / "day_left")
     known = ("--dataset", "gardens-point", "--data", gardens)
-    (tmp_path / "kept.txt").write_text("0\n")
+    (tmp_path / "retained.txt").write_text("0\n")
     for words in (
         (),
         ("--reference", gardens),
@@ -95,7 +95,7 @@ def test_what_does_not_go_together_is_refused(placerec: Placerec, gardens: Path,
         ("--dataset", "gardens-point"),
         (*known, "--tolerance", 1),
         (*known, "--reference", gardens),
-        (*known, "--reduced", "--limit-references", tmp_path / "kept.txt"),
+        (*known, "--reduced", "--limit-references", tmp_path / "retained.txt"),
     ):
         placerec("evaluate", *words, status=2)
     assert "here are 8 and 8" in placerec("evaluate", *known, "--reduced", status=1).stderr.replace("\n", " ")

@@ -51,28 +51,28 @@ def test_traverses_come_in_natural_order_with_their_tolerance(tmp_path: Path) ->
     assert [path.name for path in pair.references] == [f"{n}.png" for n in range(12)]
     assert pair.references[0].parent.name == "night_right" and pair.queries[0].parent.name == "day_left"
     assert pair.truth[5].tolist() == [2, 3, 4, 5, 6, 7, 8]
-    assert pair.kept.tolist() == list(range(12))
+    assert pair.retained.tolist() == list(range(12))
     assert pair.name == "Gardens Point Walking"
     assert "The thesis counts 200 queries and 200 references" in pair.notes[0]
     assert f"(188 queries and 188 references are missing in {tmp_path})" in pair.notes[0]
 
 
 @pytest.mark.parametrize(
-    ("name", "kept", "answerable"),
+    ("name", "retained", "answerable"),
     [("gardens-point", 150, 153), ("synthesized-nordland", 1217, 1221)],
 )
-def test_reduced_references_reach_the_thesis_counts(tmp_path: Path, name: str, kept: int, answerable: int) -> None:
+def test_reduced_references_reach_the_thesis_counts(tmp_path: Path, name: str, retained: int, answerable: int) -> None:
     """With ±3 frames no contiguous run leaves exactly 152 of Gardens Point's queries: 153 is the nearest."""
     dataset = find_dataset(name)
     assert dataset.sizes is not None
     folder = made(tmp_path, dataset, dataset.sizes.references, dataset.sizes.queries)
     pair = open_dataset(dataset, folder, reduced=True, seed=3)
-    assert len(pair.kept) == kept == dataset.sizes.kept
+    assert len(pair.retained) == retained == dataset.sizes.kept
     assert len(pair.queries) - pair.negatives() == answerable
-    gone = np.setdiff1d(np.arange(len(pair.references)), pair.kept)
+    gone = np.setdiff1d(np.arange(len(pair.references)), pair.retained)
     assert (np.diff(gone) == 1).all()
     assert "which run is our choice, drawn with the seed 3" in pair.notes[-1]
-    assert pair.kept.tolist() == open_dataset(dataset, folder, reduced=True, seed=3).kept.tolist()
+    assert pair.retained.tolist() == open_dataset(dataset, folder, reduced=True, seed=3).retained.tolist()
 
 
 def test_reduced_references_need_the_thesis_traverses(tmp_path: Path) -> None:

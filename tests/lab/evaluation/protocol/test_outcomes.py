@@ -31,11 +31,11 @@ def test_of_equal_scores_the_lower_index_comes_first() -> None:
 
 
 def test_indices_stay_those_of_the_full_traverse() -> None:
-    kept = indices(2, 5, 9)
-    outcome = judge_ranking(ranking(0.1, 0.3, 0.2), kept, indices(5))
+    retained = indices(2, 5, 9)
+    outcome = judge_ranking(ranking(0.1, 0.3, 0.2), retained, indices(5))
     assert (outcome.retrieved, outcome.matched, outcome.rank) == (5, True, 1)
     # The only true reference was left out: a true negative, whatever it retrieves.
-    negative = judge_ranking(ranking(0.1, 0.3, 0.2), kept, indices(4))
+    negative = judge_ranking(ranking(0.1, 0.3, 0.2), retained, indices(4))
     assert (negative.retrieved, negative.matched, negative.rank) == (5, False, None)
 
 

@@ -33,24 +33,26 @@ def write_images(folder: Path, count: int, names: Sequence[str] = ()) -> list[Pa
 def make_run(
     name: str,
     scores: NDArray[np.float32],
-    kept: NDArray[np.int64],
+    retained: NDArray[np.int64],
     truth: Truth,
     title: str | None = None,
     nbytes: int = 1536,
 ) -> SystemRun:
     """A run judged as any is."""
-    outcomes = judge(scores, kept, truth)
+    outcomes = judge(scores, retained, truth)
     about = About(name, title or name, "Somebody, 2020", {"N": 300, "layers": ("conv3", "conv4")})
     identity = f"{name}@0123456789abcdef"
-    return SystemRun(about, identity, summarize(identity, outcomes, len(kept), TIMES), outcomes, scores, nbytes, TIMES)
+    return SystemRun(
+        about, identity, summarize(identity, outcomes, len(retained), TIMES), outcomes, scores, nbytes, TIMES
+    )
 
 
 def make_comparison(
-    folder: Path, systems: int = 2, kept: Sequence[int] | None = None, count: int = 8, noise: float = 1.0
+    folder: Path, systems: int = 2, retained: Sequence[int] | None = None, count: int = 8, noise: float = 1.0
 ) -> SystemComparison:
     """``count`` queries and references, the same place at the same index; each system is noisier than the last."""
     generator = np.random.default_rng(7)
-    chosen = np.array(range(count) if kept is None else kept, np.int64)
+    chosen = np.array(range(count) if retained is None else retained, np.int64)
     truth = tolerance_truth(count, count, 0)
     runs = []
     for place in range(systems):

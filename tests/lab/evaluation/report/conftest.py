@@ -21,7 +21,7 @@ def small_charts() -> Iterator[None]:
 @pytest.fixture(scope="package")
 def written(small_charts: None, tmp_path_factory: pytest.TempPathFactory) -> Written:
     folder = tmp_path_factory.mktemp("report")
-    made = make_comparison(folder, systems=2, kept=range(6), noise=6)
+    made = make_comparison(folder, systems=2, retained=range(6), noise=6)
     comparison = replace(
         made,
         runs=[made.runs[0], replace(made.runs[1], elsewhere=True)],

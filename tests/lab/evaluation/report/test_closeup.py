@@ -8,7 +8,7 @@ from tests.lab.evaluation.report.comparisons import Written, make_comparison, wr
 
 
 def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=1, kept=range(6), noise=4.0)
+    comparison = make_comparison(tmp_path, systems=1, retained=range(6), noise=4.0)
     page = written_page(tmp_path / "report", comparison)
     cells = [int(cell.text) for cell in page.named("td") if cell.text and not cell.attributes]
     mean, full = comparison.runs[0].evaluation.thresholds

@@ -13,7 +13,7 @@ from tests.lab.evaluation.report.comparisons import Written, make_comparison, wr
 
 
 def test_texts_name_all_systems_and_their_areas(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=3, kept=range(6))
+    comparison = make_comparison(tmp_path, systems=3, retained=range(6))
     cast = Cast(comparison.runs)
     for plot, figure in (
         (plot_pr(comparison.runs, cast), "auc_pr"),
@@ -33,7 +33,7 @@ def with_probabilities(folder: Path) -> SystemComparison:
     comparison = make_comparison(folder, systems=2, count=60, noise=6.0)
     runs = []
     for run in comparison.runs:
-        figures = trust_figures(run.scores, comparison.kept, run.outcomes, run.evaluation.notes)
+        figures = trust_figures(run.scores, comparison.retained, run.outcomes, run.evaluation.notes)
         runs.append(replace(run, evaluation=run.evaluation.model_copy(update=figures)))
     assert all(run.evaluation.trust for run in runs)
     return replace(comparison, runs=runs)

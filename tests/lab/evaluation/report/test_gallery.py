@@ -25,16 +25,16 @@ def test_right_matches_are_spaced_from_sure_to_unsure() -> None:
 
 
 def test_which_true_reference_is_shown(tmp_path: Path) -> None:
-    kept = np.array([0, 2, 4, 5])
+    retained = np.array([0, 2, 4, 5])
     truth = [np.array([0, 2, 4]), np.array([0, 2, 4]), np.array([1, 3]), np.array([], np.int64)]
     scores = np.array([[0.9, 0.1, 0.2, 0.0], [0.3, 0.1, 0.4, 0.8], [0.0, 0.0, 0.0, 0.7], [0.6, 0, 0, 0]], np.float32)
-    comparison = replace(make_comparison(tmp_path, systems=1), kept=kept, truth=truth)
-    run = make_run("hand", scores, kept, truth)
+    comparison = replace(make_comparison(tmp_path, systems=1), retained=retained, truth=truth)
+    run = make_run("hand", scores, retained, truth)
     shown = [case(comparison, run, query) for query in range(4)]
     assert [(one.truth, one.truth_score) for one in shown] == [
         (2, float(scores[0, 1])),  # right: the middle of the true ones
         (4, float(scores[1, 2])),  # wrong: the best of the true ones
-        (3, None),  # none of the true ones was kept
+        (3, None),  # none of the true ones was retained
         (None, None),
     ]
 

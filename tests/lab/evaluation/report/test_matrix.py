@@ -16,14 +16,14 @@ def test_true_cells_of_kept_references() -> None:
 
 
 def test_small_matrix_by_hand() -> None:
-    kept, truth = np.array([0, 2]), tolerance_truth(2, 3, 0)
+    retained, truth = np.array([0, 2]), tolerance_truth(2, 3, 0)
     scores = np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
-    drawn = layers(scores, true_cells(truth, kept), kept, judge(scores, kept, truth), longest=20)
+    drawn = layers(scores, true_cells(truth, retained), retained, judge(scores, retained, truth), longest=20)
     assert drawn.heat.shape == (20, 20)
     assert not drawn.shrunk
     assert (drawn.heat[:10, :10] == 255).all()
     assert (drawn.heat[:10, 10:] == 0).all()
-    # Query 0 is true at reference 0, in the first column; reference 1 was not kept.
+    # Query 0 is true at reference 0, in the first column; reference 1 was not retained.
     opaque = drawn.truth[..., 3] == 255
     assert opaque[:10, :10].sum() == 36, "the edge of a square of ten"
     assert not opaque[1:9, 1:9].any()
@@ -38,9 +38,9 @@ def test_small_matrix_by_hand() -> None:
 
 def test_no_true_cell_is_lost_in_a_large_matrix() -> None:
     count = 2000
-    kept, truth = np.arange(count), tolerance_truth(count, count, 0)
+    retained, truth = np.arange(count), tolerance_truth(count, count, 0)
     scores = np.eye(count, dtype=np.float32)
-    drawn = layers(scores, true_cells(truth, kept), kept, judge(scores, kept, truth), longest=200)
+    drawn = layers(scores, true_cells(truth, retained), retained, judge(scores, retained, truth), longest=200)
     assert drawn.heat.shape == (200, 200)
     assert drawn.shrunk
     assert (drawn.truth[np.arange(200), np.arange(200), 3] == 255).all()
@@ -53,24 +53,24 @@ def test_no_true_cell_is_lost_in_a_large_matrix() -> None:
 
 
 def test_matrix_of_one_value() -> None:
-    kept, truth = np.arange(3), tolerance_truth(2, 3, 0)
+    retained, truth = np.arange(3), tolerance_truth(2, 3, 0)
     scores = np.full((2, 3), 0.5, np.float32)
-    drawn = layers(scores, true_cells(truth, kept), kept, judge(scores, kept, truth))
+    drawn = layers(scores, true_cells(truth, retained), retained, judge(scores, retained, truth))
     assert (drawn.heat == 0).all()
 
 
 def test_long_and_narrow_matrix() -> None:
-    kept, truth = np.array([0]), tolerance_truth(500, 1, 0)
+    retained, truth = np.array([0]), tolerance_truth(500, 1, 0)
     scores = np.random.default_rng(0).random((500, 1)).astype(np.float32)
-    drawn = layers(scores, true_cells(truth, kept), kept, judge(scores, kept, truth), longest=100)
+    drawn = layers(scores, true_cells(truth, retained), retained, judge(scores, retained, truth), longest=100)
     assert drawn.heat.shape == (100, 1)
     assert cv2.imdecode(np.frombuffer(matrix_file("HOG", drawn, (500, 1)), np.uint8), cv2.IMREAD_COLOR) is not None
 
 
 def test_files_decode_to_the_layers() -> None:
-    kept, truth = np.arange(3), tolerance_truth(3, 3, 0)
+    retained, truth = np.arange(3), tolerance_truth(3, 3, 0)
     scores = np.eye(3, dtype=np.float32)
-    drawn = layers(scores, true_cells(truth, kept), kept, judge(scores, kept, truth), longest=30)
+    drawn = layers(scores, true_cells(truth, retained), retained, judge(scores, retained, truth), longest=30)
     heat = cv2.imdecode(np.frombuffer(heat_file(drawn)[0], np.uint8), cv2.IMREAD_UNCHANGED)
     matches = cv2.imdecode(np.frombuffer(png(drawn.matches), np.uint8), cv2.IMREAD_UNCHANGED)
     assert heat is not None

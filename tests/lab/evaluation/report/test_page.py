@@ -115,14 +115,14 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
 @pytest.mark.thorough
 def test_hostile_names_are_text(tmp_path: Path) -> None:
     evil = '<script>alert("1")</script>&\N{RIGHT-TO-LEFT OVERRIDE}$\\frac{$'
-    comparison = make_comparison(tmp_path, systems=1, kept=range(6))
+    comparison = make_comparison(tmp_path, systems=1, retained=range(6))
     names = ["'><img src=x onerror=alert(2)>.png", os.fsdecode(b"not-\xff-unicode.png")]
     hostile = replace(
         comparison,
         name=evil,
         queries=write_images(tmp_path / "hostile", 8, names),
         notes=[evil],
-        runs=[make_run(evil, comparison.runs[0].scores, comparison.kept, comparison.truth, title=evil)],
+        runs=[make_run(evil, comparison.runs[0].scores, comparison.retained, comparison.truth, title=evil)],
         severity=[SeverityCurve(evil, evil, [0.0, 1.0], evil, [0.9, 0.5], [0.8, 0.3])],
     )
     html, page = page_of(tmp_path / "report", hostile)
@@ -139,9 +139,11 @@ def test_wrong_matches_come_first(tmp_path: Path) -> None:
     scores = np.eye(4, dtype=np.float32)
     scores[1] = [0.9, 0.1, 0, 0]  # wrong, sure
     scores[2] = [0, 0.3, 0.2, 0]  # wrong, unsure
-    kept, truth = np.arange(4), tolerance_truth(4, 4, 0)
+    retained, truth = np.arange(4), tolerance_truth(4, 4, 0)
     comparison = replace(
-        make_comparison(tmp_path, systems=1, count=4), runs=[make_run("mixed", scores, kept, truth)], kept=kept
+        make_comparison(tmp_path, systems=1, count=4),
+        runs=[make_run("mixed", scores, retained, truth)],
+        retained=retained,
     )
     _, page = page_of(tmp_path / "report", comparison)
     articles = page.named("article")
@@ -163,14 +165,14 @@ def test_without_a_wrong_match_there_is_nothing_to_reject_and_without_negatives_
     assert "all right" in page.named("td", "bar")[0].text
     assert not (tmp_path / "report" / "scores-after-system-0.png").exists()
     assert "There is none." in html
-    assert "There is no ROC curve: every query has a kept true reference" in html
+    assert "There is no ROC curve: every query has a retained true reference" in html
     assert not (tmp_path / "report" / "roc.png").exists()
 
 
 @pytest.mark.thorough
 def test_without_a_right_match_there_is_no_curve(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
-    backwards = make_run("backwards", -np.eye(8, dtype=np.float32), comparison.kept, comparison.truth)
+    backwards = make_run("backwards", -np.eye(8, dtype=np.float32), comparison.retained, comparison.truth)
     html, _ = page_of(tmp_path / "report", replace(comparison, runs=[backwards]))
     assert "no precision–recall curve, of backwards" in html
     assert not (tmp_path / "report" / "pr.png").exists()
@@ -181,9 +183,9 @@ def test_without_a_right_match_there_is_no_curve(tmp_path: Path) -> None:
 def test_every_query_is_a_negative(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     nothing = [np.array([], np.int64)] * 8
-    run = make_run("lost", comparison.runs[0].scores, comparison.kept, nothing)
+    run = make_run("lost", comparison.runs[0].scores, comparison.retained, nothing)
     html, page = page_of(tmp_path / "report", replace(comparison, truth=nothing, runs=[run]))
-    assert "no query has a kept true reference" in html
+    assert "no query has a retained true reference" in html
     assert len(page.named("article")) == 8
     assert "True reference" in page.named("article")[0].text
 
@@ -199,7 +201,7 @@ def test_one_query_and_one_reference(tmp_path: Path) -> None:
 def test_more_systems_than_hues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Two plots of each system, which take most of the time and know of no other system.
     monkeypatch.setattr("lab.evaluation.report.closeup.plot_fates", lambda *_: [])
-    comparison = make_comparison(tmp_path, systems=10, kept=range(6))
+    comparison = make_comparison(tmp_path, systems=10, retained=range(6))
     _, page = page_of(tmp_path / "report", comparison)
     assert len(page.named("section", "run")) == 10 > len(LIGHT.hues)
     rows = [element for element in page.named("th") if element.attributes["scope"] == "row"]
@@ -210,7 +212,7 @@ def test_more_systems_than_hues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.thorough
 def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, kept=range(6))
+    comparison = make_comparison(tmp_path, retained=range(6))
     second = comparison.runs[1]
     seen: list[Path] = []
 

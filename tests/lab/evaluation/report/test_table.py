@@ -14,7 +14,7 @@ from tests.lab.evaluation.report.comparisons import Written, make_comparison, ma
 def test_columns_without_any_figure_are_left_out(tmp_path: Path) -> None:
     all_positive = make_comparison(tmp_path, systems=1).runs
     assert "AUC-ROC" not in [column.heading for column in columns(all_positive)]
-    with_negatives = make_comparison(tmp_path, systems=1, kept=range(6)).runs
+    with_negatives = make_comparison(tmp_path, systems=1, retained=range(6)).runs
     assert "AUC-ROC" in [column.heading for column in columns(with_negatives)]
 
 
@@ -29,9 +29,9 @@ def test_stages_of_all_systems_matching_last(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_best_figure_of_a_column_stands_out(tmp_path: Path) -> None:
-    kept, truth = np.arange(3), tolerance_truth(3, 3, 0)
-    good = make_run("good", np.eye(3, dtype=np.float32), kept, truth, nbytes=9000)
-    poor = make_run("poor", np.array([[1, 0, 0], [2, 0, 0], [0, 0, 1]], np.float32), kept, truth, nbytes=10)
+    retained, truth = np.arange(3), tolerance_truth(3, 3, 0)
+    good = make_run("good", np.eye(3, dtype=np.float32), retained, truth, nbytes=9000)
+    poor = make_run("poor", np.array([[1, 0, 0], [2, 0, 0], [0, 0, 1]], np.float32), retained, truth, nbytes=10)
     comparison = make_comparison(tmp_path, systems=1, count=3)
     page = written_page(tmp_path / "two", replace(comparison, runs=[good, poor]))
     best = [cell.text for cell in page.named("td", "best")]
@@ -60,8 +60,8 @@ def test_sorted_as_it_comes(written: Written) -> None:
 
 def test_what_was_not_measured_is_a_dash() -> None:
     """A run whose scores were computed elsewhere has no memory beside one that has."""
-    kept = np.arange(2)
-    ours = make_run("ours", np.eye(2, dtype=np.float32), kept, tolerance_truth(2, 2, 0))
+    retained = np.arange(2)
+    ours = make_run("ours", np.eye(2, dtype=np.float32), retained, tolerance_truth(2, 2, 0))
     theirs = replace(ours, bytes_per_place=None, elsewhere=True)
     (memory,) = [column for column in columns([ours, theirs]) if column.group == "Memory"]
     assert [memory.form(memory.value(run)) for run in (ours, theirs)] == ["1.5\N{NO-BREAK SPACE}KB", "–"]

@@ -55,8 +55,8 @@ def test_text_stands_out_of_the_paper(theme: Theme) -> None:
 
 
 def test_marks_of_thirty_two_systems_differ(tmp_path: Path) -> None:
-    truth, kept = tolerance_truth(2, 2, 0), np.arange(2)
-    runs = [make_run(f"s{place}", np.eye(2, dtype=np.float32), kept, truth) for place in range(32)]
+    truth, retained = tolerance_truth(2, 2, 0), np.arange(2)
+    runs = [make_run(f"s{place}", np.eye(2, dtype=np.float32), retained, truth) for place in range(32)]
     marks = Cast(runs).runs
     assert len({(mark.color(LIGHT), mark.dashes) for mark in marks}) == 32
     assert marks[0].linestyle == "-"
@@ -64,9 +64,9 @@ def test_marks_of_thirty_two_systems_differ(tmp_path: Path) -> None:
 
 
 def test_systems_of_one_title_are_distinguished(tmp_path: Path) -> None:
-    truth, kept, scores = tolerance_truth(2, 2, 0), np.arange(2), np.eye(2, dtype=np.float32)
+    truth, retained, scores = tolerance_truth(2, 2, 0), np.arange(2), np.eye(2, dtype=np.float32)
     named = [("a", "Twin"), ("b", "Twin"), ("b", "Twin"), ("c", "Single")]
-    runs = [make_run(name, scores, kept, truth, title=title) for name, title in named]
+    runs = [make_run(name, scores, retained, truth, title=title) for name, title in named]
     assert [mark.label for mark in Cast(runs).runs] == ["Twin (a)", "Twin (b) 1", "Twin (b) 2", "Single"]
 
 

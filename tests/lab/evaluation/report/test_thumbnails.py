@@ -18,7 +18,7 @@ def test_an_image_is_stored_once_and_small(tmp_path: Path) -> None:
     assert first is not None
     assert thumbnails.add(large) is first
     assert (first.width, first.height) == (LONGEST, LONGEST // 2)
-    assert thumbnails.kept == [first]
+    assert thumbnails.retained == [first]
     data = base64.b64decode(first.address.removeprefix("data:image/jpeg;base64,"))
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
@@ -44,7 +44,7 @@ def test_what_is_no_image(tmp_path: Path) -> None:
     thumbnails = Thumbnails()
     assert thumbnails.add(tmp_path / "text.png") is None
     assert thumbnails.add(tmp_path / "missing.png") is None
-    assert thumbnails.kept == []
+    assert thumbnails.retained == []
 
 
 def test_each_is_stored_once_and_shown_by_its_id(written: Written) -> None:
