@@ -56,7 +56,7 @@ FADING = 0.8
 """With each further frame that is covered, or constant and unlike the map, the robot is believed to see the map by this
 factor less.  After three of them not even a belief that was sure is recognized."""
 
-KEPT = 512
+MOST_PLACES = 512
 """The state has the probabilities of this many places; the others share the rest."""
 
 
@@ -324,7 +324,7 @@ class Run:
     def state(self) -> RunState:
         """The state from which the run can be continued."""
         masses = self.belief.given
-        best = np.argpartition(-masses, KEPT)[:KEPT] if len(masses) > KEPT else np.arange(len(masses))
+        best = np.argpartition(-masses, MOST_PLACES)[:MOST_PLACES] if len(masses) > MOST_PLACES else np.arange(len(masses))
         return RunState(
             self.graph.rows[best],
             masses[best],

@@ -15,7 +15,7 @@ from enum import IntEnum
 from service.engine.queue import RequestDeadline
 from service.errors.faults import BatchOutOfOrder, ClientGone
 
-KEPT = 1024
+MOST_NAMES = 1024
 """How many names of stored batches are remembered."""
 
 GRACE = 5.0
@@ -67,7 +67,7 @@ class BatchOrder:
         if stage is not None:
             self._stages[name] = stage
         if stage == Stage.STORED:
-            for stored in [name for name, stage in self._stages.items() if stage == Stage.STORED][:-KEPT]:
+            for stored in [name for name, stage in self._stages.items() if stage == Stage.STORED][:-MOST_NAMES]:
                 del self._stages[stored]
         self._changed.set()
         self._changed = asyncio.Event()

@@ -35,7 +35,7 @@ router = APIRouter(prefix="/v1/maps/{map}", tags=["upkeep"], dependencies=[Depen
 
 JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
 
-KEPT = 2
+MOST_CACHED = 2
 """The number of matrices that are cached: the JSON and the picture of a matrix are fetched one after the other."""
 
 
@@ -94,7 +94,7 @@ class Matrices:
         if found is None:
             found = Matrix(score_pairs(traverses.snapshot, encoder, queries, references))
         self._cached[key] = found
-        while len(self._cached) > KEPT:
+        while len(self._cached) > MOST_CACHED:
             self._cached.popitem(last=False)
         return found
 

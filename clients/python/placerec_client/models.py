@@ -183,7 +183,7 @@ class PlaceView(Model):
 
 
 class ScoreParts(Model):
-    """What a match's place in the ranking is made of: the score is the sum of `similarity` and `agreement`."""
+    """The parts of a match's score: it is the sum of `similarity` and `agreement`."""
 
     similarity: float
     agreement: float
@@ -259,7 +259,7 @@ class MatchExplanation(Model):
 
 
 class RivalGroup(Model):
-    """Places that keep an answer from being recognized, as one."""
+    """Places that prevent the recognition of an answer, as one."""
 
     places: list[str]
     score: float
@@ -554,9 +554,9 @@ class Intrinsics(Model):
 
 
 class Mask(Model):
-    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
-    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
-    covered.
+    """The parts of each frame of one camera that are ignored. ``polygons`` are given by their corners, (x, y) in
+    shares of the upright frame's width and height, from its top left corner; where they overlap, all that any of
+    them holds is covered.
     """
 
     polygons: list[list[tuple[float, float]]]
@@ -930,7 +930,7 @@ class Layer(Model):
 
 
 class MapAnswer(Model):
-    """The answer of one map: its own verdict, or the problem that kept it from answering."""
+    """The answer of one map: its own verdict, or the problem that prevented it."""
 
     map: str
     status: int

@@ -74,11 +74,11 @@ class Query(TypedDict, total=False):
     """
 
     exclude_frames: int | None
-    """Leave out so many of the last places of the frame's own sequence."""
+    """Leave out this many of the last places of the frame's own sequence."""
 
     exclude_seconds: float | None
-    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
-    have no timestamp.
+    """Leave out the places of the frame's own sequence that were taken within this many seconds of the frame, or
+    that have no timestamp.
     """
 
     k: int
@@ -160,11 +160,11 @@ class QueryBatch(TypedDict, total=False):
     """
 
     exclude_frames: int | None
-    """Leave out so many of the last places of the frame's own sequence."""
+    """Leave out this many of the last places of the frame's own sequence."""
 
     exclude_seconds: float | None
-    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
-    have no timestamp.
+    """Leave out the places of the frame's own sequence that were taken within this many seconds of the frame, or
+    that have no timestamp.
     """
 
     k: int
@@ -378,11 +378,11 @@ class QueryOrEnrol(TypedDict, total=False):
     """
 
     exclude_frames: int | None
-    """Leave out so many of the last places of the frame's own sequence."""
+    """Leave out this many of the last places of the frame's own sequence."""
 
     exclude_seconds: float | None
-    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
-    have no timestamp.
+    """Leave out the places of the frame's own sequence that were taken within this many seconds of the frame, or
+    that have no timestamp.
     """
 
     metadata: str | Mapping[str, Any] | None
@@ -464,11 +464,11 @@ class QueryMaps(TypedDict, total=False):
     """
 
     exclude_frames: int | None
-    """Leave out so many of the last places of the frame's own sequence."""
+    """Leave out this many of the last places of the frame's own sequence."""
 
     exclude_seconds: float | None
-    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
-    have no timestamp.
+    """Leave out the places of the frame's own sequence that were taken within this many seconds of the frame, or
+    that have no timestamp.
     """
 
     maps: str | Sequence[str] | None
@@ -600,7 +600,7 @@ class Regions(TypedDict, total=False):
     """Name or identity; the default encoder if left out."""
 
     limit: int | None
-    """Only so many, those of the highest energy."""
+    """Only this many, those of the highest energy."""
 
     format: Literal["json", "png"] | None
     """json or png; if left out, the Accept header decides, and json is the default."""
@@ -616,8 +616,8 @@ class Match(TypedDict, total=False):
     """Say which words, regions and cells carried the score."""
 
     format: Literal["json", "png"] | None
-    """png: both frames side by side, what answers each other joined by lines; if left out, the Accept header
-    decides, and json is the default.
+    """png: both frames side by side, corresponding points joined by lines; if left out, the Accept header decides,
+    and json is the default.
     """
 
 
@@ -1028,9 +1028,9 @@ class Intrinsics(TypedDict):
 
 
 class Mask(TypedDict):
-    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
-    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
-    covered.
+    """The parts of each frame of one camera that are ignored. ``polygons`` are given by their corners, (x, y) in
+    shares of the upright frame's width and height, from its top left corner; where they overlap, all that any of
+    them holds is covered.
     """
 
     polygons: Sequence[Sequence[tuple[float, float]]]

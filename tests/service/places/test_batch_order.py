@@ -87,7 +87,7 @@ async def test_no_batch_waits_forever(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.anyio
 async def test_the_number_of_remembered_names_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_order, "KEPT", 3)
+    monkeypatch.setattr(batch_order, "MOST_NAMES", 3)
     line = BatchOrder()
     with line.enter("lab", "open", None, deadline()):
         for number in range(9):

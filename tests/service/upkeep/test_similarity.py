@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.method.encoder import Encoder
 from core.upkeep.similarity import score_pairs
 from service.upkeep.alignment import TraversesToAlign
-from service.upkeep.similarity import KEPT, Matrices
+from service.upkeep.similarity import MOST_CACHED, Matrices
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.engines import ENCODER, runtime_at
 from tests.service.map_jobs import asked, finished
@@ -153,6 +153,6 @@ def test_the_latest_matrices_are_cached_and_follow_the_traverses(tmp_path: Path)
         later = TraversesToAlign(map_)
         other = matrices.of(map_, later, plain, later.frames("a"), second)
         assert other is not made and len(other.scores) == 699
-        for count in range(KEPT + 1):
+        for count in range(MOST_CACHED + 1):
             matrices.of(map_, later, plain, second[: count + 5], second)
         assert matrices.of(map_, traverses, plain, first, second) is not made

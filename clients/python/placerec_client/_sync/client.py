@@ -162,7 +162,7 @@ class Client:
     def draw_match(
         self, a: Frame, b: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Match]
     ) -> bytes:
-        """Return two frames side by side with lines between what answers each other: a PNG file."""
+        """Return two frames side by side with lines between corresponding points: a PNG file."""
         content, kind = _two(a, b)
         response = self.connection.request(
             "POST",
