@@ -2,7 +2,7 @@
 
     python -m benchmarks.request_paths
 
-Every file counts of which a Python function is called, in whichever thread; what compiled code calls is not seen.
+Every file counts of which a Python function is called, in whichever thread; calls by compiled code are not seen.
 """
 
 from __future__ import annotations

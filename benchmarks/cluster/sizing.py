@@ -1,4 +1,4 @@
-"""How many machines a fleet needs, what a query costs, and which part gives out first: a queueing model.
+"""How many machines a fleet needs, the cost of a query, and which part gives out first: a queueing model.
 
     python -m benchmarks.cluster.sizing [--rate 1] [--places-per-map 100000]
 

@@ -101,7 +101,7 @@ def upside_down(pixels: Pixels, _random: Random, _number: int) -> Pixels:
 
 
 def on_its_side(pixels: Pixels, _random: Random, _number: int) -> Pixels:
-    """A camera turned by 90 degrees clockwise: what it sees lies turned counter-clockwise in its file."""
+    """A camera turned by 90 degrees clockwise: its view is turned counter-clockwise in its file."""
     return np.ascontiguousarray(np.rot90(pixels))
 
 

@@ -1,4 +1,4 @@
-"""The table of situations: how the robot moves, what its camera shows, and what becomes of its messages.
+"""The table of situations: how the robot moves, the view of its camera, and the fate of its messages.
 
 A situation is data. Its stretches follow one another; :func:`moments` makes the frames of a walk of them, with the
 truth of each.

@@ -30,7 +30,7 @@ class Row:
     drive: DriveOutcomes
 
     def cell(self) -> str:
-        """As it is shown: right/wrong/ambiguous/unknown, what else there is, and the seconds until right again."""
+        """As it is shown: right/wrong/ambiguous/unknown, other outcomes, and the seconds until right again."""
         counts = "/".join(str(self.drive.count(one)) for one in SHOWN)
         more = [f"+{count}{LETTERS[one]}" for one in BESIDE if (count := self.drive.count(one))]
         return " ".join([counts, *more, *([seconds(self.drive.again)] if self.drive.again is not None else [])])

@@ -4,7 +4,7 @@
 
 Each picture of corridor, lip6_outdoor and the training sets is compared with itself and with near copies: JPEG, noise,
 another brightness, shifts, turns about the optical axis, pans.  The changes of geometry are homographies, as of a
-camera that only turns; what comes into view is black.  A comparison fails if it has ``ENOUGH_MATCHES`` matches or more,
+camera that only turns; its new parts are black.  A comparison fails if it has ``ENOUGH_MATCHES`` matches or more,
 of which fewer than half are inliers.  At most ``FAILURES`` may fail, and each that does is listed.
 
 Strangers are frames of one traverse more than ``FAR`` frames from where the other was there, and frames of two sets of

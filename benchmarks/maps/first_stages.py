@@ -5,7 +5,7 @@
 Each answers with its 100 best, in one thread; given are how often the exact best is among them, the median time of one
 query and of each of eight together, taken in turns, the bytes of a place in memory, the milliseconds that adding one
 takes, and the seconds of training.  All but the flat index get descriptors that are rotated at random, as RaBitQ wants
-them; what learns is trained on descriptors that are not searched.  ``FAISS_SIMD_LEVEL=AVX2`` lets FAISS do without
+them; some are trained on descriptors that are not searched.  ``FAISS_SIMD_LEVEL=AVX2`` lets FAISS do without
 AVX-512.
 """
 

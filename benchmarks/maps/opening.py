@@ -3,7 +3,7 @@
     python -m benchmarks.maps.opening [--places 100000] [--precision half] [--keep FOLDER]
 
 The map is written through the storage, of descriptors mixed from those of sample frames, and
-what it is searched by is built as the service would.  Then a service is started on it and queried once, from a cold
+its indexes are built as the service would.  Then a service is started on it and queried once, from a cold
 cache of the system as far as it lets us; and a process of its own opens it and searches, with and without a filter.
 ``--keep`` is where the map lies, used again when it is there already.
 """

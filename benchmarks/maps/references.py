@@ -41,7 +41,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp"}
 class Material:
     """Descriptors of real photographs.
 
-    sources: float32 [s, D], what distractors are made of; kinds: int64 [s].
+    sources: float32 [s, D], the sources of distractors; kinds: int64 [s].
     neighbours: int64 [s, 10], like places of the same kind.
     queries, places: float32 [q, D], [p, D]: second and first looks.
     walks: int64 [q], which data set a query is of, an index into ``names``.

@@ -7,7 +7,7 @@ Maps are written through the storage (``core.storage``), of real places and dist
 descriptors (:mod:`benchmarks.maps.references`), and searched as the service searches them: the first stage, and the
 exact comparison of the shortlist with what the disk holds; the encoder's second stage is not in it.  Flat is FAISS's
 IndexFlatIP over float32; over more than 20 000 places its time is that of 20 000, scaled linearly.  All are measured
-in turns, so that whatever else the machine does falls on all of them alike; what is shown are medians.
+in turns, so that whatever else the machine does falls on all of them alike; medians are shown.
 
 The truth is the best of all references by float32 inner products, computed while they are written; recall@1 is how
 often just that row comes first.  ``python -m benchmarks.maps.search_plots`` draws the figures.

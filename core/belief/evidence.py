@@ -133,7 +133,7 @@ def evidence(
         neighborhood: which places are the same place.
         examined: bool [n], which of them the encoder's second stage has examined; None, or none of them: it has no
             second stage.
-        verified: float64 [n], what geometric verification found of them (``core.geometry.verification``), -ln of the
+        verified: float64 [n], the results of their geometric verification (``core.geometry.verification``), -ln of the
             number of false alarms; NaN where a place was not verified; other frames of its view may then count.
             None: none was.
         rivals: positions of places that show what the best match shows, as another traverse's do.  A robot is at one of

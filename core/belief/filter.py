@@ -7,7 +7,7 @@ over the later frames gives the place of the robot that many frames ago.
 
 Whether the robot sees the map is a second chain of two states (LEAVING, RETURNING), which compares the likelihood of
 each frame under the first chain with that of a frame from outside.  A robot whose view was blocked is therefore looked
-for where it must have got to by then: what it saw meanwhile, however little, still counts among the places.
+for where it must have got to by then: its views meanwhile, however few, still count among the places.
 """
 
 from __future__ import annotations

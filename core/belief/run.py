@@ -324,7 +324,9 @@ class Run:
     def state(self) -> RunState:
         """The state from which the run can be continued."""
         masses = self.belief.given
-        best = np.argpartition(-masses, MOST_PLACES)[:MOST_PLACES] if len(masses) > MOST_PLACES else np.arange(len(masses))
+        best = (
+            np.argpartition(-masses, MOST_PLACES)[:MOST_PLACES] if len(masses) > MOST_PLACES else np.arange(len(masses))
+        )
         return RunState(
             self.graph.rows[best],
             masses[best],

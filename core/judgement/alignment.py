@@ -16,7 +16,7 @@ Some path is always the best.  Its quality by chance is measured on the same sco
 around: nobody sees its places in that order, but they resemble one another as before.
 
 Memory does not grow with the product of the lengths: scores are computed in tiles, of each frame the ``MOST_PAIRS``
-best pairs are kept while all others count as ordinary ones, and of a long traverse ``TOGETHER`` frames are matched at a
+best pairs are stored, all others count as ordinary ones, and of a long traverse ``TOGETHER`` frames are matched at a
 time.  Time does grow with the product, by an inner product of two descriptors for each pair of frames.
 """
 

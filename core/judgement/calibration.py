@@ -229,7 +229,7 @@ class Measurement(BaseModel):
 
 @dataclass(frozen=True)
 class FittedCalibration:
-    """A calibration fitted to trials on a map, what was measured while fitting it, and the trials."""
+    """A calibration fitted to trials on a map, the measurements of the fit, and the trials."""
 
     calibration: Calibration
     measurement: Measurement

@@ -23,7 +23,7 @@ class Share(BaseModel):
     low: float = Field(description="Lower end of the interval (95 %).")
     high: float = Field(description="Upper end of the interval (95 %).")
     count: int = Field(description="Of these …")
-    of: int = Field(description="… so many.")
+    of: int = Field(description="… this many.")
 
 
 class Bin(BaseModel):

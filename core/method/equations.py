@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-"""Floating-point values; what is computed from float32 is float32 unless the function says otherwise."""
+"""Floating-point values; results from float32 are float32 unless the function says otherwise."""
 
 Normalization = Literal["intra", "global"]
 

@@ -1,4 +1,4 @@
-"""Why two frames score as they do: what words, regions and cells contribute to the score (thesis, section 3.4.3).
+"""Why two frames score as they do: the contributions of words, regions and cells to the score (thesis, section 3.4.3).
 
 The score of an encoder with two stages is the sum of two sums: the first over the words of the vocabulary (equations
 3.13 and 4.13), the second over the corresponding cells (``agreement.py``).  A region has no share of its own, since
@@ -42,13 +42,13 @@ class Shown:
 class Explanation:
     """The parts of the score of a frame a against a frame b.
 
-    words: float32 [V], what each word adds to the score (its j_u, scaled as in the score); of whitened
+    words: float32 [V], the contribution of each word to the score (its j_u, scaled as in the score); of whitened
         descriptors only their sum, float32 [1], for whitening mixes the words.
-    losses: of a and of b, float32 [T], what the score would lose without each region; negative if it would gain.
+    losses: of a and of b, float32 [T], the loss of the score without each region; negative if it would gain.
         None if a frame's regions are not known.
     answers: int64 [n, 2], regions of a and of b of one word that are each other's nearest.
     cells: the corresponding cells of a and b; none without a second stage.
-    gains: float32 [n], what each pair of cells adds to the score.
+    gains: float32 [n], the contribution of each pair of cells to the score.
     """
 
     words: Array

@@ -291,7 +291,7 @@ class Collection:
         Args:
             descriptors: float32 [B, D].
             limit: how many at most; at most ``MOST_FOUND``.
-            seen_from: a timestamp of Milvus; what was inserted until then is searched.
+            seen_from: a timestamp of Milvus; rows that were inserted until then are searched.
         """
         with self._using("search") as collection:
             queries, settings = (

@@ -1,6 +1,6 @@
 """Making a map of an export file in PostgreSQL and Milvus.
 
-The map is stored unlisted, under a name that no map can have, until all of it is there; what a crash leaves of it is
+The map is stored unlisted, under a name that no map can have, until all of it is there; the remains after a crash are
 removed a while later.
 """
 

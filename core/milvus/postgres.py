@@ -140,7 +140,7 @@ class Postgres:
 
     @contextmanager
     def connection(self, action: str) -> Iterator[Connection[Any]]:
-        """A connection of the pool; what the block does not commit is undone if it raises, else committed.
+        """A connection of the pool; uncommitted changes of the block are undone if it raises, else committed.
 
         Args:
             action: the work of the block, for the message of an error.

@@ -248,7 +248,7 @@ def calibrate_map(
     """A calibration of a map from its answers to queries; nothing is stored.
 
     Args:
-        beside: further queries, whose answers count as much; None: none.
+        beside: further queries with answers that count as much; None: none.
         target: the target of the calibration, such as a precision.
         source: is noted in the calibration.
 

@@ -43,7 +43,7 @@ HEAD = 500
 
 
 SEARCHES = 8
-"""So many times a map is searched for other places at most, where many frames show few views."""
+"""The most searches of a map for other places, where many frames show few views."""
 
 
 @dataclass(frozen=True)

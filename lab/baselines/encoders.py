@@ -41,7 +41,7 @@ PAPERS = {
 
 
 def about_encoder(summary: EncoderSummary) -> About:
-    """An installed encoder as a system; for a damaged one, what is wrong with it in place of the paper."""
+    """An installed encoder as a system; for a damaged one, the fault in place of the paper."""
     definition = summary.definition
     if definition is None:
         return About(summary.name, summary.name, summary.damaged or "", {})
@@ -84,7 +84,7 @@ class EncoderSystem:
     def region_boxes(self, pixels: Pixels) -> list[Box]:
         """The boxes of a frame's regions, highest energy first; none for a blank frame.
 
-        A frame is resized whole, so the cells of a layer are spread evenly over it; what a cell sees is wider.
+        A frame is resized whole, so the cells of a layer are spread evenly over it; receptive fields are wider.
         """
         by_layer = self.encoder.layer_grids()
         grids = np.array([by_layer[layer] for layer in self.encoder.definition.layers], np.float64)  # rows, columns

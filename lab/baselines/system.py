@@ -211,7 +211,7 @@ def system_identity(about: About, **digests: str) -> str:
 
 
 def arrays_digest(**arrays: NDArray[np.generic]) -> str:
-    """SHA-256 over names, types, shapes and values: what a system has learned, for its identity."""
+    """SHA-256 over names, types, shapes and values: the learned state of a system, for its identity."""
     import torch
 
     from core.networks.identity import tensors_digest

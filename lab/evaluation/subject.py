@@ -100,7 +100,7 @@ class Subject:
 
         Args:
             kind: of measurement.
-            parts: JSON, what else it depends on.
+            parts: JSON, its further dependencies.
         """
         training = [files_digest(self.training.images), self.training.seed] if self._learns else None
         return cache_key(
@@ -133,7 +133,7 @@ class Subject:
         """One image of the traverses, decoded.
 
         Raises:
-            Others: what decoding it raises.
+            Others: errors of decoding it.
         """
         return self._load(path)
 

@@ -104,7 +104,7 @@ class ScoredTraverse:
     truth: bool [Q, R].
     candidates: how many the encoder's second stage examines.
     pairs: of the keypoints; None: nothing can be verified.
-    promised: float32 [Q, R], what the second stage promises to add to the first's scores.
+    promised: float32 [Q, R], the second stage's promised addition to the first's scores.
     screened: among how many places the second stage looks for those that it examines.
     """
 

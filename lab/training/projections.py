@@ -59,7 +59,7 @@ CONFUSABLE, APART = 3, 8
 WRONG_REACH = (3, 5)
 """Rows and columns within which wrong matches are looked for."""
 SHRINKAGE = 2.0
-"""As in ``core.method.projection``; what single matches differ by needs more of it."""
+"""As in ``core.method.projection``; the differences of single matches need more of it."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def fit_cell_projections(
     place.
 
     Args:
-        encoder: whose first stage it is; it has all layers of the stage, and projections of them.
+        encoder: of the first stage; it has all layers of the stage, and projections of them.
         photographs: folder of the training photographs.
         pairs, neighbours: how many displaced views and neighbouring frames are drawn.
     """
@@ -186,7 +186,7 @@ class Views:
 
     @classmethod
     def of(cls, encoder: Encoder, stage: AgreementDefinition, pairs: Iterable[DisplacedViews]) -> Views:
-        """Encode pairs of views; what the second stage compares of them stays unprojected."""
+        """Encode pairs of views; the second stage's features of them stay unprojected."""
         outputs = encoder.definition.outputs
         displacements: list[Displacement] = []
         sides: tuple[dict[str, list[Features]], ...] = tuple({layer: [] for layer in stage.layers} for _ in "ab")

@@ -76,7 +76,7 @@ class Key:
 
     Args:
         id: 12 hexadecimal digits, which are part of the key.
-        name: whose it is; unique among the keys in force.
+        name: of the key's holder; unique among the keys in force.
         role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
         digest: SHA-256 of the whole key, as its holder sends it.
@@ -238,7 +238,7 @@ class KeyRecords(ABC):
         """Let the holder of a key do less, or for a shorter time.
 
         Args:
-            changes: new values of ``role``, ``maps`` and ``expires_at``; what is left out stays.
+            changes: new values of ``role``, ``maps`` and ``expires_at``; fields that are left out stay.
             keep_admin: refuse to narrow the last key that can manage the service.
 
         Raises:

@@ -105,7 +105,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_documentation_file": Rule("open", "none"),
     "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
     "read_metrics": Rule("query", "all"),  # its series name all maps
-    # The console's own files; what they ask for needs a key like any other request
+    # The console's own files; their requests need a key like any other request
     "read_console": Rule("open", "none"),
     "find_console": Rule("open", "none"),
     "read_console_file": Rule("open", "none"),

@@ -105,7 +105,7 @@ class NewKey(BaseModel):
 
 
 class KeyChanges(BaseModel):
-    """A merge patch (RFC 7396) of a key; what is left out stays. The key can only be narrowed."""
+    """A merge patch (RFC 7396) of a key; fields that are left out stay. The key can only be narrowed."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"role": "query", "maps": ["lab"]}]})
 

@@ -1,4 +1,4 @@
-"""Routes of the console: the page, and the files that it loads.  They need no key; what the page then asks does."""
+"""Routes of the console: the page, and the files that it loads.  They need no key; the page's requests do."""
 
 from __future__ import annotations
 

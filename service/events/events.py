@@ -179,7 +179,7 @@ class Events:
                 del self._feeds[map_id]
 
     def end(self, map_id: str) -> None:
-        """End the streams of a map that was deleted; what was published before is still read."""
+        """End the streams of a map that was deleted; earlier events are still read."""
         with self._lock:
             feed = self._feeds.pop(map_id, None)
             if feed is not None:

@@ -55,7 +55,7 @@ class JobContext:
     """The interface between a running job and the service; it is used in the job's thread.
 
     id, map_id, arguments, attempt, maps: as in :class:`service.jobs.records.Job`.
-    notes: what :meth:`remember` stored, also in an earlier attempt.
+    notes: the notes of :meth:`remember`, also of an earlier attempt.
     """
 
     def __init__(self, jobs: Supervisor, job: Job) -> None:

@@ -110,7 +110,7 @@ class Job:
 
 
 class JobRecords:
-    """The file of the jobs.  Thread-safe; what a method writes is synced when it returns.
+    """The file of the jobs.  Thread-safe; the writes of a method are synced when it returns.
 
     Every method may raise StorageFull and StorageFailure.
     """

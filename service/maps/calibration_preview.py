@@ -1,4 +1,4 @@
-"""The route that reads a map's calibration, what was measured for it, and what another threshold would change."""
+"""The route that reads a map's calibration, its measurements, and the effect of another threshold."""
 
 from __future__ import annotations
 

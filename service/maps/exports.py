@@ -40,7 +40,7 @@ class Export:
     """A map as it was at one time.
 
     map: the object, since a later map of the same id is another map.
-    state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same.
+    state: the value of ``map.exporter.state()`` then; the map has not changed as long as it gives the same.
     file: the export file.
     readers: how many responses read it now.
     used: when it was last requested, on the monotonic clock.

@@ -271,7 +271,7 @@ class CalibrationOrder(BaseModel):
     )
     beside: Literal["encoder", "map", "none"] = Field(
         default="encoder",
-        description="With the method labels, what the labels join, since they are few and of the doubtful frames. "
+        description="With the method labels, further frames, since labels are few and of the doubtful frames. "
         "`encoder`: the encoder's calibration, whose curve is moved as far as the labels demand; the target is not "
         "used then. `map`: the map's own frames, which query it as well. `none`: nothing.",
     )

@@ -106,7 +106,7 @@ async def enrol(
         QueueFull, DeadlineExceeded, ClientGone, BatchOutOfOrder: nothing was stored.
         TooManyPlaces: the map has no room for the places.
         StorageFull, StorageFailure: nothing of the last commit was stored.
-        Others: what ``reject`` raises.
+        Others: errors of ``reject``.
     """
     digests = await in_thread(lambda: [digest_of(frame) for frame in frames])
     stored: dict[int, Enrolled] = {}

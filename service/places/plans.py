@@ -83,7 +83,7 @@ class Plans:
                 f"The map has {count} places, and a plan lists at most {MOST_PLACES}: send "
                 f"step={-(-count // MOST_PLACES)} or more."
             )
-        state = map_.state  # of now: what is written while the plan is read makes it old
+        state = map_.state  # of now: a write while the plan is read makes it old
         columns = map_.plan.columns(step)
         revision = hashlib.sha256(columns.encode()).hexdigest()[:32]
         head = {"map": map_.record.id, "revision": revision, "places": count, "step": step}

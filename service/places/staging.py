@@ -194,7 +194,7 @@ class Staging:
             MalformedBody: the form is not multipart, or incomplete.
             BodyTooLarge: the form has too many parts.
             StorageFull, StorageFailure: the disk is full or refuses.
-            Others: what ``chunks`` raises.
+            Others: errors of ``chunks``.
         """
         arrival = Arrival(self._folder, "store the frames", inside="form")
         name = arrival.name

@@ -285,7 +285,7 @@ class RayEncoders:
 
         Raises:
             TimeoutError: it takes too long.
-            Others: what Ray raises when the replica, or the way to it, is gone.
+            Others: Ray's errors when the replica, or the way to it, is gone.
         """
         until = time.monotonic() + LONGEST_CALL
         response = self._handle.remote(sent)

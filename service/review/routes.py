@@ -118,7 +118,7 @@ async def label_frame(
 ) -> Labelled:
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
-    Or throw it away. A label that is given again replaces the one before; what was enrolled stays. Labels serve to
+    Or throw it away. A label that is given again replaces the one before; enrolled places stay. Labels serve to
     calibrate the map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)

@@ -165,7 +165,7 @@ class FrameParameters(Parameters):
         default=None,
         max_length=512,
         description="The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated "
-        "by commas, in metres and radians as in ROS; what it grows by is that of the motion.",
+        "by commas, in metres and radians as in ROS; its growth is that of the motion.",
     )
     odometry_origin: str | None = Field(
         default=None,

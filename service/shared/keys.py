@@ -90,7 +90,7 @@ class _Watch:
         return self._keys.version() != self._version
 
     def read(self) -> list[Key] | None:
-        version = self._keys.version()  # before the keys: what is changed meanwhile is read again
+        version = self._keys.version()  # before the keys: later changes are read again
         found = self._keys.all()
         self._version = version
         return found or None

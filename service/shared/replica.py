@@ -83,7 +83,7 @@ class ServiceReplica:
             self._threads.append(thread)
 
     def close(self) -> None:
-        """Leave; what this service held can be taken over at once."""
+        """Leave; the leases of this service can be taken over at once."""
         self._stopping.set()
         for thread in self._threads:
             thread.join(5)

@@ -1,7 +1,7 @@
 """Statistics and latest answers of any number of services together.
 
 Each service counts in memory and adds its counts to the common ones at intervals, so that no query waits.  The counts
-of all are sums; what a service has not added yet only that one shows, and its crash loses it.
+of all are sums; counts that a service has not added yet are shown by it alone, and lost in its crash.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def _new_names(
     coming: Sequence[Outline],
     conflicts: list[str],
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """New names for sequences and cameras whose names are taken here; what cannot be renamed is added to conflicts."""
+    """New names for sequences and cameras whose names are taken here; others are added to conflicts."""
     rule, prefix = options["on_conflict"], options["prefix"]
     ours = {place.sequence for place in before}
     shared = sorted({place.sequence for place in coming if place.sequence is not None} & (ours - {None}))

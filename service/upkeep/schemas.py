@@ -73,8 +73,9 @@ class Aligning(BaseModel):
         alias="with",
         default=None,
         max_length=1000,
-        description="The traverses to align it with; all others if left out. What an earlier alignment of the traverse "
-        "found is replaced. With an empty list it is only forgotten, with the poses that were handed over.",
+        description="The traverses to align it with; all others if left out. The result of an "
+        "earlier alignment of the traverse is replaced. With an empty list it is only forgotten, with the poses that were "
+        "handed over.",
     )
     poses: bool = Field(
         strict=True,

@@ -111,7 +111,7 @@ def read_place(place: NewPlace, digest: bool = False) -> Read:
     """Read a frame and make its entry; with ``digest`` only the digest of its bytes is held.
 
     Raises:
-        InvalidParameter: the place is none; what is wrong with one is its ``error``.
+        InvalidParameter: the place is none; the fault of one is its ``error``.
     """
     if not isinstance(place, NewPlace):
         raise InvalidParameter(f"A frame to enrol has to be a NewPlace, not a {type(place).__name__}.")

@@ -42,7 +42,7 @@ class SequenceLine(_Line):
 
 
 class CameraLine(_Line):
-    """A camera, what is ignored in its frames, and its intrinsics."""
+    """A camera, the ignored parts of its frames, and its intrinsics."""
 
     name: Camera
     mask: Mask | None

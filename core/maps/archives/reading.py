@@ -115,7 +115,7 @@ def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Mani
 
 
 class PartReader:
-    """Reads one part in order; what was read is trustworthy only when :meth:`finish` has returned."""
+    """Reads one part in order; its data is trustworthy only when :meth:`finish` has returned."""
 
     def __init__(self, read_at: Callable[[int, int], bytes], member: Member, part: ArchivePart) -> None:
         self._read_at, self._member, self._part = read_at, member, part

@@ -219,7 +219,7 @@ def append(folder: Path, layout: Layout, first_row: int, records: NDArray[np.voi
     """Append records to the ``first_row`` rows of a map, and sync the files and the folder.
 
     Raises:
-        OSError: the disk refuses; what the files hold from ``first_row`` on is then unknown (:func:`rewind`).
+        OSError: the disk refuses; the content of the files from ``first_row`` on is then unknown (:func:`rewind`).
     """
     done = 0
     while done < len(records):

@@ -99,7 +99,7 @@ class Indexer:
                 self._thread.start()
 
     def stop(self, wait: bool = True) -> None:
-        """Stop building; what was published stays.
+        """Stop building; published indexes stay.
 
         Args:
             wait: wait until the thread has ended; not while the map's lock is held.

@@ -148,7 +148,7 @@ def show_thresholds(figures: Sequence[Evaluation]) -> None:
 
 
 def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Sequence[str]) -> None:
-    """Remarks: why figures are missing, what is special about the data, and which figures are cached."""
+    """Remarks: why figures are missing, special properties of the data, and which figures are cached."""
     for note in notes:
         remark(note)
     reasons = dict.fromkeys((name, reason) for row in figures for name, reason in row.notes.items())

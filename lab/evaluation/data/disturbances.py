@@ -47,7 +47,7 @@ class Disturbance:
 
 
 def lateral_shift(pixels: Pixels, level: float, _: np.random.Generator) -> Pixels:
-    """The scene moves sideways by ``level`` percent of the width; what comes into view mirrors the edge."""
+    """The scene moves sideways by ``level`` percent of the width; the part that comes into view mirrors the edge."""
     height, width = pixels.shape[:2]
     move = np.array([[1, 0, level / 100 * width], [0, 1, 0]], np.float32)
     moved = cv2.warpAffine(pixels, move, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
@@ -62,7 +62,7 @@ def scale(pixels: Pixels, level: float, _: np.random.Generator) -> Pixels:
 
 
 def darkness(pixels: Pixels, level: float, _: np.random.Generator) -> Pixels:
-    """``level`` percent of the light is gone; what is left is rounded to 8 bits."""
+    """``level`` percent of the light is gone; the rest is rounded to 8 bits."""
     return np.round(pixels * np.float32(1 - level / 100)).astype(np.uint8)
 
 

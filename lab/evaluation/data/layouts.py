@@ -44,7 +44,7 @@ class DatasetLayout:
 
     publisher: who hands it out so.
     home: the folders from the top of the tree to the one that holds the files; any of the first may be left out.
-    holds: what must lie there for the layout to be taken.
+    holds: the files that must be there for the layout to be taken.
     read: reads that folder; raises InvalidTraverse or InvalidGroundTruth where something is missing or malformed.
     truth_file: the file that says what is true, where there is one.
     inside: folders below ``home`` that may be given in its place, as may be whatever it holds.

@@ -1,7 +1,7 @@
 """Data sets and the protocols by which they are evaluated, each by its name, as ``presets.toml`` lists them.
 
-A protocol says which traverse is the reference and which the query, what is true, what a query is not matched against,
-and how many images there should be.
+A protocol says which traverse is the reference and which the query, the truth, the references that a query is not
+matched against, and how many images there should be.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Dataset:
 
     truth: the rule, in words.
     references, queries: names that the folder of a traverse goes by; the first that is there is taken.
-    rule: what is true where no file says it; None where one must.
+    rule: the truth where no file gives it; None where one must.
     sizes: None where there are none to compare with.
     layouts: the published ways to lay it out, tried before the two folders themselves.
     excluded: the references that a query is not matched against, in words; ``exclude`` finds it.
@@ -75,7 +75,7 @@ class Dataset:
 
 
 def read_datasets(text: str) -> tuple[Dataset, ...]:
-    """The data sets of a text in the form of ``presets.toml``; what a protocol does not give is its family's.
+    """The data sets of a text in the form of ``presets.toml``; fields that a protocol does not give are its family's.
 
     Raises:
         KeyError: there is no family or no ``kind`` of that name.

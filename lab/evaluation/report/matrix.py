@@ -121,7 +121,7 @@ def png(drawing: Drawing) -> bytes:
 
 
 def heat_file(drawn: Layers) -> tuple[bytes, str]:
-    """The greys as a file, and its media type: sharp cells as PNG, what was shrunk as the smaller JPEG."""
+    """The greys as a file, and its media type: sharp cells as PNG, shrunk ones as the smaller JPEG."""
     if not drawn.shrunk:
         return png(drawn.heat), "image/png"
     done, encoded = cv2.imencode(".jpg", drawn.heat, [cv2.IMWRITE_JPEG_QUALITY, 82])

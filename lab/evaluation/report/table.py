@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """One figure: its heading, what it means, how to find and write it, and which end of it is good."""
+    """One figure: its heading, its meaning, how to find and write it, and which end of it is good."""
 
     group: str
     heading: str

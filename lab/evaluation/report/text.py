@@ -13,7 +13,7 @@ MISSING = "–"
 def plain(text: str) -> str:
     """Text that any font and any encoder of text takes: no control or direction characters, no lone surrogates.
 
-    A file name need not be valid Unicode; what is not is shown as ``\\udcff``.
+    A file name need not be valid Unicode; other bytes are shown as ``\\udcff``.
     """
     whole = text.encode("utf-8", "backslashreplace").decode("utf-8")
     return "".join(

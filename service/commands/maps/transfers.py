@@ -83,7 +83,7 @@ async def upload(service: Service, path: Path, map_id: str | None) -> dict[str, 
 
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar in mebibytes: what is called with the bytes that are done, and their number."""
+    """A progress bar in mebibytes: a function that takes the number of bytes that are done, and their total."""
     with progress() as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, size: bar.update(task, completed=-(-done // MIB), total=-(-size // MIB))
