@@ -74,8 +74,8 @@ class Aligning(BaseModel):
         default=None,
         max_length=1000,
         description="The traverses to align it with; all others if left out. The result of an "
-        "earlier alignment of the traverse is replaced. With an empty list it is only forgotten, with the poses that were "
-        "handed over.",
+        "earlier alignment of the traverse is replaced. With an empty list it is only forgotten, with the poses that "
+        "were handed over.",
     )
     poses: bool = Field(
         strict=True,

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from benchmarks.maps.damaged_bags import by_recordings, damaged, hostile, tried
+from benchmarks.recordings.damaged_bags import by_recordings, damaged, hostile, tried
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnknownTopic
 from core.recordings import Poses, RecordedFrame, open_recording
 from core.recordings.bag import STORAGES

@@ -1,6 +1,6 @@
 """Frames of bags against the same frames in a folder: reading them, enrolling them over HTTP, and memory.
 
-    python -m benchmarks.maps.recordings
+    python -m benchmarks.recordings.reading
 
 The recordings take turns, in each round each once.  ``placerec enrol`` is run as a user runs it, its start included.
 Memory is the most that a process has had which opens a recording and loads every frame.

@@ -1,6 +1,6 @@
 """Damaged, cut and hostile bags: how many frames ``core.recordings`` and the libraries read of them, and at what cost.
 
-    python -m benchmarks.maps.damaged_bags
+    python -m benchmarks.recordings.damaged_bags
 
 Each kind of bag is cut at many places, and in copies of it one bit is turned over.  Of the frames that a reader gives,
 those count that are equal to the written ones; *wrong* ones are pictures that nobody wrote.  The readers of rosbags and
@@ -152,7 +152,7 @@ def _with_chunk_of_ros1(whole: bytes, packed: bytes) -> bytes:
 def peak(reader: str, path: Path) -> str:
     """The most memory of a process that reads a bag, MB, and how that ends."""
     program = (
-        "import re, sys; from pathlib import Path; from benchmarks.maps.damaged_bags import READERS\n"
+        "import re, sys; from pathlib import Path; from benchmarks.recordings.damaged_bags import READERS\n"
         "try:\n    end = str(len(list(READERS[sys.argv[1]](Path(sys.argv[2]))))) + ' frames'\n"
         "except Exception as error:\n    end = type(error).__name__\n"
         "most = int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])\n"

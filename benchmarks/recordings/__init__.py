@@ -1,0 +1,1 @@
+"""Bags, videos and folders of pictures: reading them whole, and damaged."""
