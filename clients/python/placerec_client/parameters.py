@@ -534,7 +534,7 @@ class SendFrame(TypedDict, total=False):
 
     odometry_covariance: str | Sequence[float] | None
     """The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated by commas,
-    in metres and radians as in ROS; what it grows by is that of the motion.
+    in metres and radians as in ROS; its growth is that of the motion.
     """
 
     odometry_origin: str | None
@@ -906,7 +906,7 @@ class CalibrationOrder(TypedDict, total=False):
     """The largest number of frames that query the map; they are chosen evenly."""
 
     beside: Literal["encoder", "map", "none"]
-    """With the method labels, what the labels join, since they are few and of the doubtful frames. `encoder`: the
+    """With the method labels, further frames, since labels are few and of the doubtful frames. `encoder`: the
     encoder's calibration, whose curve is moved as far as the labels demand; the target is not used then. `map`: the
     map's own frames, which query it as well. `none`: nothing.
     """
@@ -936,7 +936,7 @@ class NewKey(TypedDict, total=False):
 
 
 class KeyChanges(TypedDict, total=False):
-    """A merge patch (RFC 7396) of a key; what is left out stays. The key can only be narrowed."""
+    """A merge patch (RFC 7396) of a key; fields that are left out stay. The key can only be narrowed."""
 
     role: Literal["query", "enrol", "admin"] | None
     """Not higher than now."""

@@ -41,7 +41,7 @@ class Keys(OldNames, revoke="delete"):
         It is sent once: if the answer is lost, the key may be there all the same, and should be deleted.
 
         Args:
-            name: whose key it is.
+            name: of the key's holder.
             role: of its holder.
             lock_out: whether it may be that nobody has the role admin afterwards.
             options: such as ``maps`` and ``expires_at``.
@@ -55,7 +55,7 @@ class Keys(OldNames, revoke="delete"):
         return self._connection.ask(models.KeyView, "GET", self._of(key_id))
 
     def narrow(self, key_id: str, changes: parameters.KeyChanges, *, lock_out: bool | None = None) -> models.KeyView:
-        """Let a key do less, or for a shorter time; what is left out stays."""
+        """Let a key do less, or for a shorter time; fields that are left out stay."""
         return self._connection.ask(
             models.KeyView, "PATCH", self._of(key_id), params={"lock_out": lock_out}, json=changes
         )
