@@ -157,7 +157,7 @@ def textured(picture: Picture, seed: int) -> Picture:
 
 
 def first_look(picture: Picture) -> Picture:
-    """What the camera sees of a scene."""
+    """The view of the camera on a scene."""
     return picture[RIM:-RIM, RIM:-RIM]
 
 

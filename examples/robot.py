@@ -25,7 +25,7 @@ OF_THE_FRAME = (400, 413, 415, 422)
 
 
 def act(answer: QueryAnswer) -> str:
-    """What the robot makes of an answer; here it only says so."""
+    """The robot's use of an answer; here it only says so."""
     candidates = ", ".join(f"{match.place.id} ({match.score:.3f})" for match in answer.matches[:3])
     if answer.place is not None:
         pose = answer.place.pose.model_dump(exclude_none=True) if answer.place.pose else "not known"
@@ -37,7 +37,7 @@ def act(answer: QueryAnswer) -> str:
 
 
 def look(lab: Map, frame: Path, deadline: float) -> str:
-    """What the robot does with one frame.
+    """The robot's steps with one frame.
 
     Raises:
         PlacerecError: no frame will be answered: no such map, no permission, a service that needs its operator.

@@ -22,7 +22,7 @@ OVER = (problems.UnknownSession, problems.SessionExpired, problems.UnknownMap)
 
 
 def act(answer: SessionAnswer) -> str:
-    """What the robot makes of an answer; here it only says so."""
+    """The robot's use of an answer; here it only says so."""
     if answer.lost:
         return "lost: stop, look around"
     if answer.place is not None:

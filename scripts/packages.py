@@ -39,7 +39,7 @@ SETTINGS = {
 
 
 def pip_settings() -> str:
-    """What ``pip config list`` prints."""
+    """The output of ``pip config list``."""
     return subprocess.run([*PIP[:3], "config", "list"], check=True, capture_output=True, text=True).stdout
 
 
@@ -66,7 +66,7 @@ def uv_settings(listing: str) -> dict[str, str]:
 
 
 def without_index(listing: str) -> bool:
-    """Whether pip is told to ask no index, by what ``pip config list`` has printed; uv has no variable for it."""
+    """Whether pip is set to query no index, by the output of ``pip config list``; uv has no variable for it."""
     return " ".join(configured(listing).get("no-index", [])).lower() in ("1", "true", "yes", "on", "y", "t")
 
 

@@ -137,8 +137,8 @@ class Bag:
         """
         topics = self.topics
         fitting = {one: topic for one, topic in topics.items() if topic.kind in kinds}
-        told = "; ".join(f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in fitting.items())
-        there = f"It has these topics of {what}: {told}." if told else f"It has no topic of {what}."
+        listed = "; ".join(f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in fitting.items())
+        there = f"It has these topics of {what}: {listed}." if listed else f"It has no topic of {what}."
         if name is None:
             filled = [one for one, topic in fitting.items() if topic.messages]
             if len(filled) == 1:
@@ -279,7 +279,7 @@ class Bag:
             raise InvalidTrajectory(f"No message of {name} has a position.")
         return Trajectory.of_samples(times, places, turns, self.topics[name].kind == FIX)
 
-    def told(self) -> list[str]:
+    def all_remarks(self) -> list[str]:
         """All remarks, those about damaged files first."""
         damaged = [
             f"{file.name} {storage.problem}: the part that could be read is used."

@@ -131,7 +131,7 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
         )
         if poses.topic is not None:
             _place(recording, bag.trajectory(poses.topic), False, poses.largest_gap)
-        recording.remarks = bag.told() + recording.remarks
+        recording.remarks = bag.all_remarks() + recording.remarks
     except BaseException:
         bag.close()
         raise

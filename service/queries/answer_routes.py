@@ -167,11 +167,11 @@ def list_answers(
     admins.
     """
     key = map_key(engine.maps.get(map_id))
-    kept = statistics.recent.of_map(key)
-    wanted = [one for one in kept if options.wants(one)][: options.limit]
+    stored = statistics.recent.of_map(key)
+    wanted = [one for one in stored if options.wants(one)][: options.limit]
     return RecentAnswerList(
         items=[RecentAnswerView(**RecentAnswerView.fields_of(one, principal)) for one in wanted],
-        kept=len(kept),
+        kept=len(stored),
         hours=statistics.hours(key),
     )
 
@@ -189,8 +189,8 @@ def list_place_matches(
     map_ = engine.maps.get(map_id)
     map_.place(place_id)
     key = map_key(map_)
-    kept = [one for one in statistics.recent.of_map(key) if options.wants(one)]
-    found = [(one, rank) for one in kept if (rank := one.rank_of(place_id)) is not None]
+    stored = [one for one in statistics.recent.of_map(key) if options.wants(one)]
+    found = [(one, rank) for one in stored if (rank := one.rank_of(place_id)) is not None]
     count = statistics.of_place(key, place_id)
     return PlaceMatchList(
         items=[

@@ -12,7 +12,7 @@ from tests.project.sources import FILES, ROOT, syntax_of
 
 HEADLESS = re.compile(r"(What|Whose|Of which|That which)\s")
 
-ROOMS = ("core", "service", "lab", "benchmarks", "clients")
+ROOMS = ("core", "service", "lab", "benchmarks", "clients", "examples", "scripts")
 
 
 def headless(path: Path) -> list[str]:

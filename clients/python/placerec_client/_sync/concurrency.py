@@ -59,7 +59,7 @@ class Task(Generic[Result]):
         self._thread.start()
 
     def result(self, seconds: float | None = None) -> Result:
-        """Wait for the end of the work; return its result or raise its error, or TimeoutError after so many seconds."""
+        """Wait for the end of the work; return its result or raise its error, or TimeoutError after ``seconds``."""
         return self._future.result(seconds)
 
     def end(self) -> None:
@@ -74,7 +74,7 @@ def acquire(lock: threading.Lock, seconds: float | None) -> None:
     """Take a lock.
 
     Raises:
-        TimeoutError: it has not become free within so many seconds; None waits for any time.
+        TimeoutError: it has not become free in time; None waits for any time.
     """
     if not lock.acquire(timeout=-1 if seconds is None else min(max(seconds, 0.0), threading.TIMEOUT_MAX)):
         raise TimeoutError
