@@ -10,7 +10,7 @@ from typing import Annotated, Literal, cast
 import typer
 
 from core.disk.files import replacing
-from service.commands.console import Commands, Failure, output, remark, show, table
+from service.commands.console import Commands, Failure, remark, say, show, table
 from service.commands.encoders.models import ModelsDir, models_directory
 
 model = typer.Typer(cls=Commands, help="Import networks that were trained elsewhere.", no_args_is_help=True)
@@ -122,7 +122,7 @@ def _import_described(
         remark(f"Its encoder learns from pictures: placerec vocabulary train IMAGES… --network {name} --name {name}")
         return
     encoder = install_described(folder, name, name, path, chosen, seed)
-    output.print(f"{encoder.identity}\ninstalled in {folder}", soft_wrap=True, highlight=False)
+    say(f"{encoder.identity}\ninstalled in {folder}")
     if chosen is None:
         remark(f"It calls every frame unknown until it is calibrated: placerec calibrate {name} --packaged IMAGES")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.disk.files import replacing
 from lab.commands.making import MOST_IMAGES, install_described, split
 from lab.commands.model import check_free_name
-from service.commands.console import Commands, Failure, output, progress
+from service.commands.console import Commands, Failure, progress, say
 from service.commands.encoders.models import ModelsDir, models_directory
 from service.commands.encoders.pictures import FEWEST_IMAGES, find_images, measured, read_images
 
@@ -96,7 +96,7 @@ def train(
     if is_onnx_network(network_file):
         _install_network(network_name, network_file, folder)
         found = install_described(folder, name, network_name, network_file, chosen, seed)
-        output.print(f"{found.identity}\ninstalled in {folder}", soft_wrap=True, highlight=False)
+        say(f"{found.identity}\ninstalled in {folder}")
         return
     layer_names = tuple(part.strip() for part in layers.split(","))
     try:
@@ -132,7 +132,7 @@ def train(
         save_encoder(folder, encoder, made, network_name, training)
     except OSError as error:
         raise Failure(f"{folder} cannot be written: {error.strerror or error}.") from error
-    output.print(f"{encoder.identity}\ninstalled in {folder}", soft_wrap=True, highlight=False)
+    say(f"{encoder.identity}\ninstalled in {folder}")
 
 
 def _find_network(given: str, folder: Path) -> tuple[str, Path]:

@@ -12,7 +12,7 @@ import typer
 
 from core.errors import InvalidImage, InvalidRecording
 from service.commands.connection.client import AsJson, CommandTarget, DataDir, MapId, Url, ask, media_type, path_of
-from service.commands.console import Failure, number, output, remark, show, show_json, table
+from service.commands.console import Failure, number, remark, say, show, show_json, table
 from service.commands.encoders.models import ModelsDir, models_directory, open_catalogue
 from service.commands.encoders.pictures import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
 from service.commands.jobs import submit
@@ -143,11 +143,9 @@ def _calibrate_encoder(name: str, pictures: list[Path], models_dir: Path | None,
     if as_json:
         show_json({"encoder": encoder.identity, "stored": not dry_run, "calibration": found.model_dump(mode="json")})
         return
-    output.print(
+    say(
         f"{encoder.identity} {'would be' if dry_run else 'is'} calibrated by {found.frames} pictures: threshold "
-        f"{number(found.threshold)}, margin {number(found.margin)}.",
-        soft_wrap=True,
-        highlight=False,
+        f"{number(found.threshold)}, margin {number(found.margin)}."
     )
     if found.curve is None:
         remark("The pictures are all alike, or distinguished without a mistake: no probabilities could be fitted.")
@@ -217,10 +215,9 @@ def _show(report: dict[str, Any]) -> None:
     for warning in report["warnings"]:
         remark(warning)
     done = "is calibrated" if report["stored"] else "would be calibrated"
-    output.print(
+    say(
         f"The map {report['map']} {done} by {measured['frames']} frames: threshold {number(calibration['threshold'])}, "
-        f"margin {number(calibration['margin'])}.",
-        highlight=False,
+        f"margin {number(calibration['margin'])}."
     )
     figures = table("figure", "#value", "#from", "#to")
     for name in ("precision", "recall", "false_accept_rate"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,11 @@ RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("
 """Commands by their group and the names that they had once."""
 
 
+UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Control characters, with which a text could drive the terminal, and those that turn the direction of a line around.
+A tab and the end of a line are none."""
+
+
 class Failure(Exception):
     """A command failed for a foreseen reason; its text explains it to the user."""
 
@@ -64,14 +70,24 @@ class Commands(TyperGroup):
             raise typer.Exit(1) from error
 
 
+def printable(text: str) -> str:
+    """A text with its unprintable characters as JSON writes them (``\\u001b``), for it may come from anybody."""
+    return UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def say(sentence: str) -> None:
+    """Write a sentence to standard output."""
+    output.print(Text(printable(sentence)), soft_wrap=True)
+
+
 def complain(sentence: str) -> None:
     """Write an error to standard error."""
-    messages.print(Text.assemble(("Error: ", "bold red"), sentence), soft_wrap=True)
+    messages.print(Text.assemble(("Error: ", "bold red"), printable(sentence)), soft_wrap=True)
 
 
 def remark(sentence: str) -> None:
     """Write a remark to standard error."""
-    messages.print(Text(sentence), soft_wrap=True)
+    messages.print(Text(printable(sentence)), soft_wrap=True)
 
 
 class Rate(ProgressColumn):
@@ -85,7 +101,7 @@ class Rate(ProgressColumn):
 def progress() -> Progress:
     """A progress bar on standard error; if that is no terminal, only the last state is written."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         Rate(),
@@ -97,12 +113,30 @@ def progress() -> Progress:
 
 def show_json(value: Any) -> None:
     """Write a value as indented JSON to standard output."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    typer.echo(json_text(value, indent=2))
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """JSON for a terminal: only characters that would drive it are escaped."""
+    return printable(json.dumps(value, indent=indent, ensure_ascii=False))
+
+
+class PlainTable(Table):
+    """A table of texts that are shown as they are, whoever wrote them: none is markup, none drives the terminal."""
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        super().add_row(*(Text(printable(one)) if isinstance(one, str) else one for one in cells), **options)
 
 
 def table(*columns: str, title: str | None = None) -> Table:
     """An empty table; a column whose name starts with ``#`` is aligned right, for numbers."""
-    made = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    made = PlainTable(
+        title=None if title is None else Text(printable(title), style="table.title"),
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+    )
     for column in columns:
         made.add_column(column.removeprefix("#"), justify="right" if column.startswith("#") else "left")
     return made

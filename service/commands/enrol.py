@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.markup import escape
 
 from core.errors import InvalidIdentifier
 from core.places import check_sequence
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
-from service.commands.console import Failure, complain, output, progress
+from service.commands.console import Failure, complain, progress, say
 from service.commands.jobs import show_outcome, submit
 from service.commands.options.recordings import (
     PANEL,
@@ -168,13 +167,10 @@ def _show_aligned(job: dict[str, Any]) -> None:
         return
     found = job["result"]
     paired = ", ".join(f"{one['sequence']}: {one['paired']}" for one in found["traverses"] if one["paired"])
-    output.print(
+    say(
         f"{found['paired']} of {found['frames']} frames show places of other traverses"
         f"{f' ({paired})' if paired else ''}; "
-        f"{found['poses_handed_over']} poses were handed over.",
-        soft_wrap=True,
-        markup=False,
-        highlight=False,
+        f"{found['poses_handed_over']} poses were handed over."
     )
 
 
@@ -199,7 +195,7 @@ async def _enrol(
         frames = await asyncio.to_thread(choose, used, mask)
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
-            task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
+            task = bar.add_task(f"Enrolling into {map_id}", total=len(frames))
 
             def report_frame(outcome: SendingOutcome) -> None:
                 report.add(outcome)
@@ -257,13 +253,10 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend
 def _show(report: Report, map_id: str, sequence: str, frames: int, seconds: float) -> None:
     done = sum(report.changes.values())
     counts = ", ".join(f"{count} {change}" for change, count in sorted(report.changes.items()))
-    output.print(
+    say(
         f"{done} of {frames} frames are places of {map_id}, sequence {sequence}"
         f"{f': {counts}' if counts else ''}; {report.posed} with a pose; "
-        f"{report.uploaded} sent in {seconds:.1f} s.",
-        soft_wrap=True,
-        markup=False,
-        highlight=False,
+        f"{report.uploaded} sent in {seconds:.1f} s."
     )
     for frame, reason in sorted(report.failures):
         complain(f"{frame}: {reason}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -22,7 +21,7 @@ from service.commands.connection.client import (
     path_of,
     run,
 )
-from service.commands.console import Failure, complain, number, show, table
+from service.commands.console import Failure, complain, json_text, number, show, table
 from service.commands.options.recordings import (
     EveryChange,
     EveryDegrees,
@@ -184,7 +183,7 @@ async def _query(
                 continue
             if as_json:
                 line = {"file": file, **({"frame": frame.id} if of_recording else {}), **answer}
-                typer.echo(json.dumps(line, ensure_ascii=False))
+                typer.echo(json_text(line))
             else:
                 rows.add_row(frame.name, *_cells(answer))
     if rows.row_count:

@@ -11,6 +11,7 @@ import asyncio
 import functools
 import logging
 import math
+import os
 import resource
 import signal
 import socket
@@ -74,9 +75,10 @@ def serve_application(
         log_config=None,
         access_log=False,
         server_header=False,
+        proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,  # whoever calls from this machine is not believed by default
         ws_max_size=settings.max_image_bytes,
         ws_per_message_deflate=False,  # frames are compressed already
-        lifespan="off",  # stored here, so that an error at the start reaches the caller
+        lifespan="off",  # run here, so that an error at the start reaches the caller
         timeout_keep_alive=math.ceil(settings.keep_alive_timeout),
         timeout_graceful_shutdown=math.ceil(settings.shutdown_timeout),
         **protocols,

@@ -49,7 +49,9 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     made = subprocess.run(
         [*command, "--data-dir", folder / "data"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    server, port = Server(folder), free_port()
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("FORWARDED_ALLOW_IPS", "127.0.0.1")  # of nginx, as compose.tls.yaml names it
+        server, port = Server(folder), free_port()
     changes = {
         "placerec:8000": f"127.0.0.1:{server.port}",
         "/etc/nginx/certificates": str(folder),

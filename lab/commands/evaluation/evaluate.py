@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import typer
-from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from lab.commands.evaluation.output import (
@@ -136,7 +135,7 @@ class _Bar:
 
     def begin(self, system: str, steps: int) -> None:
         self._steps = steps
-        self._task = self._bar.add_task(escape(system), total=steps)
+        self._task = self._bar.add_task(system, total=steps)
 
     def advance(self) -> None:
         self._bar.advance(self._task)

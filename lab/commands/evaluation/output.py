@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from lab.evaluation import DEPTHS, Evaluation, Outcome, SystemComparison, SystemRun
 from lab.evaluation.data.published import RECALLS, PublishedRecall
@@ -101,7 +100,7 @@ def show_figures(figures: Sequence[Evaluation], title: str, verified: Sequence[s
     for row, when in zip(figures, verified or [None] * len(figures), strict=True):
         values = [row.auc_roc, *(row.recall_at[str(depth)] for depth in DEPTHS)]
         shown.add_row(
-            escape(name_of(row.encoder)),
+            name_of(row.encoder),
             *([] if verified is None else [when or "–"]),
             row.one_class or number(row.auc_pr),
             *map(number, values),
@@ -124,7 +123,7 @@ def show_costs(figures: Sequence[Evaluation]) -> None:
     for row in figures:
         place = None if row.bytes_per_place is None else row.bytes_per_place / 1000
         shown.add_row(
-            escape(name_of(row.encoder)),
+            name_of(row.encoder),
             *(number(row.milliseconds.get(stage), 2) for stage in stages),
             number(row.describe_milliseconds, 2),
             number(row.milliseconds["match"], 3),
@@ -142,7 +141,7 @@ def show_thresholds(figures: Sequence[Evaluation]) -> None:
         for one in row.thresholds if row.negatives else []:
             before, after = one.before.model_dump(), one.after.model_dump()
             changes = [f"{before[name]} → {after[name]}" for name in counts]
-            shown.add_row(escape(name_of(row.encoder)), RULES[one.rule], number(one.threshold), *changes)
+            shown.add_row(name_of(row.encoder), RULES[one.rule], number(one.threshold), *changes)
     if shown.row_count:
         show(shown)
 
@@ -168,7 +167,7 @@ def show_published(published: Sequence[PublishedRecall]) -> None:
     shown = table("system", *heads, "#year", "source", title=title)
     for one in published:
         recalls = [*one.recall_at, *(None for _ in RECALLS[len(one.recall_at) :])]
-        shown.add_row(escape(one.system), *map(number, recalls), str(one.year), escape(one.source))
+        shown.add_row(one.system, *map(number, recalls), str(one.year), one.source)
     if shown.row_count:
         show(shown)
 
@@ -182,7 +181,7 @@ def show_trends(comparison: SystemComparison) -> None:
         for point in comparison.scalability:
             counts = (str(point.references), str(point.queries))
             figures = (number(point.auc_pr), number(point.recall_at_1), number(point.milliseconds, 3))
-            shown.add_row(escape(point.system), *counts, *figures)
+            shown.add_row(point.system, *counts, *figures)
         show(shown)
     if comparison.severity:
         steps = [f"step {step}" for step in range(1, max(len(curve.levels) for curve in comparison.severity))]
@@ -191,7 +190,7 @@ def show_trends(comparison: SystemComparison) -> None:
         for curve in comparison.severity:
             levels = zip(curve.levels, curve.auc_pr, curve.recall_at_1, strict=True)
             cells = [f"{level:g}: {area:.3f} {recall:.3f}" for level, area, recall in levels]
-            shown.add_row(escape(curve.system), curve.disturbance, *cells, curve.unit)
+            shown.add_row(curve.system, curve.disturbance, *cells, curve.unit)
         show(shown)
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.box import HEAVY_HEAD
-from rich.markup import escape
 
 from service.commands.console import output, show, table
 from service.commands.encoders.models import ModelsDir, default_encoder, name_of, open_catalogue
@@ -137,7 +136,7 @@ def show_list(models: EncoderCatalogue) -> None:
         column.overflow, column.no_wrap = "fold", column.header == "name"
     for about in systems(models):
         needed = "none" if about.weights is None else f"--weights {about.name}=FILE: {about.weights}"
-        shown.add_row(*map(escape, (about.name, f"{about.title}. {about.paper}", _configuration(about), needed)))
+        shown.add_row(about.name, f"{about.title}. {about.paper}", _configuration(about), needed)
     show(shown)
     columns = ("name", "data set", "references", "queries", "true", "left out", "protocol of")
     sets = table(*columns, title="Data sets, for --dataset")

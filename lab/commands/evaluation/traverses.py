@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from core.frames.traverses import find_images, find_images_below, read_retained_references
 from lab.commands.evaluation.systems import SYSTEMS
@@ -178,7 +177,7 @@ def _images(path: Path, options: RecordingOptions, stack: ExitStack, encoder: st
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="placerec-")))
     with options.open(path) as recording, progress() as bar:
         chosen = options.choose(recording, encoder)
-        return extract(bar.track(chosen, description=f"Reading {escape(path.name)}"), folder)
+        return extract(bar.track(chosen, description=f"Reading {path.name}"), folder)
 
 
 def name_pair(reference: Path, query: Path) -> str:

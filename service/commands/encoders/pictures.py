@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from core.errors import InvalidImage
 from core.frames.traverses import SUPPORTED_SUFFIXES, natural_key
 from service.commands.connection.client import read_bytes
-from service.commands.console import Failure, messages, progress
+from service.commands.console import Failure, progress, remark
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels
@@ -46,7 +46,7 @@ def read_images(paths: Iterable[Path]) -> Iterator[Pixels]:
         try:
             yield decode(read_bytes(path))
         except InvalidImage as error:
-            messages.print(f"{path} is left out: {error}", soft_wrap=True, markup=False, highlight=False)
+            remark(f"{path} is left out: {error}")
 
 
 def measured(encoder: Encoder, paths: Sequence[Path]) -> Calibration:

@@ -7,6 +7,7 @@ DIR/<map>.<sha256…>.tar     a file is never overwritten: a new one has a name 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -39,6 +40,9 @@ Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this m
 
 INDEX = "index.json"
 FORMAT = "placerec backup"
+
+MAP_ID = r"^[a-z0-9][a-z0-9._-]{0,63}$"
+"""The id of a map, of which the name of a file is made: whatever a service answers, the file stays in the folder."""
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A tar file.", show_default=False)]
 
@@ -87,7 +91,7 @@ class BackupEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    id: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
+    id: str = Field(pattern=MAP_ID)
     file: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,100}$")
     manifest_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     bytes: int
@@ -150,8 +154,8 @@ def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir
 async def _save_all(service: Service, folder: Path, index: BackupIndex, only: list[str] | None) -> list[str]:
     """Save maps one after the other; return those that could not be saved."""
     pages = [page async for page in service.pages(path_of("maps"))]
-    there = [item["id"] for page in pages for item in page["items"]]
-    failed = [item["id"] for item in pages[0]["quarantined"] if only is None or item["id"] in only]
+    there = [_checked(item["id"]) for page in pages for item in page["items"]]
+    failed = [_checked(item["id"]) for item in pages[0]["quarantined"] if only is None or item["id"] in only]
     for map_id in failed:
         complain(f"{map_id} is damaged and out of service; its earlier file stays.")
     if missing := set(only or ()) - {*there, *failed}:
@@ -167,6 +171,17 @@ async def _save_all(service: Service, folder: Path, index: BackupIndex, only: li
                 failed.append(map_id)
     _write_index(folder, index)
     return failed
+
+
+def _checked(map_id: Any) -> str:
+    """An id from a service's answer.
+
+    Raises:
+        Failure: it is none, and a file of its name might be anywhere.
+    """
+    if not isinstance(map_id, str) or re.search(MAP_ID, map_id) is None or "\n" in map_id:
+        raise Failure(f"The service names a map {map_id!r}, which is no id of a map. Nothing was saved.")
+    return map_id
 
 
 async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str) -> None:

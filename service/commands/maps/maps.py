@@ -17,7 +17,7 @@ from service.commands.connection.client import (
     path_of,
     run,
 )
-from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
+from service.commands.console import Commands, Failure, number, remark, say, show, show_json, table
 from service.commands.maps.backup import export, import_
 from service.commands.maps.places import places, sequences
 from service.commands.maps.upkeep import align, health, keypoints, merge, prune, rebuild, reencode
@@ -163,7 +163,7 @@ def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json
     if not report["ok"]:
         raise Failure(f"The map {map_id} is damaged: {' '.join(report['problems'])}")
     if not as_json:
-        output.print(f"The map {map_id} is not damaged: {report['places']} places were checked.", highlight=False)
+        say(f"The map {map_id} is not damaged: {report['places']} places were checked.")
 
 
 def _given(

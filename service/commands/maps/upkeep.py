@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from service.commands.connection.client import AsJson, CommandTarget, DataDir, MapId, Url, ask, path_of
-from service.commands.console import number, output, remark, show, show_json, table
+from service.commands.console import number, remark, say, show, show_json, table
 from service.commands.jobs import Wait, show_outcome, submit
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do it; otherwise the command only reports what it would do.")]
@@ -56,7 +56,7 @@ def health(
     if report["retraverse"]:
         show(again)
     else:
-        output.print("No stretch has to be recorded again.", highlight=False)
+        say("No stretch has to be recorded again.")
     for stop in report["stops"]:
         remark(
             f"{stop['frames']} frames of traverse {stop['sequence']} show one view, from place {stop['place']} "

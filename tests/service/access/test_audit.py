@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from core.errors import StorageFailure
 from service.access import audit
 from service.access.audit import ASKER, Asker, Refusals, asker_fields, audit_file, note_change
 from service.jobs.jobs import Jobs
+from tests.service.server import Server
 
 EVE = Asker("eve", "0123456789ab", "prune_map", "a-request", None, "10.0.0.1")
 
@@ -100,3 +102,14 @@ def test_a_file_of_its_own(tmp_path: Path) -> None:
         assert (line["logger"], line["map"], line["principal"]) == ("placerec.audit", map_id, "eve")
     with pytest.raises(StorageFailure, match="cannot be opened"), audit_file(tmp_path / "absent" / "audit.jsonl"):
         pass
+
+
+def test_nobody_says_of_itself_where_it_calls_from(server: Server) -> None:
+    """A header that a proxy would set is believed from no one who is not named as a proxy, on this machine neither."""
+    forged = {"X-Forwarded-For": "6.6.6.6"}
+    assert server.client.post("/v1/maps", json={"id": "by-whom"}, headers=forged).status_code == 201
+    until = time.monotonic() + 60  # the line is written after the answer
+    while not (lines := server.lines(logger="placerec.audit", operation="create_map", map="by-whom")):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert [line["client"] for line in lines] == ["127.0.0.1"]

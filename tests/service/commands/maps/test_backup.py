@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -26,6 +29,30 @@ def lab(server: Server) -> str:
 @pytest.fixture
 def url(server: Server) -> list[str]:
     return ["--url", str(server.client.base_url)]
+
+
+@contextmanager
+def service_with(maps: list[dict[str, object]]) -> Iterator[str]:
+    """The address of a service that answers every GET with these maps: one that is not ours, and means no good."""
+
+    class Listing(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = json.dumps({"items": maps, "quarantined": [], "next_cursor": None}).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Listing) as served:
+        threading.Thread(target=served.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{served.server_address[1]}"
+        finally:
+            served.shutdown()
 
 
 def damaged(path: Path) -> None:
@@ -145,3 +172,15 @@ def test_what_is_no_backup(placerec: Placerec, tmp_path: Path) -> None:
     entry = '{"id": "a", "file": "../../etc/passwd", "manifest_sha256": "00", "bytes": 1, "places": 1}'
     (tmp_path / "index.json").write_text(f'{{"format": "placerec backup", "version": 1, "maps": [{entry}]}}')
     assert "damaged" in placerec("backup", "verify", tmp_path, status=1).stderr
+
+
+@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "..", "a/b", "lab\n", "LAB", "", 7])
+def test_a_service_chooses_no_file(placerec: Placerec, tmp_path: Path, name: object) -> None:
+    """A backup of a service whose maps have names that lead out of the folder."""
+    folder = tmp_path / "backup" / "folder"
+    folder.mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with service_with([{"id": name}]) as address:
+        refused = placerec("backup", "create", folder, "--url", address, status=1)
+    assert "no id of a map" in refused.stderr
+    assert sorted(path for path in tmp_path.rglob("*") if path.name != "LOCK") == before

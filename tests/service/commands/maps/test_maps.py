@@ -104,3 +104,17 @@ def test_damage_is_found(placerec: Placerec, monday: Path, tmp_path: Path) -> No
     largest.write_bytes(content)
     verified = placerec("maps", "verify", "lab", status=1)
     assert "damaged" in verified.stderr
+
+
+def test_a_text_from_anybody_is_shown_as_it_is(placerec: Placerec, monday: Path, where: list[str]) -> None:
+    """Markup of the terminal library is text; characters that drive a terminal, or turn a line around, are named."""
+    name, text = f"shown-{len(where)}", "[/oops] [red]west[/red] \x1b[31m\x9b2J\u202egnissorc"
+    placerec("maps", "create", name, "--description", text, *where)
+    shown = "[/oops] [red]west[/red] \\u001b[31m\\u009b2J\\u202egnissorc"
+    for words in (("maps", "list"), ("maps", "show", name)):
+        assert shown in placerec(*words, *where).stdout
+    as_json = placerec("maps", "show", name, "--json", *where).stdout
+    assert "\\u202e" in as_json and not {"\x1b", "\x9b", "\u202e"} & set(as_json)
+    assert json.loads(as_json)["description"] == text
+    refused = placerec("maps", "show", "[/oops]\u202e", *where, status=1)
+    assert not {"\x1b", "\u202e"} & set(refused.stderr)
