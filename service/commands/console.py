@@ -25,6 +25,7 @@ from typer.core import TyperGroup
 
 from core.disk.files import write_file as write_durably
 from core.errors import PlacerecError
+from core.names import UNSEEN
 from service.commands.connection.credentials import add_key
 from service.errors.faults import Fault
 
@@ -39,9 +40,9 @@ RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("
 """Commands by their group and the names that they had once."""
 
 
-UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""Control characters, with which a text could drive the terminal, and those that turn the direction of a line around.
-A tab and the end of a line are none."""
+UNPRINTABLE = re.compile(rf"(?![\t\n])[{UNSEEN}]")
+"""Characters that no name may have, but for a tab and the end of a line: with them a text could drive the terminal,
+turn a line around, or hide something."""
 
 
 class Failure(Exception):

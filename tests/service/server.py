@@ -120,12 +120,17 @@ class Server:
         return [line for line in found if all(line.get(name) == value for name, value in wanted.items())]
 
     def logged_request(self, request_id: str) -> dict[str, Any]:
-        """The line of a request, which is written when its answer is on its way."""
-        until = time.monotonic() + 60
-        while not (lines := self.lines(message="request", request_id=request_id)) and time.monotonic() < until:
-            time.sleep(0.02)
-        (line,) = lines
+        """The line of a request."""
+        (line,) = self.lines_soon(message="request", request_id=request_id)
         return line
+
+    def lines_soon(self, **wanted: object) -> list[dict[str, Any]]:
+        """The lines of its log with these values, at least one: it is written when an answer is on its way."""
+        until = time.monotonic() + 60
+        while not (lines := self.lines(**wanted)):
+            assert time.monotonic() < until, f"no line has {wanted}"
+            time.sleep(0.02)
+        return lines
 
     def create_map(self, map_id: str, **fields: object) -> dict[str, Any]:
         """A new map."""

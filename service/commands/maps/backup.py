@@ -7,7 +7,6 @@ DIR/<map>.<sha256…>.tar     a file is never overwritten: a new one has a name 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -17,6 +16,8 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from core.errors import InvalidIdentifier
+from core.places import MAP_IDS
 from service.commands.connection.client import (
     AsJson,
     CommandTarget,
@@ -40,9 +41,6 @@ Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this m
 
 INDEX = "index.json"
 FORMAT = "placerec backup"
-
-MAP_ID = r"^[a-z0-9][a-z0-9._-]{0,63}$"
-"""The id of a map, of which the name of a file is made: whatever a service answers, the file stays in the folder."""
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A tar file.", show_default=False)]
 
@@ -91,7 +89,7 @@ class BackupEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    id: str = Field(pattern=MAP_ID)
+    id: Annotated[str, MAP_IDS]
     file: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,100}$")
     manifest_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     bytes: int
@@ -179,9 +177,10 @@ def _checked(map_id: Any) -> str:
     Raises:
         Failure: it is none, and a file of its name might be anywhere.
     """
-    if not isinstance(map_id, str) or re.search(MAP_ID, map_id) is None or "\n" in map_id:
-        raise Failure(f"The service names a map {map_id!r}, which is no id of a map. Nothing was saved.")
-    return map_id
+    try:
+        return MAP_IDS.check(map_id if isinstance(map_id, str) else "")
+    except InvalidIdentifier as error:
+        raise Failure(f"The service names a map {map_id!r}, which is no id of a map. Nothing was saved.") from error
 
 
 async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str) -> None:
