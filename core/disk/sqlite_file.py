@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -94,11 +94,13 @@ class Schema:
     application_id: names the kind of file; 0 for kinds that have none.
     version: of the tables.
     create: statements that make them in an empty file.
+    migrate: gives the statements that bring tables of an earlier version up to date; None if they are not read.
     """
 
     application_id: int
     version: int
     create: Sequence[str]
+    migrate: Callable[[int], Sequence[str] | None] = lambda _version: None
 
     def prepare(self, connection: sqlite3.Connection, create: bool = False) -> None:
         """See that a file has these tables.
@@ -115,15 +117,21 @@ class Schema:
         (owner,) = connection.execute("PRAGMA application_id").fetchone()
         query = "SELECT count(*) FROM sqlite_schema"
         if create and (version, owner) == (0, 0) and connection.execute(query).fetchone() == (0,):
-            with transaction(connection):
-                for statement in self.create:
-                    connection.execute(statement)
-                connection.execute(f"PRAGMA application_id = {self.application_id}")
-                connection.execute(f"PRAGMA user_version = {self.version}")
+            self._bring_up_to_date(connection, self.create)
         elif version < 1 or owner != self.application_id:
             raise NotOurs("it is a database, but not one of placerec's")
         elif version != self.version:
-            raise UnreadVersion(version, self.version)
+            statements = self.migrate(version)
+            if statements is None:
+                raise UnreadVersion(version, self.version)
+            self._bring_up_to_date(connection, statements)
+
+    def _bring_up_to_date(self, connection: sqlite3.Connection, statements: Sequence[str]) -> None:
+        with transaction(connection):
+            for statement in statements:
+                connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {self.application_id}")
+            connection.execute(f"PRAGMA user_version = {self.version}")
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ from pymilvus import CollectionSchema, DataType, FieldSchema, connections, utili
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StoreOfAnotherVersion, StoreUnavailable
+from core.ledger.outage import Outage, Unreachable
 from core.milvus.expressions import NO_HEADING
 from core.milvus.indexes import indexing_for, search_settings
-from core.milvus.outage import Outage, Unreachable
 from core.places import Whereabouts
 
 warnings.filterwarnings("ignore", message=".*ORM-style PyMilvus API")

@@ -10,9 +10,9 @@ import psycopg
 from psycopg import Connection
 
 from core.errors import StoreOfAnotherVersion
+from core.ledger.outage import Unreachable
+from core.ledger.postgres import Postgres
 from core.milvus.ledger import TABLES, VERSION, version_of
-from core.milvus.outage import Unreachable
-from core.milvus.postgres import Postgres
 
 MOST_CONNECTIONS = 16
 _LOCK = 7_061_636_572  # any number that nothing else in the database uses

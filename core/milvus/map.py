@@ -22,6 +22,7 @@ from core.errors import (
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints, keypoints_of
+from core.ledger.postgres import postgres_errors
 from core.maps.enrolling import check_enrolment
 from core.maps.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
@@ -48,7 +49,6 @@ from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
 from core.milvus.pictures.stored import read_pictures
-from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
 from core.places import Place, PlaceFields

@@ -79,7 +79,7 @@ class AuditTable(logging.Handler):
         taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), LINES_AT_ONCE))]
         query = "INSERT INTO service.audit (replica, line) SELECT %s, unnest(%s::text[])"
         try:
-            self._database.execute("write the audit trail", query, (self._replica, taken))
+            self._database.query("write the audit trail", query, (self._replica, taken))
         except BaseException:
             self._waiting.extendleft(reversed(taken))
             raise
@@ -95,7 +95,7 @@ class AuditTable(logging.Handler):
         """
         query = "SELECT number, replica, line FROM service.audit WHERE number < %s ORDER BY number DESC LIMIT %s"
         reached = (1 << 63) - 1 if before is None else before.offset
-        while found := self._database.execute("read the audit trail", query, (reached, LINES_AT_ONCE)):
+        while found := self._database.query("read the audit trail", query, (reached, LINES_AT_ONCE)):
             for number, replica, line in found:
                 yield AuditLine(Position(0, number), len(line), {**json.loads(line), "replica": replica})
             reached = found[-1][0]

@@ -83,14 +83,14 @@ class ReplicaDifferences:
         mine = self._mine
         if (text := json.dumps(mine)) != self._written:
             query = "UPDATE service.replicas SET settings = %s WHERE id = %s"
-            self._database.execute("tell its settings", query, (text, self._replica))
+            self._database.query("tell its settings", query, (text, self._replica))
             self._written = text
         query = (
             "SELECT r.id, r.settings, extract(epoch FROM clock_timestamp())::float8"
             " FROM service.replicas r JOIN service.living USING (id) ORDER BY r.id"
         )
         sent = time.time()
-        found = self._database.execute("compare settings", query)
+        found = self._database.query("compare settings", query)
         answered = time.time()
         differences = [
             difference

@@ -111,14 +111,14 @@ class SharedEvents(Events):
                 " SELECT pg_notify('placerec', %s || max(number)) FROM new"
             )
             maps, events = [map_id for map_id, _ in taken], [event for _, event in taken]
-            self._database.execute("send events", query, (self._replica.id, maps, events, f"{EVENT} "))
+            self._database.query("send events", query, (self._replica.id, maps, events, f"{EVENT} "))
 
     def _say_who_listens(self) -> None:
         with self._lock:
             now = {name: any(listener.pictures for listener in feed.listeners) for name, feed in self._feeds.items()}
         if now == self._said:
             return
-        with self._database.transaction("say who listens") as connection:
+        with self._database.text_transaction("say who listens") as connection:
             connection.execute("DELETE FROM service.listening WHERE replica = %s", (self._replica.id,))
             query = "INSERT INTO service.listening SELECT %s, * FROM unnest(%s::text[], %s::boolean[])"
             connection.execute(query, (self._replica.id, list(now), list(now.values())))
@@ -131,18 +131,18 @@ class SharedEvents(Events):
         self._something.set()  # feeds that nobody listens to any more go away by themselves
         self._look(None)
         query = "DELETE FROM service.events WHERE at < clock_timestamp() - make_interval(secs => %s)"
-        self._database.execute("forget events", query, (RETENTION_SECONDS,))
+        self._database.query("forget events", query, (RETENTION_SECONDS,))
 
     def _look(self, _said: str | None) -> None:
         query = (
             "SELECT map, bool_or(pictures) FROM service.listening WHERE replica <> %s"
             f" AND replica IN ({LIVING}) GROUP BY map"
         )
-        self._elsewhere = dict(self._database.execute("see who listens", query, (self._replica.id,)))
+        self._elsewhere = dict(self._database.query("see who listens", query, (self._replica.id,)))
 
     def _fetch(self, _said: str | None) -> None:
         if self._reached < 0:  # whoever listens here does so from now on
-            found = self._database.execute("read events", "SELECT coalesce(max(number), 0) FROM service.events")
+            found = self._database.query("read events", "SELECT coalesce(max(number), 0) FROM service.events")
             self._reached = int(found[0][0])
             return
         maps = list(self._feeds)
@@ -151,7 +151,7 @@ class SharedEvents(Events):
             " AND number <> ALL(%s) ORDER BY number"
         )
         values = (self._reached - LOOK_BACK, self._replica.id, maps, list(self._read_lately))
-        for number, map_id, text in self._database.execute("read events", query, values):
+        for number, map_id, text in self._database.query("read events", query, values):
             self._reached = max(self._reached, number)
             self._read_lately.append(number)
             if text is None:

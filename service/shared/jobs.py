@@ -78,7 +78,7 @@ class JobTable:
             f"INSERT INTO service.jobs ({', '.join(names)}, home) VALUES ({', '.join(['%s'] * len(names))}, %s)"
             f" RETURNING {', '.join(_COLUMNS)}"
         )
-        with self._database.transaction("add a job", TAKING) as connection:
+        with self._database.text_transaction("add a job", TAKING) as connection:
             count = "SELECT count(*) FROM service.jobs WHERE state = 'queued'"
             if connection.execute(count).fetchall()[0][0] >= longest_queue:
                 raise JobQueueFull("")
@@ -108,7 +108,7 @@ class JobTable:
             " ORDER BY coalesce(j.behind, j.number), j.yielded LIMIT 1) AS next"
             f" WHERE j.number = next.number RETURNING {_GIVEN}, j.yielded > 0"
         )
-        with self._database.transaction("take a job", TAKING) as connection:
+        with self._database.text_transaction("take a job", TAKING) as connection:
             found = connection.execute(query, {"me": self._service, "kinds": list(kinds), "own": list(own)}).fetchall()
         return (_job(found[0][:-1]), found[0][-1]) if found else None
 
@@ -118,26 +118,26 @@ class JobTable:
             "SELECT 1 FROM service.jobs AS j WHERE j.state = 'queued' AND (j.home IS NULL OR j.home = %s)"
             f" AND j.kind = ANY(%s) AND (j.map IS NULL OR j.map IS DISTINCT FROM %s) AND {_FREE} LIMIT 1"
         )
-        return bool(self._database.execute("look for jobs", query, (self._service, list(kinds), map_id)))
+        return bool(self._database.query("look for jobs", query, (self._service, list(kinds), map_id)))
 
     def get(self, job_id: str) -> Job | None:
         """A job; None if there is none."""
-        found = self._database.execute("read a job", f"{_READ} WHERE id = %s", (job_id,))
+        found = self._database.query("read a job", f"{_READ} WHERE id = %s", (job_id,))
         return _job(found[0]) if found else None
 
     def all(self) -> list[Job]:
         """All jobs, the oldest first."""
-        return [_job(row) for row in self._database.execute("read the jobs", f"{_READ} ORDER BY number")]
+        return [_job(row) for row in self._database.query("read the jobs", f"{_READ} ORDER BY number")]
 
     def counts(self) -> Counter[JobState]:
         """How many jobs are in each state."""
         query = "SELECT state, count(*) FROM service.jobs GROUP BY state"
-        return Counter(dict(self._database.execute("count the jobs", query)))
+        return Counter(dict(self._database.query("count the jobs", query)))
 
     def is_home(self, job_id: str) -> bool:
         """Whether this service alone could do a job."""
         query = "SELECT 1 FROM service.jobs WHERE id = %s AND home = %s"
-        return bool(self._database.execute("read a job", query, (job_id, self._service)))
+        return bool(self._database.query("read a job", query, (job_id, self._service)))
 
     def cancel(self, job_id: str) -> Job | None:
         """Ask a job to stop; one that waits is cancelled at once if nothing of it is half done.  None: it is not there.
@@ -149,7 +149,7 @@ class JobTable:
         query = f"SELECT state, attempt = 0 OR yielded > 0 OR {gone} FROM service.jobs AS j WHERE id = %s FOR UPDATE"
         end = "state = 'cancelled', ended_at = clock_timestamp(), notes = '{}', change = change + 1"
         ask = "cancelling = true, change = change + 1"
-        with self._database.transaction("cancel a job", TAKING) as connection:
+        with self._database.text_transaction("cancel a job", TAKING) as connection:
             for state, clean in connection.execute(query, (job_id,)).fetchall():
                 if state in ("succeeded", "failed"):
                     raise JobEnded(f"The job {job_id} has {state} already.")
@@ -165,7 +165,7 @@ class JobTable:
             f"UPDATE service.jobs SET {', '.join(f'{n} = %s' for n in _WRITTEN)} WHERE {_OWNED} RETURNING cancelling"
         )
         values = [_value(job, name) for name in _WRITTEN]
-        found = self._database.execute("write down a job", query, (*values, *self._owned(job)))
+        found = self._database.query("write down a job", query, (*values, *self._owned(job)))
         return bool(found[0][0]) if found else None
 
     def release(self, job: Job, gives_way: bool) -> bool:
@@ -180,7 +180,7 @@ class JobTable:
             f" done = %s, total = %s, change = change + 1 WHERE {_OWNED} RETURNING id"
         )
         values = (job.message, job.done, job.total, *self._owned(job))
-        return bool(self._database.execute("put a job off", query, values))
+        return bool(self._database.query("put a job off", query, values))
 
     def _owned(self, job: Job) -> tuple[Any, ...]:
         return job.number, self._service, job.attempt
@@ -192,7 +192,7 @@ class JobTable:
             " USING (number, attempt) WHERE owner = %s AND state = 'running'"
         )
         numbers, attempts = [job.number for job in jobs], [job.attempt for job in jobs]
-        return dict(self._database.execute("read the jobs", query, (numbers, attempts, self._service)))
+        return dict(self._database.query("read the jobs", query, (numbers, attempts, self._service)))
 
     def let_go(self, held: Sequence[str]) -> list[Job]:
         """Let the jobs wait whose service is gone, or that this service owns but does not do.
@@ -207,7 +207,7 @@ class JobTable:
             " WHERE state = 'running' AND resumable AND ((owner = %s AND id <> ALL(%s)) OR owner NOT IN"
             f" ({LIVING})) RETURNING {_GIVEN}"
         )
-        return [_job(row) for row in self._database.execute("resume jobs", query, (self._service, list(held)))]
+        return [_job(row) for row in self._database.query("resume jobs", query, (self._service, list(held)))]
 
     def fail_lost(self, held: Sequence[str], problem: Mapping[str, Any]) -> list[Job]:
         """Fail the jobs that cannot be resumed, and whose service is gone or does not know them.
@@ -221,7 +221,7 @@ class JobTable:
             f" AND ((home = %s AND id <> ALL(%s)) OR home NOT IN ({LIVING})) RETURNING {_GIVEN}"
         )
         values = (json.dumps(dict(problem)), self._service, list(held))
-        return [_job(row) for row in self._database.execute("end jobs", query, values)]
+        return [_job(row) for row in self._database.query("end jobs", query, values)]
 
     def trim(self, history: int) -> None:
         """Forget the oldest ended jobs beyond some."""
@@ -229,7 +229,7 @@ class JobTable:
             "DELETE FROM service.jobs WHERE number IN (SELECT number FROM service.jobs"
             " WHERE state NOT IN ('queued', 'running') ORDER BY number DESC OFFSET %s)"
         )
-        self._database.execute("forget jobs", query, (history,))
+        self._database.query("forget jobs", query, (history,))
 
 
 _FREE = (

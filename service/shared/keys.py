@@ -49,7 +49,7 @@ class SharedKeys(KeyRecords):
 
     @contextmanager
     def changing(self) -> Iterator[KeyNarrowing]:
-        with _refusals(), self.database.transaction("change the keys") as connection:
+        with _refusals(), self.database.text_transaction("change the keys") as connection:
             connection.execute(_CHANGE)
             yield _Changes(connection)
 
@@ -62,7 +62,7 @@ class SharedKeys(KeyRecords):
 
     def _execute(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
         with _refusals():
-            return self.database.execute("use the keys", query, values)
+            return self.database.query("use the keys", query, values)
 
 
 @dataclass(frozen=True)

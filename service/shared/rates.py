@@ -71,7 +71,7 @@ class SharedBuckets(Buckets):
             return
         names = [f"{self._kind} {name}" for name in taken]
         try:
-            found = self._database.execute(
+            found = self._database.query(
                 "exchange rates", _ADD, (names, [count / self.rate for count in taken.values()])
             )
         except BaseException:
@@ -120,6 +120,6 @@ class SharedRates(Rates):
                 self.exchange()
                 if time.monotonic() - tidied > TIDYING_SECONDS:
                     tidied = time.monotonic()
-                    self._database.execute("forget rates", "DELETE FROM service.rates WHERE full_at < now()")
+                    self._database.query("forget rates", "DELETE FROM service.rates WHERE full_at < now()")
             except (StorageFull, StorageFailure) as error:
                 log.warning("the rate limits hold for this service alone: %s", error)

@@ -88,7 +88,7 @@ class ServiceReplica:
         for thread in self._threads:
             thread.join(5)
         try:
-            self.database.execute(
+            self.database.query(
                 "leave",
                 "UPDATE service.replicas SET seen = '-infinity' WHERE id = %s AND process = %s",
                 (self.id, self.process),
@@ -110,7 +110,7 @@ class ServiceReplica:
 
     def say(self, topic: str, text: str = "") -> None:
         """Send a message to all services, this one included; it is not stored for those that are not connected."""
-        self.database.execute("notify other services", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
+        self.database.query("notify other services", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
 
     # The threads
 
@@ -147,13 +147,13 @@ class ServiceReplica:
                 "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
                 " SET process = excluded.process, seen = clock_timestamp()"
             )
-            self.database.execute("enter", enter, (self.id, self.process))
+            self.database.query("enter", enter, (self.id, self.process))
             self._entered, self._beaten = True, began
             return
         query = "UPDATE service.replicas SET seen = clock_timestamp() WHERE id = %s AND process = %s RETURNING id"
         if self.displaced:
             return
-        if self.database.execute("say that it is there", query, (self.id, self.process)):
+        if self.database.query("say that it is there", query, (self.id, self.process)):
             self._beaten = began
         else:
             self.displaced = True

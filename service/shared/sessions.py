@@ -85,13 +85,13 @@ class SessionTable:
 
     def all(self) -> list[StoredSession]:
         """All sessions, including ended ones."""
-        found = self._database.execute("read the sessions", f"SELECT {_READ} FROM service.sessions")
+        found = self._database.query("read the sessions", f"SELECT {_READ} FROM service.sessions")
         return [_stored(row) for row in found]
 
     def read(self, session_id: str) -> StoredSession | None:
         """One session with all columns; None if there is no such session."""
         query = f"SELECT {_READ} FROM service.sessions WHERE id = %s"
-        found = self._database.execute("read a session", query, (session_id,))
+        found = self._database.query("read a session", query, (session_id,))
         return _stored(found[0]) if found else None
 
     def newer(self, session_id: str, revision: int | None) -> tuple[StoredSession, int] | None:
@@ -100,7 +100,7 @@ class SessionTable:
             f"SELECT {_READ}, revision FROM service.sessions"
             " WHERE id = %s AND ended IS NULL AND revision IS DISTINCT FROM %s"
         )
-        found = self._database.execute("read a session", query, (session_id, revision))
+        found = self._database.query("read a session", query, (session_id, revision))
         return (_stored(found[0][:-1]), found[0][-1]) if found else None
 
     def head(self, session_id: str) -> Head | None:
@@ -109,7 +109,7 @@ class SessionTable:
             "SELECT map, map_created_at, ended, expires_after,"
             " extract(epoch FROM clock_timestamp() - used)::float8, revision FROM service.sessions WHERE id = %s"
         )
-        found = self._database.execute("read a session", query, (session_id,))
+        found = self._database.query("read a session", query, (session_id,))
         return Head(*found[0]) if found else None
 
     def write(self, session: StoredSession, begun_by: str | None = None, most: int | None = None) -> None:
@@ -130,7 +130,7 @@ class SessionTable:
             f"INSERT INTO service.sessions ({names}) VALUES ({marks}) ON CONFLICT (id) DO UPDATE"
             f" SET {again}, used = clock_timestamp(), revision = sessions.revision + 1"
         )
-        with self._database.transaction("keep a session", ADDING) as connection:
+        with self._database.text_transaction("keep a session", ADDING) as connection:
             if most is not None:
                 ((living,),) = connection.execute(f"SELECT count(*) FROM service.sessions WHERE {_LIVES}").fetchall()
                 if living >= most:
@@ -146,11 +146,11 @@ class SessionTable:
             " WHERE id = %s AND revision = %s AND ended IS NULL RETURNING id"
         )
         values = [getattr(session, name) for name in changing]
-        return bool(self._database.execute("save a session", query, (*values, session.id, revision)))
+        return bool(self._database.query("save a session", query, (*values, session.id, revision)))
 
     def end(self, session_id: str, reason: str, moment: float) -> None:
         """Mark a session as ended, for a reason, and delete its state and answer."""
-        self._database.execute("end a session", f"{_END} WHERE id = %s AND ended IS NULL", (reason, session_id))
+        self._database.query("end a session", f"{_END} WHERE id = %s AND ended IS NULL", (reason, session_id))
 
     def end_expired(self) -> list[StoredSession]:
         """End the sessions that have expired; each is given to one service only."""
@@ -158,11 +158,11 @@ class SessionTable:
             f"{_END} WHERE ended IS NULL AND used < clock_timestamp() - make_interval(secs => expires_after + %s)"
             f" RETURNING {_READ}"
         )
-        return [_stored(row) for row in self._database.execute("end sessions", query, (EXPIRED, LATE_SECONDS))]
+        return [_stored(row) for row in self._database.query("end sessions", query, (EXPIRED, LATE_SECONDS))]
 
     def forget(self, session_id: str) -> None:
         """Delete a session."""
-        self._database.execute("delete a session", "DELETE FROM service.sessions WHERE id = %s", (session_id,))
+        self._database.query("delete a session", "DELETE FROM service.sessions WHERE id = %s", (session_id,))
 
     def forget_ended(self) -> None:
         """Delete the sessions that ended long ago, and the oldest ones if they are too many."""
@@ -171,7 +171,7 @@ class SessionTable:
             "secs => %s) OR used < (SELECT used FROM service.sessions WHERE ended IS NOT NULL"
             " ORDER BY used DESC OFFSET %s LIMIT 1))"
         )
-        self._database.execute("forget sessions", query, (REMEMBERED_SECONDS, REMEMBERED))
+        self._database.query("forget sessions", query, (REMEMBERED_SECONDS, REMEMBERED))
 
     def living_of(self, map_id: str, made: str) -> list[tuple[StoredSession, float]]:
         """The sessions of a map that have not ended, by id, without states and answers; and how long they are idle."""
@@ -180,7 +180,7 @@ class SessionTable:
             f"SELECT {heads}, extract(epoch FROM clock_timestamp() - used)::float8 FROM service.sessions"
             f" WHERE map = %s AND map_created_at = %s AND {_LIVES} ORDER BY id"
         )
-        found = self._database.execute("list sessions", query, (map_id, made))
+        found = self._database.query("list sessions", query, (map_id, made))
         return [(_stored(row[:-1]), row[-1]) for row in found]
 
     def begun_by(self, asker: str, map_id: str, made: str, options: str) -> str | None:
@@ -190,13 +190,13 @@ class SessionTable:
             " AND options::jsonb - 'expires_after' = %s::jsonb AND revision = 0 AND answer IS NULL AND ended IS NULL"
             " AND used > clock_timestamp() - make_interval(secs => %s) LIMIT 1"
         )
-        found = self._database.execute("find a session", query, (asker, map_id, made, options, REPEATED_SECONDS))
+        found = self._database.query("find a session", query, (asker, map_id, made, options, REPEATED_SECONDS))
         return found[0][0] if found else None
 
     def count(self) -> int:
         """The number of sessions that have not ended."""
         query = f"SELECT count(*) FROM service.sessions WHERE {_LIVES}"
-        return int(self._database.execute("count the sessions", query)[0][0])
+        return int(self._database.query("count the sessions", query)[0][0])
 
 
 _LIVES = "ended IS NULL AND used > clock_timestamp() - make_interval(secs => expires_after)"

@@ -59,7 +59,7 @@ class SharedAnswers(RecentAnswers):
         """
         self.flush()
         query = "SELECT answer FROM service.answers WHERE map = %s AND made = %s ORDER BY number DESC LIMIT %s"
-        found = self._database.execute("read the latest answers", query, (*key, MOST_OF_MAP))
+        found = self._database.query("read the latest answers", query, (*key, MOST_OF_MAP))
         return [_ANSWER.validate_json(text) for (text,) in found]
 
     def flush(self) -> None:
@@ -72,7 +72,7 @@ class SharedAnswers(RecentAnswers):
             texts = [_ANSWER.dump_json(answer).decode() for _, answer in taken]
             keys = sorted({key for key, _ in taken})
             try:
-                with self._database.transaction("write down answers") as connection:
+                with self._database.text_transaction("write down answers") as connection:
                     query = (
                         "INSERT INTO service.answers (map, made, answer)"
                         " SELECT * FROM unnest(%s::text[], %s::text[], %s::text[])"
@@ -149,7 +149,7 @@ class SharedStatistics(QueryStatistics):
             "INSERT INTO service.calibrations VALUES (%s, %s, %s, %s) ON CONFLICT (map) DO UPDATE"
             " SET at = excluded.at, report = excluded.report, trials = excluded.trials"
         )
-        with self._common.transaction("keep a calibration") as connection:
+        with self._common.text_transaction("keep a calibration") as connection:
             connection.execute(query, (_code(connection, key, now), now, report, trials))
 
     def calibration(self, key: MapKey) -> tuple[datetime, str, str] | None:
@@ -169,11 +169,11 @@ class SharedStatistics(QueryStatistics):
         return self._read(query + only, oldest, *values)
 
     def _read(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
-        return self._common.execute("read the statistics of queries", query, values)
+        return self._common.query("read the statistics of queries", query, values)
 
     def _keep(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
         sizes = self._sizes()
-        with self._common.transaction("write down the statistics of queries") as connection:
+        with self._common.text_transaction("write down the statistics of queries") as connection:
             if sizes is not None:
                 for code, *key in connection.execute("SELECT code, id, made FROM service.counted_maps").fetchall():
                     if tuple(key) not in sizes:

@@ -23,7 +23,7 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
-from core.milvus.outage import Outage, Unreachable
+from core.ledger.outage import Outage, Unreachable
 from core.milvus.pictures.bucket import Bucket
 from core.milvus.pictures.stored import StoredObject
 

@@ -32,7 +32,7 @@ class Postgres:
         with psycopg.connect(self.address) as connection:
             connection.execute("DROP SCHEMA IF EXISTS service CASCADE")
         database = SharedDatabase(self.address)
-        database.execute("make its tables", "SELECT 1")
+        database.query("make its tables", "SELECT 1")
         database.close()
 
 

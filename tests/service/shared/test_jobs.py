@@ -77,7 +77,7 @@ def quick(database: SharedDatabase, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setattr(replicas, "LOSING_SECONDS", 1.2)
     monkeypatch.setattr("service.shared.jobs.BEAT_SECONDS", 0.2)
     view = "SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '2 seconds'"
-    database.execute("shorten the time", f"CREATE OR REPLACE VIEW service.living AS {view}")
+    database.query("shorten the time", f"CREATE OR REPLACE VIEW service.living AS {view}")
     # Whoever connects makes the tables again.
     monkeypatch.setattr("service.shared.database.TABLES", "SELECT 1")
     return database.address

@@ -68,7 +68,7 @@ def test_they_are_stored_as_in_a_file(
     tmp_path_factory: pytest.TempPathFactory,
     steps: list[tuple[str, str, str, frozenset[str] | None, bool]],
 ) -> None:
-    database.execute("empty the table", "TRUNCATE service.keys")
+    database.query("empty the table", "TRUNCATE service.keys")
     shared, file = SharedKeys(database), KeyStore(tmp_path_factory.mktemp("keys"))
     for step in steps:
         assert outcome(shared, step) == outcome(file, step), step

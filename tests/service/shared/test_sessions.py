@@ -42,7 +42,7 @@ def beliefs(answer: dict[str, Any]) -> dict[str, float]:
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(STEPS)
 def test_contract(database: SharedDatabase, steps: list[tuple[str, str, int, bytes]]) -> None:
-    database.execute("empty the table", "TRUNCATE service.sessions")
+    database.query("empty the table", "TRUNCATE service.sessions")
     check_records(SessionTable(database), steps)
 
 

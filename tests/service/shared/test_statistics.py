@@ -51,7 +51,7 @@ def test_counted_as_in_a_data_directory(
 
     def counting(folder: Path, maps: Maps) -> SharedStatistics:
         if folder not in begun:
-            database.execute("empty the table", "TRUNCATE service.counted_maps CASCADE")
+            database.query("empty the table", "TRUNCATE service.counted_maps CASCADE")
             begun.add(folder)
         counted = SharedStatistics(folder, 3600, lambda: maps.sizes, lambda _: maps.present)
         counted.share(database)
@@ -100,7 +100,7 @@ def test_what_one_answers_the_other_shows(
     prepared: Path, tmp_path: Path, postgres: Postgres, database: SharedDatabase
 ) -> None:
     with two_services(prepared, tmp_path, postgres.address, {}) as (one, other), listening(other) as heard:
-        soon(lambda: database.execute("look", "SELECT 1 FROM service.listening"))
+        soon(lambda: database.query("look", "SELECT 1 FROM service.listening"))
         time.sleep(0.2)  # until the other one knows
         asked = [one.query(MAP, jpeg(number)) for number in range(3)]
         blank_one = other.query(MAP, encoded(blank()))
@@ -141,5 +141,5 @@ def test_the_latest_answers_are_bounded(database: SharedDatabase) -> None:
     kept = one.of_map(("lab", "2026"))
     assert len(kept) == MOST_OF_MAP and {answer.reason for answer in kept} == {ANSWER.reason}
     assert [answer.frame for answer in one.of_map(("hall", "2026"))] == [QueriedFrame("front", "s-1", 7)]
-    rows = database.execute("count", "SELECT count(*) FROM service.answers")
+    rows = database.query("count", "SELECT count(*) FROM service.answers")
     assert rows == [(MOST_OF_MAP + 1,)]

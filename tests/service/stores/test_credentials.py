@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from core.errors import StoreUnavailable
+from core.ledger.postgres import check_address
 from core.milvus import open_store
-from core.milvus.postgres import check_address
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem, typed

@@ -1,20 +1,23 @@
-"""A PostgreSQL that may be away, or refuse: connections to it, and what it says as our errors."""
+"""A ledger in a PostgreSQL that may be away, or refuse: connections to it, and what it says as our errors."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import psycopg
 from psycopg import Connection
 from psycopg.conninfo import conninfo_to_dict
 from psycopg_pool import ConnectionPool, PoolTimeout
 
-from core.errors import StorageFailure, StorageFull, StoreUnavailable
-from core.milvus.outage import Outage, Unreachable
+from core.errors import StorageFailure, StorageFull, StoreOfAnotherVersion, StoreUnavailable
+from core.ledger.database import Lock
+from core.ledger.outage import Outage, Unreachable
+from core.ledger.statements import Statement
+from core.ledger.tables import Tables
 
 logging.getLogger("psycopg.pool").setLevel(logging.CRITICAL)  # it would log each attempt of an outage
 
@@ -161,3 +164,99 @@ class Postgres:
             pool, self._pool = self._pool, None
         if pool is not None:
             pool.close()
+
+
+class PostgresConnection:
+    """A connection of the pool (:class:`core.ledger.database.Connection`)."""
+
+    dialect: Literal["postgresql"] = "postgresql"
+
+    def __init__(self, connection: Connection[Any]) -> None:
+        self.driver = connection
+
+    def execute(self, statement: Statement, **values: Any) -> list[tuple[Any, ...]]:
+        """Execute a statement; the rows that it gives."""
+        compiled = statement.compiled("postgresql")
+        cursor = self.driver.execute(compiled.text, compiled.values(values))
+        return [] if cursor.description is None else cursor.fetchall()
+
+    def execute_many(self, statement: Statement, values: Sequence[Mapping[str, Any]]) -> None:
+        """Execute a statement once for each of some sets of values."""
+        compiled = statement.compiled("postgresql")
+        with self.driver.cursor() as cursor:
+            cursor.executemany(compiled.text, [compiled.values(one) for one in values])
+
+    def change(self, statement: Statement, **values: Any) -> int:
+        """Execute a statement; the number of rows that it inserted, updated or deleted."""
+        compiled = statement.compiled("postgresql")
+        return self.driver.execute(compiled.text, compiled.values(values)).rowcount
+
+
+def prepare(connection: Connection[Any], tables: Sequence[Tables]) -> None:
+    """Make the tables of some parts that are missing, and bring those of earlier versions up to date.
+
+    Raises:
+        StoreOfAnotherVersion: tables are of a version that is not read; all are as they were.
+    """
+    connection.execute("SELECT pg_advisory_xact_lock(%s)", (Lock.TABLES,))
+    connection.execute("CREATE TABLE IF NOT EXISTS placerec_tables (part text PRIMARY KEY, version integer NOT NULL)")
+    versions = dict(connection.execute("SELECT part, version FROM placerec_tables").fetchall())
+    for part in tables:
+        found = versions.get(part.name)
+        if found == part.version:
+            continue
+        statements = part.create("postgresql") if found is None else part.migrate("postgresql", found)
+        if statements is None:
+            raise StoreOfAnotherVersion(
+                f"The tables of {part.name} in PostgreSQL are those of version {found}, which this placerec does not"
+                f" read; it reads version {part.version}. They are left as they are: go on with the version that made"
+                " them, or begin anew in another database."
+            )
+        for statement in statements:
+            connection.execute(statement)
+        query = (
+            "INSERT INTO placerec_tables VALUES (%s, %s) ON CONFLICT (part) DO UPDATE SET version = excluded.version"
+        )
+        connection.execute(query, (part.name, part.version))
+
+
+class PostgresLedger(Postgres):
+    """A ledger in a PostgreSQL (:class:`core.ledger.database.Ledger`); tables that are missing are made.
+
+    Args:
+        tables: of the parts that are kept in it.
+        statement_seconds: how long a statement may take.
+    """
+
+    def __init__(
+        self, address: str, tables: Sequence[Tables], most_connections: int = 8, statement_seconds: int = 10
+    ) -> None:
+        def configure(connection: Connection[Any]) -> None:
+            connection.execute("SET synchronous_commit TO on")  # a commit is durable whatever the server's default is
+            connection.execute(f"SET statement_timeout TO '{statement_seconds}s'")
+
+        super().__init__(
+            address, lambda connection: prepare(connection, tables), most_connections, {"autocommit": True}, configure
+        )
+
+    def execute(self, action: str, statement: Statement, **values: Any) -> list[tuple[Any, ...]]:
+        """Execute one statement, which is durable when this returns; the rows that it gives."""
+        with self.connection(action) as connection:
+            return PostgresConnection(connection).execute(statement, **values)
+
+    def change(self, action: str, statement: Statement, **values: Any) -> int:
+        """The same; the number of rows that it inserted, updated or deleted."""
+        with self.connection(action) as connection:
+            return PostgresConnection(connection).change(statement, **values)
+
+    @contextmanager
+    def transaction(self, action: str, lock: Lock | None = None) -> Iterator[PostgresConnection]:
+        """A transaction that is committed at the end of the block, and undone if it raises.
+
+        Args:
+            lock: only one transaction with it runs at a time, over all services.
+        """
+        with self.connection(action) as connection, connection.transaction():
+            if lock is not None:
+                connection.execute("SELECT pg_advisory_xact_lock(%s)", (lock,))
+            yield PostgresConnection(connection)
