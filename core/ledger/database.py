@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, Protocol
@@ -27,6 +27,9 @@ class Connection(Protocol):
 
     def execute(self, statement: Statement, **values: Any) -> list[tuple[Any, ...]]:
         """Execute a statement; the rows that it gives."""
+
+    def pages(self, statement: Statement, size: int, **values: Any) -> Iterator[list[tuple[Any, ...]]]:
+        """Execute a statement; the rows that it gives, up to ``size`` at a time, within a transaction."""
 
     def execute_many(self, statement: Statement, values: Sequence[Mapping[str, Any]]) -> None:
         """Execute a statement once for each of some sets of values."""

@@ -180,6 +180,15 @@ class PostgresConnection:
         cursor = self.driver.execute(compiled.text, compiled.values(values))
         return [] if cursor.description is None else cursor.fetchall()
 
+    def pages(self, statement: Statement, size: int, **values: Any) -> Iterator[list[tuple[Any, ...]]]:
+        """Execute a statement within a transaction; the rows that it gives, up to ``size`` at a time."""
+        compiled = statement.compiled("postgresql")
+        with self.driver.cursor(name="placerec_pages") as cursor:
+            cursor.itersize = size
+            cursor.execute(compiled.text, compiled.values(values))
+            while page := cursor.fetchmany(size):
+                yield page
+
     def execute_many(self, statement: Statement, values: Sequence[Mapping[str, Any]]) -> None:
         """Execute a statement once for each of some sets of values."""
         compiled = statement.compiled("postgresql")

@@ -42,6 +42,13 @@ class SqliteConnection:
         compiled = statement.compiled("sqlite")
         return self.driver.execute(compiled.text, compiled.values(values)).fetchall()
 
+    def pages(self, statement: Statement, size: int, **values: Any) -> Iterator[list[tuple[Any, ...]]]:
+        """Execute a statement; the rows that it gives, up to ``size`` at a time."""
+        compiled = statement.compiled("sqlite")
+        with closing(self.driver.execute(compiled.text, compiled.values(values))) as cursor:
+            while page := cursor.fetchmany(size):
+                yield page
+
     def execute_many(self, statement: Statement, values: Sequence[Mapping[str, Any]]) -> None:
         """Execute a statement once for each of some sets of values."""
         compiled = statement.compiled("sqlite")

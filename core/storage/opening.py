@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,23 +17,29 @@ from numpy.typing import NDArray
 
 from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
+from core.errors import UnknownMap
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.index.table import LARGEST_BLOCK
+from core.ledger.maps import places
+from core.ledger.maps import record as map_record
+from core.ledger.maps.checksums import DamagedRow
+from core.ledger.maps.columns import read_columns
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.record import MapState
 from core.maps.records import MapRecord, validation_message
 from core.maps.status import Tier
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
-from core.storage.database import ledger, row_checksums
-from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
-from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.database.schema import (
     check_schema,
+    connection_of,
+    driver_of,
     prepare,
     rebuild_metadata_index,
-    stale_metadata_index,
-    wrong_sequence_ends,
+    wrong_sequences,
 )
+from core.storage.database.segments import SegmentEntry, put_rows_per_segment, rows_per_segment, segment_entries
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.array_files import StaleArrays
@@ -52,11 +58,20 @@ UNLISTED = ".unlisted-"
 """Prefix of the folder of a map that is being built; no map id begins with a dot."""
 
 
+@contextmanager
+def named_damage() -> Iterator[None]:
+    """Name the file in which a row is damaged."""
+    try:
+        yield
+    except DamagedRow as damage:
+        raise Damage(f"{FILE}: {damage}") from damage
+
+
 @dataclass(frozen=True, eq=False)
 class OpenMap:
     """A map that was read from disk, and the objects to read and write it."""
 
-    record: MapRecord
+    state: MapState
     layout: Layout
     database: Database
     row_reader: RowReader
@@ -64,8 +79,11 @@ class OpenMap:
     removed_segments: RemovedSegments
 
 
-def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> None:
+def create_folder(folder: Path, record: MapRecord, rows: int) -> None:
     """Make ``folder`` with an empty map in it, durable except for the folder's own name.
+
+    Args:
+        rows: of a full segment.
 
     Raises:
         OSError, sqlite3.Error: the disk refuses.
@@ -75,31 +93,37 @@ def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> Non
     try:
         prepare(connection, create=True)
         with transaction(connection):
-            ledger.insert_record(connection, record, rows_per_segment)
+            made = connection_of(connection)
+            map_record.create(made.whole, record)
+            put_rows_per_segment(made, rows)
     finally:
         connection.close()  # SQLite moves its log into the file and deletes it
     sync_file(folder / FILE)
     sync_folder(folder)
 
 
-def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
-    """The map's record and the layout of its segment files.
+def read_layout(connection: MapConnection, map_id: str = "") -> tuple[MapState, Layout]:
+    """The state of a map and the layout of its segment files.
 
     Raises:
-        Damage: the record is invalid.
+        Damage: the record is invalid, or missing.
     """
     try:
-        record, rows_per_segment = ledger.read_record(connection)
-        return record, Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
-    except ValueError as error:
-        raise Damage(f"map.sqlite: the map's own record cannot be read: {validation_message(error)}") from error
+        state = map_record.state_of(connection, map_id)
+        record = state.record
+        layout = Layout(
+            record.dimension, record.encoder, rows_per_segment(connection), record.local_shape, record.precision
+        )
+        return state, layout
+    except (ValueError, UnknownMap) as error:
+        raise Damage(f"the map's own record cannot be read: {error}") from error
 
 
-def _adopt(folder: Path, connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
-    record, layout = read_layout(connection)
-    if record.id != folder.name.removeprefix(UNLISTED):
-        raise Damage(f"{FILE}: it belongs to the map {record.id!r}")
-    return record, layout
+def _adopt(folder: Path, connection: MapConnection) -> tuple[MapState, Layout]:
+    state, layout = read_layout(connection, folder.name)
+    if state.record.id != folder.name.removeprefix(UNLISTED):
+        raise Damage(f"{FILE}: it belongs to the map {state.record.id!r}")
+    return state, layout
 
 
 def _check_files(folder: Path) -> None:
@@ -122,8 +146,9 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
     try:
         prepare(connection, str(folder / FILE))
         check_schema(connection)
-        (places,) = connection.execute("SELECT count(*) FROM places").fetchone()
-        return _adopt(folder, connection)[0], int(places)
+        with named_damage():
+            state, _ = _adopt(folder, connection_of(connection))
+        return state.record, state.places
     except sqlite3.OperationalError as error:
         if primary_code(error) == sqlite3.SQLITE_ERROR:  # our statements do not fit its tables
             raise Damage(f"{FILE}: {error}") from error
@@ -161,17 +186,17 @@ def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable
     return table.appended(np.concatenate(read))
 
 
-def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
+def _check_rows(folder: Path, connection: MapConnection) -> None:
     """Check all rows of a small map and their indexes; pictures are checked when they are read."""
-    for table in ("places", "place_values", "sequences"):
-        ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
+    for table in ("places", "tokens", "sequences"):
+        ((line,),) = driver_of(connection).execute(f"PRAGMA integrity_check({table})").fetchmany(1)
         if line != "ok":
             raise Damage(f"{FILE}: {line}")
-    if broken := row_checksums.mismatched(connection, "places"):
+    if broken := places.unsound(connection):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := wrong_sequence_ends(connection):
+    if found := wrong_sequences(connection):
         raise Damage(f"{FILE}: {found[0]}")
-    if found := stale_metadata_index(connection):  # it can be made again from the places, which are sound
+    if found := places.stale_tokens(connection):  # it can be made again from the places, which are sound
         log.warning("The index of the metadata of map %s is rebuilt: %s.", folder.name, found[0])
         rebuild_metadata_index(connection)
 
@@ -179,8 +204,8 @@ def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
 def read_snapshot(
     folder: Path,
     layout: Layout,
-    connection: sqlite3.Connection,
-    record: MapRecord,
+    connection: MapConnection,
+    state: MapState,
     row_reader: RowReader,
     files: IndexFiles,
 ) -> Snapshot:
@@ -194,8 +219,11 @@ def read_snapshot(
         OSError, sqlite3.Error: the disk refuses.
     """
     entries = segment_entries(connection, layout)
-    total = sum(segment.rows for segment in entries)
+    total, record = sum(segment.rows for segment in entries), state.record
     columns = read_columns(connection, total)
+    if (state.rows, state.places) != (total, len(columns.rows)):
+        counted = f"{state.places} places in {state.rows} rows"
+        raise Damage(f"{FILE}: its record counts {counted}, but there are {len(columns.rows)} in {total}")
     whereabouts = Whereabouts(
         np.full(total, NO_POSE, np.int8),
         np.zeros((total, 3)),
@@ -252,10 +280,10 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     _check_files(folder)
     database = Database(folder / FILE)
     try:
-        with database.reading() as connection:
-            record, layout = _adopt(folder, connection)
+        with named_damage(), database.reading() as connection:
+            state, layout = _adopt(folder, connection)
             row_reader, files = RowReader(folder, layout), IndexFiles(folder, layout)
-            snapshot = read_snapshot(folder, layout, connection, record, row_reader, files)
+            snapshot = read_snapshot(folder, layout, connection, state, row_reader, files)
             clear_folder(folder, segment_entries(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # the name of SQLite's log
@@ -275,4 +303,4 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     except BaseException:
         database.close()
         raise
-    return OpenMap(record, layout, database, row_reader, files, RemovedSegments(folder, layout)), snapshot
+    return OpenMap(state, layout, database, row_reader, files, RemovedSegments(folder, layout)), snapshot

@@ -10,7 +10,6 @@ its segment.
 from __future__ import annotations
 
 import logging
-import sqlite3
 import threading
 import weakref
 from collections.abc import Iterator, Sequence, Set
@@ -18,7 +17,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from core.storage.database.ledger import SegmentEntry
+from core.ledger.maps.connection import MapConnection
+from core.storage.database.segments import SegmentEntry, count_places_between, mark_removed
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.search.snapshot import Snapshot
 
@@ -49,7 +49,7 @@ class RemovedSegments:
             with self._lock:
                 self._keepers -= 1
 
-    def remove(self, connection: sqlite3.Connection, after: Snapshot, touched: Set[int] = frozenset()) -> Snapshot:
+    def remove(self, connection: MapConnection, after: Snapshot, touched: Set[int] = frozenset()) -> Snapshot:
         """Record segments without a living row as removed; returns the snapshot to search after the COMMIT.
 
         Args:
@@ -64,12 +64,10 @@ class RemovedSegments:
         for number in suspects:
             if number >= tail or (segment := segments[number]).removed or segment.living:
                 continue
-            query = "SELECT count(*) FROM places WHERE row >= ? AND row < ?"
-            (places,) = connection.execute(query, (number * size, (number + 1) * size)).fetchone()
-            if places:
+            if places := count_places_between(connection, number * size, (number + 1) * size):
                 log.error("%s is not removed: it has %s places that are not searched.", segment_name(number), places)
                 continue
-            connection.execute("UPDATE segments SET removed = 1 WHERE number = ?", (number,))
+            mark_removed(connection, number)
             self._waiting[number] = weakref.ref(segment.reading)
             segments[number] = segment.without_rows()
         return after if tuple(segments) == after.segments else replace(after, segments=tuple(segments))

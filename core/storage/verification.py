@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage
 from core.index.flat import vectors
+from core.ledger.maps import cameras, frames, places
+from core.ledger.maps.checksums import DamagedRow
+from core.ledger.maps.columns import read_columns
+from core.ledger.maps.connection import MapConnection
 from core.maps.records import VerifyReport
 from core.maps.status import Progress, no_progress
-from core.storage.database import keypoints, row_checksums
-from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
-from core.storage.database.ledger import SegmentEntry, segment_entries
-from core.storage.database.schema import check_schema, contradictions
+from core.storage.database.schema import check_schema, connection_of, contradictions, driver_of
+from core.storage.database.segments import SegmentEntry, segment_entries
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.segment_files import Layout
@@ -45,10 +47,18 @@ class _Findings:
         """Note an error that ends the block as a problem, and go on after it."""
         try:
             yield
+        except DamagedRow as damage:
+            self.problems.append(f"{FILE}: {damage}")
         except (Damage, OSError) as damage:
             self.problems.append(str(damage))
         except (sqlite3.Error, ValueError, TypeError) as error:
             self.problems.append(f"{FILE}: {error}")
+
+    def list_some(self, problems: list[str], kind: str) -> None:
+        """Note some problems of one kind one by one, and the number of the others."""
+        self.problems += problems[:_MOST_LISTED]
+        if len(problems) > _MOST_LISTED:
+            self.problems.append(f"{FILE}: the same is true of {len(problems) - _MOST_LISTED} more {kind}")
 
     def report(self) -> VerifyReport:
         return VerifyReport(
@@ -73,7 +83,7 @@ def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyRepo
         connection = connect(folder / FILE) if is_log_sound else connect_without_log(folder / FILE)
         try:
             check_schema(connection)
-            report = inspect(folder, connection, None, progress)
+            report = inspect(folder, connection_of(connection), None, progress)
             return report.model_copy(
                 update={"ok": report.ok and not findings.problems, "problems": findings.problems + report.problems}
             )
@@ -83,7 +93,7 @@ def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyRepo
 
 
 def inspect(
-    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = no_progress
+    folder: Path, connection: MapConnection, snapshot: Snapshot | None, progress: Progress = no_progress
 ) -> VerifyReport:
     """Check a map's files against each other and, if the map is in service, against its snapshot.
 
@@ -104,10 +114,15 @@ def inspect(
     with findings.noting():
         findings.problems += [f"{FILE}: {found}" for found in contradictions(connection)]
     with findings.noting():
-        _, layout = read_layout(connection)
+        state, layout = read_layout(connection, folder.name)
         segments = segment_entries(connection, layout)
         findings.rows = sum(segment.rows for segment in segments)
-        (findings.places,) = connection.execute("SELECT count(*) FROM places").fetchone()
+        findings.places = places.count(connection)
+        if (state.places, state.rows) != (findings.places, findings.rows):
+            counted = f"{state.places} places in {state.rows} rows"
+            findings.problems.append(
+                f"{FILE}: its record counts {counted}, but there are {findings.places} in {findings.rows}"
+            )
         with findings.noting():
             _check_pictures(connection, findings)
         with findings.noting():
@@ -115,12 +130,11 @@ def inspect(
         if snapshot is not None:
             with findings.noting():
                 _check_locations(connection, snapshot, findings)
-        query = "SELECT row, id, checksum FROM places"
-        places = {row: (place, checksum) for row, place, checksum in connection.execute(query).fetchall()}
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
+        known = {row: (place, checksum) for row, place, checksum in places.checksums(connection)}
+        if (driver := driver_of(connection)).in_transaction:
+            driver.execute("ROLLBACK")
         with findings.noting():
-            _check_descriptors(folder, layout, places, segments, snapshot, findings)
+            _check_descriptors(folder, layout, known, segments, snapshot, findings)
         if snapshot is not None:
             checked, stale = IndexFiles(folder, layout).check(segments) if snapshot.table is not None else (0, [])
             findings.checked_bytes += checked
@@ -128,49 +142,40 @@ def inspect(
     return findings.report()
 
 
-def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
-    for (line,) in connection.execute("PRAGMA integrity_check").fetchall():
+def _check_tables(connection: MapConnection, findings: _Findings) -> None:
+    for (line,) in driver_of(connection).execute("PRAGMA integrity_check").fetchall():
         if line != "ok":
             findings.problems.append(f"{FILE}: {line}")
-    for table, row, parent, _ in connection.execute("PRAGMA foreign_key_check").fetchall():
-        findings.problems.append(f"{FILE}: row {row} of {table} belongs to nothing in {parent}")
 
 
-def _check_row_checksums(connection: sqlite3.Connection, findings: _Findings) -> None:
-    for table, kind in (("map", "map"), ("places", "place"), ("cameras", "camera")):
-        names = row_checksums.mismatched(connection, table)
-        for name in names[:_MOST_LISTED]:
-            findings.problems.append(f"{FILE}: {kind} {name!r} does not match its checksum")
-        if len(names) > _MOST_LISTED:
-            findings.problems.append(f"{FILE}: the same is true of {len(names) - _MOST_LISTED} more rows of {table}")
+def _check_row_checksums(connection: MapConnection, findings: _Findings) -> None:
+    for kind, names in (("place", places.unsound(connection)), ("camera", cameras.unsound(connection))):
+        findings.list_some([f"{FILE}: {kind} {name!r} does not match its checksum" for name in names], f"{kind}s")
 
 
-def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None:
-    query = (
-        "SELECT p.id, p.number, p.picture, p.digest, k.digest, length(k.bytes), p.camera FROM places p"
-        " LEFT JOIN pictures k ON k.place = p.number ORDER BY p.number"
-    )
-    for place, number, kind, source_digest, digest, size, camera in connection.execute(query).fetchall():
-        if (kind == "none") != (size is None):
+def _check_pictures(connection: MapConnection, findings: _Findings) -> None:
+    """Check all pictures, one after another."""
+    for place, row, kind, source_digest, camera in places.pictured(connection):
+        found = frames.stored_pictures_at(connection, [row]).get(row)
+        if (kind == "none") != (found is None):
             findings.problems.append(f"{FILE}: place {place!r} is recorded to keep {kind}, which is not true")
-        if size is None:
+        if found is None:
             continue
-        ((content,),) = connection.execute("SELECT bytes FROM pictures WHERE place = ?", (number,)).fetchall()
-        findings.checked_bytes += size
-        found = hashlib.sha256(content).digest()
+        content, digest = found
+        findings.checked_bytes += len(content)
+        computed = hashlib.sha256(content).digest()
         # The digest of a place with a camera covers its image and the camera's mask.
-        if found != digest or (kind == "image" and camera is None and found != source_digest):
+        if computed != digest or (kind == "image" and camera is None and computed != source_digest):
             findings.problems.append(f"{FILE}: the {kind} of place {place!r} does not match its digest")
+    if rows := frames.rows_of_no_place(connection):
+        findings.problems.append(f"{FILE}: the pictures or keypoints of {len(rows)} rows belong to no place")
 
 
-def _check_keypoints(connection: sqlite3.Connection, findings: _Findings) -> None:
-    """Check all keypoints; those of no place are found with the foreign keys."""
-    findings.checked_bytes += keypoints.room(connection)[1]
-    places = keypoints.damaged(connection)
-    for place in places[:_MOST_LISTED]:
-        findings.problems.append(f"{FILE}: the keypoints of place {place!r} do not match their checksum")
-    if len(places) > _MOST_LISTED:
-        findings.problems.append(f"{FILE}: the same is true of {len(places) - _MOST_LISTED} more places")
+def _check_keypoints(connection: MapConnection, findings: _Findings) -> None:
+    findings.checked_bytes += frames.room(connection)[1]
+    names = frames.damaged_keypoints(connection)
+    problems = [f"{FILE}: the keypoints of place {place!r} do not match their checksum" for place in names]
+    findings.list_some(problems, "places")
 
 
 def _check_descriptors(
@@ -254,7 +259,7 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
     ]
 
 
-def _check_locations(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
+def _check_locations(connection: MapConnection, snapshot: Snapshot, findings: _Findings) -> None:
     """Check that the snapshot has the places that are stored, at the same locations."""
     columns = read_columns(connection, snapshot.rows)
     searched, stored = snapshot.whereabouts.take(columns.rows), columns.whereabouts

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import Camera, Timestamp
-from core.storage.database.schema import LONGEST_INDEXED
+from core.ledger.maps.places import LONGEST_TEXT
 from service.errors.faults import InvalidRequest
 from service.http.schemas import PageParameters
 
@@ -50,8 +50,8 @@ def checked_metadata(found: Any) -> dict[str, Scalar]:
     for key, value in found.items():
         if isinstance(value, dict | list):
             raise InvalidRequest(f"where: the value of {key[:80]!r} must be a text, number, true, false or null.")
-        if isinstance(value, str) and len(value) > LONGEST_INDEXED:
-            raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
+        if isinstance(value, str) and len(value) > LONGEST_TEXT:
+            raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_TEXT} characters.")
     return found
 
 

@@ -13,7 +13,7 @@ from core.maps.place_filter import Scalar
 from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
 from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
 from core.recognition.question import Question
-from core.storage.database.schema import LONGEST_INDEXED
+from core.ledger.maps.places import LONGEST_TEXT
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.filters import MOST_NAMES, checked_metadata, parsed_json
@@ -62,7 +62,7 @@ class FilterParameters(PlaceDescription):
         default=None,
         max_length=100_000,
         description="A JSON object: the place's metadata has these values under these keys, at its top level. Numbers "
-        f"are compared as numbers; texts may have at most {LONGEST_INDEXED} characters.",
+        f"are compared as numbers; texts may have at most {LONGEST_TEXT} characters.",
         examples=['{"floor": 2, "light": "day"}'],
     )
     soft: str | None = Field(

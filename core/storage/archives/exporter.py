@@ -5,7 +5,6 @@ The map is read in one transaction, which does not hold up writes.
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -14,12 +13,13 @@ import numpy as np
 
 from core.disk.files import Damage
 from core.errors import UnknownMap
-from core.maps.archives.manifest import ArchivedRecord
+from core.ledger.maps import cameras, places
+from core.ledger.maps.archiving import LedgerSource, pieces
+from core.ledger.maps.connection import MapConnection, Reading
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
-from core.storage.archives.stored_lines import camera_lines, place_lines, sequence_lines
-from core.storage.cameras import Access
-from core.storage.database import keypoints, ledger, row_checksums
-from core.storage.database.connections import FILE
+from core.maps.records import MapRecord
+from core.storage.database.connections import FILE, begin_reading
+from core.storage.database.schema import driver_of
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, read_layout
@@ -41,7 +41,7 @@ class Exporter:
     def __init__(
         self,
         folder: Path,
-        reading: Access[sqlite3.Connection],
+        reading: Reading,
         opened: Callable[[], OpenMap | None],
         guarded: Callable[[str], AbstractContextManager[None]],
     ) -> None:
@@ -65,18 +65,18 @@ class Exporter:
         """
         # Deleting the map waits for its readers, so this ends as soon as the map is closed.
         with self._guarded("export"), self._reading() as connection, self._files_retained():
-            connection.execute("BEGIN")
+            begin_reading(connection)
             try:
-                record, layout = read_layout(connection)
-                for table in ("places", "cameras"):
-                    if broken := row_checksums.mismatched(connection, table):
-                        raise Damage(f"{FILE}: {broken[0]!r} of {table} does not match its checksum")
-                archived = ArchivedRecord.model_validate(record.model_dump())
-                source = _Source(connection, archived, self._folder, layout, self._expect_there)
+                state, layout = read_layout(connection, self._folder.name)
+                for table, names in (("places", places.unsound(connection)), ("cameras", cameras.unsound(connection))):
+                    if names:
+                        raise Damage(f"{FILE}: {names[0]!r} of {table} does not match its checksum")
+                source = _Source(connection, state.record, self._folder, layout, self._expect_there)
                 return write_archive(source, path, advance, expect)
             finally:
-                if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
-                    connection.execute("ROLLBACK")
+                driver = driver_of(connection)
+                if driver.in_transaction:  # SQLite may have ended it itself; that error is the one to report
+                    driver.execute("ROLLBACK")
 
     def _files_retained(self) -> AbstractContextManager[None]:
         """No segment file is deleted during the block."""
@@ -88,46 +88,25 @@ class Exporter:
             raise UnknownMap(f"The map {self._folder.name!r} was deleted or closed while it was read.")
 
 
-class _Source:
-    """A map as it is in one transaction (:class:`core.maps.archives.writing.ArchiveSource`)."""
-
+class _Source(LedgerSource):
     def __init__(
         self,
-        connection: sqlite3.Connection,
-        record: ArchivedRecord,
+        connection: MapConnection,
+        record: MapRecord,
         folder: Path,
         layout: Layout,
         expect_there: Callable[[], None],
     ) -> None:
-        self.record, self.frame_bytes, self.expect_there = record, layout.frame.itemsize, expect_there
-        self._connection, self._folder, self._layout = connection, folder, layout
+        super().__init__(connection, record, layout.frame.itemsize)
+        self._expect_there, self._folder, self._layout = expect_there, folder, layout
 
-    def sequence_lines(self) -> Iterator[bytes]:
-        return sequence_lines(self._connection)
-
-    def camera_lines(self) -> Iterator[bytes]:
-        return camera_lines(self._connection)
-
-    def places(self) -> Iterator[ArchivedPlace]:
-        return place_lines(self._connection)
+    def expect_there(self) -> None:
+        self._expect_there()
 
     def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[memoryview]:
-        reader, step = RowReader(self._folder, self._layout), max(1, CHUNK_BYTES // self._layout.record.itemsize)
-        for first in range(0, len(group), step):
-            some = group[first : first + step]
+        reader = RowReader(self._folder, self._layout)
+        for some in pieces(group, max(1, CHUNK_BYTES // self._layout.record.itemsize)):
             rows = np.array([place.row for place in some], np.int64)
             checksums = np.array([place.checksum for place in some], np.uint32)
             yield reader.frames(rows, checksums).view(np.uint8).data
             self.expect_there()
-
-    def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
-        for place in group:
-            if place.picture_bytes:
-                content = ledger.picture(self._connection, place.number, place.id)
-                assert content is not None
-                yield content
-
-    def keypoints(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
-        for place in group:
-            if place.keypoints_bytes:
-                yield keypoints.record_of(self._connection, place.number)

@@ -15,8 +15,8 @@ from pathlib import Path
 from core.disk import sqlite_file
 from core.disk.files import sync_file
 from core.disk.sqlite_file import DURABLE
-from core.storage.database import keypoints, row_checksums
-from core.storage.database.schema import check_schema, prepare
+from core.ledger.maps.connection import MapConnection
+from core.storage.database.schema import check_schema, connection_of, driver_of, prepare
 
 FILE = "map.sqlite"
 
@@ -24,11 +24,18 @@ _IDLE_READERS = 8
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 
 
+def begin_reading(connection: MapConnection) -> None:
+    """Begin a transaction that sees this moment."""
+    driver = driver_of(connection)
+    driver.execute("BEGIN")
+    driver.execute("SELECT number FROM maps").fetchall()  # a transaction sees the moment of its first read
+
+
 class DatabaseClosed(Exception):
     """The database was closed before this use of it."""
 
 
-_SETTINGS = {**DURABLE, "foreign_keys": "ON", "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
+_SETTINGS = {**DURABLE, "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
 
 
 def connect(path: Path, create: bool = False) -> sqlite3.Connection:
@@ -37,9 +44,7 @@ def connect(path: Path, create: bool = False) -> sqlite3.Connection:
     Raises:
         sqlite3.Error: the file is missing (unless ``create``) or cannot be read.
     """
-    connection = sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
-    _register(connection)
-    return connection
+    return sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
 
 
 def connect_without_log(path: Path) -> sqlite3.Connection:
@@ -52,13 +57,7 @@ def connect_without_log(path: Path) -> sqlite3.Connection:
         f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, isolation_level=None, check_same_thread=False
     )
     connection.execute("PRAGMA trusted_schema = OFF")
-    _register(connection)
     return connection
-
-
-def _register(connection: sqlite3.Connection) -> None:
-    row_checksums.register(connection)
-    keypoints.register(connection)
 
 
 class Database:
@@ -89,7 +88,7 @@ class Database:
         """A new object after every transaction; as long as it is the same object, nothing was written."""
 
     @contextmanager
-    def reading(self) -> Iterator[sqlite3.Connection]:
+    def reading(self) -> Iterator[MapConnection]:
         """A connection for the calling thread alone.
 
         Raises:
@@ -103,7 +102,7 @@ class Database:
         try:
             if connection is None:
                 connection = connect(self._path)
-            yield connection
+            yield connection_of(connection)
         finally:
             with self._condition:
                 self._reading -= 1
@@ -116,7 +115,7 @@ class Database:
                 self._condition.notify_all()
 
     @contextmanager
-    def transaction(self) -> Iterator[sqlite3.Connection]:
+    def transaction(self) -> Iterator[MapConnection]:
         """Execute all statements of the block or none; they are synced when it ends without an error.
 
         Raises:
@@ -126,7 +125,7 @@ class Database:
             raise DatabaseClosed
         try:
             with sqlite_file.transaction(self._writer):
-                yield self._writer
+                yield connection_of(self._writer)
         finally:
             self.state = object()
 

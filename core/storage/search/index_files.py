@@ -15,7 +15,7 @@ import numpy as np
 
 from core.index import Coder, Codes
 from core.maps.status import Recall
-from core.storage.database.ledger import SegmentEntry
+from core.storage.database.segments import SegmentEntry
 from core.storage.files.array_files import StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
 

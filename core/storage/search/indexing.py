@@ -23,7 +23,7 @@ from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.maps.records import TierSetting
 from core.maps.status import IndexStatus, Recall, Tier
-from core.storage.database.ledger import SegmentEntry
+from core.storage.database.segments import SegmentEntry
 from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.rebuilding import codes_of, extended, rebuilt

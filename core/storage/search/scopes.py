@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.priors import Constraint, Flags, InSequences, NotLately, Values, holding, log_weights
+from core.ledger.maps import places, sequences
+from core.ledger.maps.connection import Reading
 from core.maps.place_filter import Scalar
 from core.maps.selection import Conditions, Selection
-from core.storage.attributes import Attributes
 from core.storage.search.snapshot import SearchScope, Snapshot
 
 
@@ -18,13 +19,11 @@ class Chooser:
     """Chooses the rows of one map at one moment; only metadata is read from disk.
 
     Args:
-        rows_of: the rows of places, by their ids.
+        reading: begins to read the map's ledger.
     """
 
-    def __init__(
-        self, snapshot: Snapshot, attributes: Attributes, rows_of: Callable[[Sequence[str]], list[int | None]]
-    ) -> None:
-        self._snapshot, self._attributes, self._rows_of = snapshot, attributes, rows_of
+    def __init__(self, snapshot: Snapshot, reading: Reading) -> None:
+        self._snapshot, self._reading = snapshot, reading
 
     def scope(self, selection: Selection) -> SearchScope:
         """Which rows may be found, and their weights.
@@ -38,7 +37,9 @@ class Chooser:
         """The conditions on pose, time and sequence as constraints on rows."""
         found = list(conditions.geometry)
         if conditions.sequences is not None:
-            found.insert(0, InSequences(tuple(self._attributes.sequence_codes(conditions.sequences).values())))
+            with self._reading() as connection:
+                codes = sequences.codes_of(connection, conditions.sequences)
+            found.insert(0, InSequences(tuple(codes.values())))
         return found
 
     def _allowed(self, selection: Selection) -> Flags | None:
@@ -55,7 +56,8 @@ class Chooser:
             among, allowed = allowed, np.zeros(snapshot.rows, np.bool_)
             allowed[rows] = among[rows]
         if selection.excluded is not None:
-            (row,) = self._rows_of([selection.excluded])
+            with self._reading() as connection:
+                row = places.rows_of(connection, [selection.excluded]).get(selection.excluded)
             if row is not None and row < len(allowed):
                 allowed[row] = False
         return allowed
@@ -64,10 +66,11 @@ class Chooser:
         recent = selection.recent
         if recent is None:
             return None
-        code = self._attributes.sequence_codes([recent.sequence]).get(recent.sequence)
-        if code is None:
-            return None  # the map has no place of the sequence yet
-        oldest = self._attributes.oldest_of_last(code, recent.frames) if recent.frames else None
+        with self._reading() as connection:
+            code = sequences.codes_of(connection, [recent.sequence]).get(recent.sequence)
+            if code is None:
+                return None  # the map has no place of the sequence yet
+            oldest = sequences.oldest_of_last(connection, code, recent.frames) if recent.frames else None
         moment = recent.moment if recent.seconds else None
         return NotLately(code, oldest, moment, round(1e6 * recent.seconds))
 
@@ -84,5 +87,6 @@ class Chooser:
 
     def _rows_with(self, metadata: Mapping[str, Scalar], among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """The rows of the snapshot whose metadata has these values; places that were stored later are left out."""
-        rows = self._attributes.rows_with(metadata, among)
+        with self._reading() as connection:
+            rows = places.rows_with(connection, metadata, among)
         return rows[rows < self._snapshot.rows]

@@ -16,7 +16,7 @@ from core.maps.place_filter import Scalar
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
 from core.storage.database.connections import FILE
-from core.storage.database.schema import LONGEST_INDEXED
+from core.ledger.maps.places import LONGEST_TEXT
 from tests.core.storage import frames
 
 DIMENSION = 4
@@ -98,7 +98,7 @@ def test_whatever_was_written(
 
 def test_kinds_of_values(atlas: Atlas) -> None:
     lab = atlas.create("lab", "test@0", DIMENSION)
-    values: list[Any] = [1, 1.0, True, "1", None, 0, False, "", 10**30, [1], {"a": 1}, "x" * (LONGEST_INDEXED + 1)]
+    values: list[Any] = [1, 1.0, True, "1", None, 0, False, "", 10**30, [1], {"a": 1}, "x" * (LONGEST_TEXT + 1)]
     lab.enrol([enrolment(f"p{i}", i, {"v": value}) for i, value in enumerate(values)])
     expected: list[tuple[Scalar, list[str]]] = [
         (1, ["p0", "p1"]), (True, ["p2"]), ("1", ["p3"]), (None, ["p4"]), (0.0, ["p5"]), (False, ["p6"]), ("", ["p7"]),

@@ -1,30 +1,37 @@
-"""Reading all places of a map from SQLite as NumPy columns: a million of them in seconds."""
+"""Reading all places of a map as NumPy columns: a million of them in seconds."""
 
 from __future__ import annotations
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import bindparam, func, select
 
-from core.disk.files import Damage
+from core.ledger.maps.checksums import DamagedRow
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.schema import PLACES
+from core.ledger.statements import Statement
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
 
+_P = PLACES.c
 _AT_ONCE = 65_536
-_NUMBERS = (
-    "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading,"
-    " coalesce(track, sequence), coalesce(station, ordinal)"
-)
+_NUMBERS = 12
+_COLUMNS = Statement(
+    select(
+        _P.row, _P.checksum, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
+        func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), func.substr(_P.timestamp, 1, 26),
+    ).where(_P.map == bindparam("map"))
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
     """The places of a map, in any order.
 
-    rows: int64 [n], of their descriptors.
-    checksums: uint32 [n], of these rows.
+    rows: int64 [n], of their frames.
+    checksums: uint32 [n], of the descriptors in these rows.
     """
 
     rows: NDArray[np.int64]
@@ -32,27 +39,26 @@ class Columns:
     whereabouts: Whereabouts
 
 
-def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
+def read_columns(connection: MapConnection, rows: int) -> Columns:
     """Row, checksum and whereabouts of every place.
 
     Args:
-        rows: how many descriptor rows the map has.
+        rows: how many rows the map has.
 
     Raises:
-        Damage: a place has a row that is in no segment.
+        DamagedRow: a place has a row that the map has not.
         ValueError: a pose is invalid.
     """
-    cursor = connection.execute(f"SELECT {_NUMBERS}, substr(timestamp, 1, 26) FROM places")
-    numbers, moments = [np.empty((0, 12))], [np.empty(0, "datetime64[us]")]
-    while part := cursor.fetchmany(_AT_ONCE):
-        numbers.append(np.array([values[:12] for values in part], dtype=np.float64))
-        moments.append(np.array([values[12] for values in part], dtype="datetime64[us]"))
+    numbers, moments = [np.empty((0, _NUMBERS))], [np.empty(0, "datetime64[us]")]
+    for page in connection.pages(_COLUMNS, _AT_ONCE):
+        numbers.append(np.array([values[:_NUMBERS] for values in page], dtype=np.float64))
+        moments.append(np.array([values[_NUMBERS] for values in page], dtype="datetime64[us]"))
     found = np.concatenate(numbers)
     row = found[:, 0].astype(np.int64)
     if len(row) and row.max() >= rows:
-        raise Damage(f"map.sqlite: a place has row {row.max()}, but there are {rows}")
+        raise DamagedRow(f"a place has row {row.max()}, but there are {rows}")
     if len(row) and row.min() < 0:
-        raise Damage("map.sqlite: a place has no row")
+        raise DamagedRow("a place has no row")
     kind, position = _positions(found[:, 4:9], found[:, 9])
     whereabouts = Whereabouts(
         kind,

@@ -1,0 +1,155 @@
+"""The content of a map for an export file, as one transaction sees it."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+
+from sqlalchemy import bindparam, select
+
+from core.errors import StorageFailure
+from core.geometry.keypoints import count_of
+from core.ledger.maps import frames, places, sequences
+from core.ledger.maps.cameras import read_cameras
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.frames import StoredObject
+from core.ledger.maps.map import ObjectReader
+from core.ledger.maps.places import StoredPlace
+from core.ledger.maps.schema import SEQUENCES
+from core.ledger.statements import Statement
+from core.maps.archives.lines import written_line
+from core.maps.archives.manifest import ArchivedRecord
+from core.maps.archives.writing import ArchivedPlace, Chunks
+from core.maps.records import MapRecord
+from core.maps.stored_fields import POSE_VALUES, moment_text
+from core.places import Pose
+
+AT_ONCE = 64
+"""Places whose pictures, keypoints or descriptors are in memory at a time."""
+
+LINES_AT_ONCE = 1024
+
+_NAMES = Statement(
+    select(SEQUENCES.c.code, SEQUENCES.c.name).where(SEQUENCES.c.map == bindparam("map"), SEQUENCES.c.name.is_not(None))
+)
+
+
+class LedgerSource(ABC):
+    """A map as it is in one transaction (:class:`core.maps.archives.writing.ArchiveSource`).
+
+    Args:
+        frame_bytes: the size of one place's descriptors, as the map stores them.
+        objects: where pictures may be besides.
+    """
+
+    def __init__(
+        self, connection: MapConnection, record: MapRecord, frame_bytes: int, objects: ObjectReader | None = None
+    ) -> None:
+        self.connection, self._objects = connection, objects
+        self.record, self.frame_bytes = ArchivedRecord.model_validate(record.model_dump()), frame_bytes
+
+    @abstractmethod
+    def frames(self, group: Sequence[ArchivedPlace]) -> Chunks:
+        """The descriptors of places as they are stored, in their order."""
+
+    @abstractmethod
+    def expect_there(self) -> None:
+        """Raise if the map is gone."""
+
+    def sequence_lines(self) -> Iterator[bytes]:
+        """The lines of sequences by name; that of places without a sequence comes first."""
+        for name, following in sequences.ends(self.connection).items():
+            yield written_line({"name": name, "next_ordinal": following})
+
+    def camera_lines(self) -> Iterator[bytes]:
+        """The lines of cameras by name."""
+        for camera in read_cameras(self.connection).values():
+            values = {name: json.loads(camera.model_dump_json(include={name}))[name] for name in ("mask", "intrinsics")}
+            yield written_line({"name": camera.name, **values, "updated_at": moment_text(camera.updated_at)})
+
+    def places(self) -> Iterator[ArchivedPlace]:
+        """All places in the order of their enrolment."""
+        names = dict(self.connection.execute(_NAMES))
+        lost: dict[int, int] = {}
+        after = -1
+        while page := places.listed(self.connection, after, LINES_AT_ONCE):
+            pictures, records = frames.sizes_at(self.connection, [stored.row for stored in page])
+            for stored in page:
+                track = None if stored.track is None else names.get(stored.track)
+                if stored.track is not None and track is None:
+                    track = lost.setdefault(stored.track, len(lost))
+                yield _archived(stored, track, pictures.get(stored.row), records.get(stored.row, 0))
+            after = page[-1].number
+
+    def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        """The pictures of those of the places that keep one."""
+        for some in pieces([place for place in group if place.picture_bytes]):
+            stored = frames.pictures_at(self.connection, [place.row for place in some])
+            far = {row: one for row, one in stored.items() if isinstance(one, StoredObject)}
+            if far and self._objects is None:
+                raise StorageFailure("The picture is in an object store, and this service is configured without one.")
+            read = [] if self._objects is None else self._objects.read(list(far.values()))
+            found = dict(zip(far, read, strict=True))
+            for place in some:
+                near = stored.get(place.row)
+                picture = near if isinstance(near, bytes) else found.get(place.row)
+                if picture is None:
+                    raise StorageFailure(f"The picture of place {place.id!r} is missing, or damaged.")
+                yield picture
+
+    def keypoints(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        """The records of keypoints of those of the places that have them."""
+        for some in pieces([place for place in group if place.keypoints_bytes]):
+            found = frames.records_at(self.connection, [place.row for place in some])
+            yield from (found[place.row] for place in some)
+
+
+def pieces(group: Sequence[ArchivedPlace], size: int = AT_ONCE) -> Iterator[Sequence[ArchivedPlace]]:
+    """A group in pieces of at most ``size`` places."""
+    for first in range(0, len(group), size):
+        yield group[first : first + size]
+
+
+def _archived(
+    stored: StoredPlace, track: str | int | None, picture: tuple[int, bytes] | None, keypoints: int
+) -> ArchivedPlace:
+    """The line of a place.
+
+    Args:
+        track: the name of its track, or the number of a track whose sequence is gone; None: it has none.
+        picture: size and SHA-256.
+        keypoints: bytes of their record; 0: it has none.
+    """
+    place = stored.place
+    described = None
+    if picture is not None:
+        described = {"kind": place.picture, "bytes": picture[0], "sha256": picture[1].hex()}
+    text = written_line(
+        {
+            "id": place.id,
+            "pose": _pose(place.pose),
+            "pose_of": place.pose_of,
+            "timestamp": None if place.timestamp is None else moment_text(place.timestamp),
+            "sequence": place.sequence,
+            "ordinal": stored.ordinal,
+            "track": track,
+            "station": stored.station,
+            "camera": place.camera,
+            "metadata": place.metadata,
+            "regions": place.regions,
+            "digest": stored.digest.hex(),
+            "picture": described,
+            "keypoints": count_of(keypoints) if keypoints else None,
+            "created_at": moment_text(place.created_at),
+            "updated_at": moment_text(place.updated_at),
+        }
+    )
+    size = 0 if picture is None else picture[0]
+    return ArchivedPlace(place.id, text, stored.number, stored.row, stored.checksum, size, keypoints)
+
+
+def _pose(pose: Pose | None) -> dict[str, float] | None:
+    if pose is None:
+        return None
+    return {name: value for name in POSE_VALUES if (value := getattr(pose, name)) is not None}

@@ -1,0 +1,253 @@
+"""What is stored of a frame beside its descriptors, by its row: its picture and its keypoints.
+
+The checksum of keypoints covers the digest of the frame, so that keypoints of another frame do not match it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import and_, bindparam, delete, exists, func, select, union
+
+from core.errors import InvalidKeypoints, StorageFailure
+from core.geometry.keypoints import Keypoints, keypoints_of
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.schema import KEYPOINTS, PICTURES, PLACES
+from core.ledger.statements import Statement, among
+from core.maps.records import PicturedPlace
+
+log = logging.getLogger(__name__)
+
+_P, _K, _PICTURE = PLACES.c, KEYPOINTS.c, PICTURES.c
+_OF_PLACES = PLACES.join(KEYPOINTS, and_(_K.map == _P.map, _K.row == _P.row))
+
+_PUT_PICTURE = Statement(
+    lambda insert: insert(PICTURES).values(
+        {name: bindparam(name) for name in ("map", "row", "digest", "size", "bytes", "object")}
+    )
+)
+_PICTURES_AT = Statement(
+    select(_PICTURE.row, _PICTURE.bytes, _PICTURE.object, _PICTURE.size, _PICTURE.digest).where(
+        _PICTURE.map == bindparam("map"), among(_PICTURE.row, "rows")
+    )
+)
+_PICTURE_SIZES = Statement(
+    select(_PICTURE.row, _PICTURE.size, _PICTURE.digest).where(
+        _PICTURE.map == bindparam("map"), among(_PICTURE.row, "rows")
+    )
+)
+_RECORD_SIZES = Statement(
+    select(_K.row, func.length(_K.record)).where(_K.map == bindparam("map"), among(_K.row, "rows"))
+)
+_PUT_KEYPOINTS = Statement(
+    lambda insert: (
+        put := insert(KEYPOINTS).values({name: bindparam(name) for name in ("map", "row", "checksum", "record")})
+    ).on_conflict_do_update(
+        index_elements=["map", "row"], set_={"checksum": put.excluded.checksum, "record": put.excluded.record}
+    )
+)
+_KEYPOINTS_AT = Statement(
+    select(_P.row, _P.id, _P.digest, _K.checksum, _K.record)
+    .select_from(_OF_PLACES)
+    .where(_P.map == bindparam("map"), among(_P.row, "rows"))
+)
+_PICTURED = Statement(
+    select(_P.number, _P.id, _P.digest, _P.camera, _P.picture, _P.row, _K.row)
+    .select_from(PLACES.outerjoin(KEYPOINTS, and_(_K.map == _P.map, _K.row == _P.row)))
+    .where(_P.map == bindparam("map"), _P.number > bindparam("after"), _P.picture != "none")
+    .order_by(_P.number)
+    .limit(bindparam("most"))
+)
+_ROOM = Statement(
+    select(func.count(), func.coalesce(func.sum(func.length(_K.record)), 0)).where(_K.map == bindparam("map"))
+)
+_PICTURE_ROOM = Statement(select(func.coalesce(func.sum(_PICTURE.size), 0)).where(_PICTURE.map == bindparam("map")))
+_DELETE_PICTURES = Statement(delete(PICTURES).where(_PICTURE.map == bindparam("map"), among(_PICTURE.row, "rows")))
+_DELETE_KEYPOINTS = Statement(delete(KEYPOINTS).where(_K.map == bindparam("map"), among(_K.row, "rows")))
+
+
+_PAGE_OF_KEYPOINTS = Statement(
+    select(_P.row, _P.id, _P.digest, _K.checksum, _K.record)
+    .select_from(_OF_PLACES)
+    .where(_P.map == bindparam("map"), _P.row > bindparam("after"))
+    .order_by(_P.row)
+    .limit(bindparam("most"))
+)
+_OF_NO_PLACE = Statement(
+    union(
+        *(
+            select(table.c.row).where(
+                table.c.map == bindparam("map"), ~exists().where(_P.map == table.c.map, _P.row == table.c.row)
+            )
+            for table in (PICTURES, KEYPOINTS)
+        )
+    )
+)
+_AT_ONCE = 100
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """A picture that is in an object store, as its row names it.
+
+    name: of the object; it was never used before.
+    size: in bytes.
+    digest: SHA-256 of the picture, 32 bytes.
+    """
+
+    name: str
+    size: int
+    digest: bytes
+
+
+StoredPicture = bytes | StoredObject
+"""A picture in its row: its bytes, or the object that has them."""
+
+
+def checksum_of(record: bytes, digest: bytes) -> int:
+    """The checksum of a record of the keypoints of the frame with this digest."""
+    return zlib.crc32(record, zlib.crc32(digest))
+
+
+# Pictures
+
+
+def put_picture(connection: MapConnection, row: int, picture: StoredPicture) -> None:
+    """Store the picture of a frame that has none."""
+    if isinstance(picture, StoredObject):
+        given = {"digest": picture.digest, "size": picture.size, "bytes": None, "object": picture.name}
+    else:
+        digest = hashlib.sha256(picture).digest()
+        given = {"digest": digest, "size": len(picture), "bytes": picture, "object": None}
+    connection.execute(_PUT_PICTURE, row=row, **given)
+
+
+def pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, StoredPicture]:
+    """The pictures of frames by row; frames without one are left out.
+
+    Raises:
+        StorageFailure: the bytes of one do not match their SHA-256.
+    """
+    found: dict[int, StoredPicture] = {}
+    for row, content, name, size, digest in connection.execute(_PICTURES_AT, rows=list(rows)):
+        if name is not None:
+            found[row] = StoredObject(name, size, digest)
+        elif isinstance(content, bytes) and hashlib.sha256(content).digest() == digest:
+            found[row] = content
+        else:
+            raise StorageFailure("A stored picture is damaged.")
+    return found
+
+
+def stored_pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, tuple[bytes, bytes]]:
+    """The bytes of the pictures of frames and their recorded SHA-256 by row, sound or not; no objects."""
+    found = connection.execute(_PICTURES_AT, rows=list(rows))
+    return {row: (bytes(content), digest) for row, content, _, _, digest in found if content is not None}
+
+
+def sizes_at(connection: MapConnection, rows: Sequence[int]) -> tuple[dict[int, tuple[int, bytes]], dict[int, int]]:
+    """Of frames by row: the size and the SHA-256 of their pictures, and the bytes of the records of keypoints."""
+    pictures = connection.execute(_PICTURE_SIZES, rows=list(rows))
+    records = connection.execute(_RECORD_SIZES, rows=list(rows))
+    return {row: (size, digest) for row, size, digest in pictures}, dict(records)
+
+
+def rows_of_no_place(connection: MapConnection) -> list[int]:
+    """The rows that have a picture or keypoints, but no place."""
+    return [row for (row,) in connection.execute(_OF_NO_PLACE)]
+
+
+# Keypoints
+
+
+def damaged_keypoints(connection: MapConnection) -> list[str]:
+    """The ids of the places whose keypoints do not match their checksum."""
+    damaged, after = [], -1
+    while page := connection.execute(_PAGE_OF_KEYPOINTS, after=after, most=_AT_ONCE):
+        damaged += [str(place) for _, place, *stored in page if not _is_sound(*stored)]
+        after = page[-1][0]
+    return damaged
+
+
+def _is_sound(digest: bytes, checksum: int, record: bytes) -> bool:
+    return isinstance(record, bytes) and checksum == checksum_of(record, digest)
+
+
+def _read(place_id: str, digest: bytes, checksum: int, record: bytes) -> Keypoints:
+    if not _is_sound(digest, checksum, record):
+        raise InvalidKeypoints(f"The stored keypoints of place {place_id!r} do not match their checksum.")
+    return keypoints_of(record)
+
+
+def keypoints_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, Keypoints]:
+    """The keypoints of the places whose frames are in ``rows`` now; damaged ones are logged and left out."""
+    found = {}
+    for row, *stored in connection.execute(_KEYPOINTS_AT, rows=list(rows)):
+        try:
+            found[int(row)] = _read(*stored)
+        except InvalidKeypoints as error:
+            log.error("%s Its place is not verified until they are found again.", error)
+    return found
+
+
+def has_keypoints(connection: MapConnection, row: int) -> bool:
+    """Whether a place has keypoints that are not damaged."""
+    return any(_is_sound(*stored) for _, _, *stored in connection.execute(_KEYPOINTS_AT, rows=[row]))
+
+
+def records_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, bytes]:
+    """The records of the keypoints of places, by row.
+
+    Raises:
+        StorageFailure: one is damaged.
+    """
+    found = {}
+    for row, *stored in connection.execute(_KEYPOINTS_AT, rows=list(rows)):
+        try:
+            _read(*stored)
+        except InvalidKeypoints as error:
+            raise StorageFailure(f"{error} Have them found again, or forget the place.") from error
+        found[int(row)] = stored[3]
+    return found
+
+
+def put_keypoints(connection: MapConnection, row: int, digest: bytes, record: bytes) -> None:
+    """Store the record of the keypoints of a frame with this digest, in the place of any other."""
+    connection.execute(_PUT_KEYPOINTS, row=row, checksum=checksum_of(record, digest), record=record)
+
+
+def without_keypoints(connection: MapConnection, after: int, limit: int) -> list[PicturedPlace]:
+    """Up to ``limit`` places behind number ``after`` that keep a picture and no keypoints, or only damaged ones."""
+    found: list[PicturedPlace] = []
+    while len(found) < limit:
+        page = connection.execute(_PICTURED, after=after, most=limit)
+        sound = set(_sound_rows(connection, [row for *_, row, has in page if has is not None]))
+        found += [PicturedPlace(*values) for *values, row, _ in page if row not in sound]
+        if len(page) < limit:
+            break
+        after = page[-1][0]
+    return found[:limit]
+
+
+def _sound_rows(connection: MapConnection, rows: Sequence[int]) -> Iterator[int]:
+    if rows:
+        for row, _, *stored in connection.execute(_KEYPOINTS_AT, rows=list(rows)):
+            if _is_sound(*stored):
+                yield int(row)
+
+
+def room(connection: MapConnection) -> tuple[int, int, int]:
+    """How many frames have keypoints, the bytes of their records, and the bytes of pictures, wherever they are."""
+    ((count, size),) = connection.execute(_ROOM)
+    ((pictures,),) = connection.execute(_PICTURE_ROOM)
+    return int(count), int(size), int(pictures)
+
+
+def delete_frames(connection: MapConnection, rows: Sequence[int]) -> None:
+    """Delete pictures and keypoints of frames."""
+    connection.execute(_DELETE_PICTURES, rows=list(rows))
+    connection.execute(_DELETE_KEYPOINTS, rows=list(rows))

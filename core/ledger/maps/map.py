@@ -1,0 +1,317 @@
+"""A map: reading and writing its ledger, whatever keeps its vectors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, overload
+
+from core.errors import (
+    InvalidImage,
+    NoThumbnail,
+    RevisionMismatch,
+    StorageFailure,
+    TooManyToDelete,
+    UnknownPlace,
+    UnknownSequence,
+)
+from core.frames.images import ANY_SIZE, decode, encode_thumbnail
+from core.geometry.keypoints import Keypoints
+from core.ledger.maps import frames, places, sequences
+from core.ledger.maps.cameras import Cameras
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.counterparts import Counterparts
+from core.ledger.maps.frames import StoredObject
+from core.ledger.maps.plan import Plan
+from core.ledger.maps.transfer import Transfer
+from core.ledger.maps.writing import Write
+from core.maps.enrolling import check_enrolment
+from core.maps.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
+from core.maps.place_filter import EVERY_PLACE, PlaceFilter
+from core.maps.records import (
+    Change,
+    Enrolment,
+    MapRecord,
+    PicturedPlace,
+    SameFrame,
+    SequenceSummary,
+    patched_fields,
+    patched_record,
+)
+from core.places import Place, PlaceFields
+
+
+class ObjectReader(Protocol):
+    """Reads objects: the bytes of each in order; None: it is missing or damaged."""
+
+    def read(self, stored: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
+
+
+class LedgerMap(ABC):
+    """The part of a map that is in a ledger (:class:`core.maps.store.Map`).  Any thread may call any method."""
+
+    objects: ObjectReader | None = None
+    """Where pictures may be that are not in the ledger."""
+
+    def __init__(self) -> None:
+        self.cameras = Cameras(self._reading, self._writing, lambda: self.state)
+        self.counterparts = Counterparts(self._reading, self._writing)
+        self.plan = Plan(self._reading)
+        self.transfer = Transfer(self._reading, self._writing, self.paused_writes)
+
+    # Of the store
+
+    @property
+    @abstractmethod
+    def record(self) -> MapRecord:
+        """The map's record as of its last edit."""
+
+    @property
+    @abstractmethod
+    def state(self) -> object:
+        """A value that is the same until the map is written to."""
+
+    @abstractmethod
+    def _reading(self) -> AbstractContextManager[MapConnection]:
+        """A transaction that reads the map, and raises if the map is gone."""
+
+    @abstractmethod
+    def _writing(self) -> AbstractContextManager[Write]:
+        """One write, which is stored whole at the end of the block, or not at all."""
+
+    @abstractmethod
+    def paused_writes(self) -> AbstractContextManager[None]:
+        """Nobody but this thread writes to the map during the block."""
+
+    # Reading
+
+    def place(self, place_id: str) -> Place:
+        with self._reading() as connection:
+            return places.expect(connection, place_id).place
+
+    def places(
+        self, cursor: str | None, limit: int, wanted: PlaceFilter = EVERY_PLACE
+    ) -> tuple[list[Place], str | None]:
+        """A page of places in the order of their enrolment, and the cursor of the next page.
+
+        Args:
+            wanted: which places are listed.
+
+        Raises:
+            InvalidCursor.
+        """
+        most, listing = one_more(limit), listing_of_places(self.record.id, wanted)
+        after = decode_number(listing, cursor)
+        with self._reading() as connection:
+            found = places.listed(connection, after, most, wanted)
+        page, more = page_of(listing, found, limit, lambda stored: stored.number)
+        return [stored.place for stored in page], more
+
+    def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
+        with self._reading() as connection:
+            return _not_more(places.ids_of(connection, wanted, most + 1), most)
+
+    def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
+        listing: Listing = ["sequences", self.record.id]
+        after = decode_name(listing, cursor)
+        with self._reading() as connection:
+            found = sequences.summaries_after(connection, after, one_more(limit))
+        return page_of(listing, found, limit, lambda sequence: sequence.name)
+
+    def unknown_sequences(self, names: Sequence[str]) -> set[str]:
+        with self._reading() as connection:
+            return set(names) - set(sequences.codes_of(connection, names))
+
+    def digest(self, place_id: str) -> bytes | None:
+        with self._reading() as connection:
+            stored = places.find(connection, place_id)
+        return None if stored is None else stored.digest
+
+    def places_at(self, rows: Sequence[int]) -> list[Place | None]:
+        with self._reading() as connection:
+            found = places.at_rows(connection, [int(row) for row in rows])
+        return [None if (stored := found.get(int(row))) is None else stored.place for row in rows]
+
+    def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
+        """The rows of places; None where there is no such place."""
+        with self._reading() as connection:
+            found = places.rows_of(connection, place_ids)
+        return [found.get(place_id) for place_id in place_ids]
+
+    def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
+        """The keypoints of the places of rows that a search returned.
+
+        Returns:
+            In the order of ``rows``; None where a place was deleted or got another frame since, where none are stored,
+            and where the stored ones are damaged, which is logged.
+        """
+        wanted = [int(row) for row in rows]
+        with self._reading() as connection:
+            found = frames.keypoints_at(connection, wanted)
+        return [found.get(row) for row in wanted]
+
+    def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
+        with self._reading() as connection:
+            return frames.without_keypoints(connection, after, limit)
+
+    def picture(self, place_id: str) -> bytes | None:
+        return self._pictured(place_id)[1]
+
+    def thumbnail(self, place_id: str) -> bytes:
+        place, picture = self._pictured(place_id)
+        if place is None:
+            raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
+        if picture is None:
+            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+        if place.picture == "thumbnail":
+            return picture
+        try:
+            return encode_thumbnail(decode(picture, ANY_SIZE))
+        except InvalidImage as error:
+            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
+
+    def _pictured(self, place_id: str) -> tuple[Place | None, bytes | None]:
+        """A place and its picture; None for what there is not."""
+        before: int | None = None
+        while True:
+            with self._reading() as connection:
+                stored = places.find(connection, place_id)
+                if stored is None:
+                    return None, None
+                try:
+                    pictures = frames.pictures_at(connection, [stored.row])
+                except StorageFailure as damage:
+                    raise StorageFailure(f"The stored picture of place {place_id!r} is damaged.") from damage
+            picture = pictures.get(stored.row)
+            if not isinstance(picture, StoredObject):
+                return stored.place, picture
+            if (content := read_object(self.objects, picture)) is not None:
+                return stored.place, content
+            if stored.row == before:
+                raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
+            before = stored.row  # or the place got another frame meanwhile
+
+    # Writing
+
+    def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
+        """Change settings (the fields of MapSettings) or ``calibration`` (None: use that of the encoder).
+
+        ``keep`` applies to frames enrolled later; pictures that are stored already stay.  The revision grows by one if
+        anything changes.
+
+        Raises:
+            InvalidField: a field is unknown or fixed, or its value is not allowed.
+            RevisionMismatch: the record is not at ``expected_revision``.
+        """
+        with self._writing() as write:
+            before = write.record
+            if expected_revision is not None and expected_revision != before.revision:
+                raise RevisionMismatch(f"The map is at revision {before.revision}, not {expected_revision}.")
+            changed = patched_record(before, changes)
+            if changed != before:
+                write.edit(changed)
+        return write.record
+
+    @overload
+    def enrol(self, items: Sequence[Enrolment]) -> Sequence[tuple[Place, Change]]: ...
+
+    @overload
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
+
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
+        """Store frames as places, all of them or, if this raises, none, with one COMMIT.
+
+        The items are stored in the order given, which is the order of the places in their sequences.  An id that
+        exists keeps its place and creation time: if the frame's digest is the same, only its fields are stored
+        (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
+
+        Returns:
+            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame:
+            such an item changes nothing.
+
+        Raises:
+            InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
+            NoRegions: a descriptor is all zero.
+            ValueError: descriptors or a digest of the wrong kind.
+        """
+        new = [item for item in items if isinstance(item, Enrolment)]
+        for item in new:
+            check_enrolment(item, self.record.dimension, self.record.local_shape)
+        if not items:
+            return []
+        with self._writing() as write:
+            write.expect(len(new))
+            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
+
+    def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
+        with self._writing() as write:
+            return write.set_fields(places.expect(write.connection, place_id), fields)
+
+    def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
+        with self._writing() as write:
+            stored = places.expect(write.connection, place_id)
+            return write.set_fields(stored, patched_fields(stored.place, changes))[0]
+
+    def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:
+        """Store the keypoints of places that :meth:`without_keypoints` listed, with one COMMIT.
+
+        A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
+        places of a map whose setting ``verification`` is off.
+
+        Returns:
+            How many were stored.
+        """
+        if not found:
+            return 0
+        with self._writing() as write:
+            return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
+
+    def forget(self, place_id: str) -> None:
+        with self._writing() as write:
+            write.forget(places.expect(write.connection, place_id))
+
+    def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """Delete the places that fulfil some conditions, all in one commit; returns their ids.
+
+        Raises:
+            TooManyToDelete: there are more than ``most``; none is deleted.
+        """
+        with self._writing() as write:
+            found = _not_more(places.ids_of(write.connection, wanted, most + 1), most)
+            for place_id in found:
+                write.forget(places.expect(write.connection, place_id))
+        return found
+
+    def forget_sequence(self, name: str) -> int:
+        count = 0
+        with self._writing() as write:
+            while some := places.listed(write.connection, -1, _AT_ONCE, PlaceFilter(sequence=name)):
+                for stored in some:
+                    write.forget(stored)
+                count += len(some)
+            if not count:
+                raise UnknownSequence(f"The map has no sequence {name[:128]!r}.")
+        return count
+
+
+_AT_ONCE = 1000
+
+
+def read_object(objects: ObjectReader | None, picture: StoredObject) -> bytes | None:
+    """The bytes of a picture in an object store; None: it is missing or damaged.
+
+    Raises:
+        StorageFailure: this service is configured without an object store.
+        StoreUnavailable: the object store cannot be reached, or refuses.
+    """
+    if objects is None:
+        raise StorageFailure("The picture is in an object store, and this service is configured without one.")
+    return objects.read([picture])[0]
+
+
+def _not_more(ids: list[str], most: int) -> list[str]:
+    """The ids; raises TooManyToDelete if they are more than ``most``."""
+    if len(ids) > most:
+        raise TooManyToDelete(f"More than {most} places fulfil the conditions. Delete them in several requests.")
+    return ids

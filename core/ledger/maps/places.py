@@ -1,0 +1,455 @@
+"""Places: finding, listing and storing them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import and_, bindparam, delete, func, select, update
+
+from core.errors import UnknownPlace
+from core.ledger.maps.checksums import DamagedRow, is_sound, sealed, sealed_columns
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.schema import PLACES, SEQUENCES, TOKENS
+from core.ledger.statements import Statement, among, joined
+from core.maps.counterparts import PlaceStation
+from core.maps.place_filter import EVERY_PLACE, PlaceFilter, Scalar
+from core.maps.records import Keep, Outline
+from core.maps.stored_fields import POSE_VALUES, field_columns, moment_text
+from core.places import Place, PlaceFields, Pose
+
+LONGEST_TEXT = 512
+"""Most characters of a text in a place's metadata by which the place can be found; longer texts are only stored."""
+
+_P, _S, _T = PLACES.c, SEQUENCES.c, TOKENS.c
+_COLUMNS = sealed_columns(PLACES)
+_STORED = (
+    select(*(_P[name] for name in _COLUMNS), _P.seal, _S.name)
+    .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
+    .where(_P.map == bindparam("map"))
+)
+_NUMBERS = (
+    "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision",
+)  # fmt: skip
+
+_BY_ID = Statement(_STORED.where(_P.id == bindparam("id")))
+_BY_IDS = Statement(_STORED.where(among(_P.id, "ids")))
+_BY_ROWS = Statement(_STORED.where(among(_P.row, "rows")))
+_BY_KEYS = Statement(_STORED.where(among(_P.key, "keys")))
+_ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
+_INSERT = Statement(
+    lambda insert: insert(PLACES).values({name: bindparam(name) for name in ("map", *_COLUMNS, "seal")})
+)
+_UPDATE = Statement(
+    update(PLACES)
+    .where(_P.map == bindparam("map"), _P.number == bindparam("which"))
+    .values({name: bindparam(f"new_{name}") for name in (*_COLUMNS, "seal") if name != "number"})
+)
+_DELETE = Statement(delete(PLACES).where(_P.map == bindparam("map"), _P.number == bindparam("number")))
+_PUT_TOKEN = Statement(
+    lambda insert: (
+        insert(TOKENS).values({name: bindparam(name) for name in ("map", "token", "row")}).on_conflict_do_nothing()
+    )
+)
+_DELETE_TOKEN = Statement(
+    delete(TOKENS).where(_T.map == bindparam("map"), _T.token == bindparam("token"), _T.row == bindparam("row"))
+)
+_DELETE_TOKENS = Statement(delete(TOKENS).where(_T.map == bindparam("map")))
+_TOKENS = Statement(select(_T.row, _T.token).where(_T.map == bindparam("map")))
+_METADATA = Statement(select(_P.row, _P.metadata).where(_P.map == bindparam("map"), _P.metadata != "{}"))
+_ROWS_WITH = Statement(select(joined(_T.row)).where(_T.map == bindparam("map"), _T.token == bindparam("token")))
+_ROWS_WITH_AMONG = Statement(
+    select(joined(_T.row)).where(_T.map == bindparam("map"), _T.token == bindparam("token"), among(_T.row, "rows"))
+)
+_OUTLINES = Statement(
+    select(_P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at)
+    .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
+    .where(_P.map == bindparam("map"))
+    .order_by(_P.number)
+)
+_STATIONS = Statement(
+    select(_P.id, _P.digest, _P.sequence, _P.ordinal, _P.track, _P.station, _P.pose_of)
+    .where(_P.map == bindparam("map"))
+    .order_by(_P.number)
+)
+_HANDED_OVER = Statement(select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _P.pose_of.is_not(None)))
+_WITHOUT_IMAGE = Statement(
+    select(func.count()).select_from(PLACES).where(_P.map == bindparam("map"), _P.picture != "image")
+)
+_COUNT = Statement(select(func.count()).select_from(PLACES).where(_P.map == bindparam("map")))
+_CHECKSUMS = Statement(select(_P.row, _P.id, _P.checksum).where(_P.map == bindparam("map")))
+_PICTURED = Statement(
+    select(_P.id, _P.row, _P.picture, _P.digest, _P.camera).where(_P.map == bindparam("map")).order_by(_P.number)
+)
+_SEALS = Statement(
+    select(*(_P[name] for name in _COLUMNS), _P.seal)
+    .where(_P.map == bindparam("map"), _P.number > bindparam("after"))
+    .order_by(_P.number)
+    .limit(bindparam("most"))
+)
+
+_AT_ONCE = 4096
+FEW = 5000
+"""Up to this number, rows are looked up one by one, which is faster than reading all rows with a value."""
+
+
+@dataclass(frozen=True)
+class StoredPlace:
+    """A place as it is stored.
+
+    number: grows in the order of enrolment.
+    row: of its frame.
+    checksum: of its descriptors; 0: where they are has its own.
+    digest: SHA-256 of its image, 32 bytes.
+    sequence: code of its sequence, NO_SEQUENCE without one.
+    ordinal: its position in its sequence (``core.maps.views``).
+    track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
+    key: of its entity in Milvus.
+    revision: of the map's write that changed it last.
+    """
+
+    number: int
+    row: int
+    checksum: int
+    digest: bytes
+    sequence: int
+    ordinal: int
+    place: Place
+    track: int | None = None
+    station: int | None = None
+    key: int | None = None
+    revision: int = 0
+
+    def outline(self) -> Outline:
+        """The place in brief."""
+        place = self.place
+        return Outline(
+            self.number, place.id, self.row, self.digest, place.picture, place.camera, place.sequence, self.ordinal,
+            moment_text(place.updated_at),
+        )  # fmt: skip
+
+
+def _stored(values: Sequence[Any]) -> StoredPlace:
+    *columns, seal, sequence = values
+    if not is_sound(columns, seal):
+        raise DamagedRow(f"the row of place {columns[1]!r} does not match its checksum")
+    return _from_columns(dict(zip(_COLUMNS, columns, strict=True)), sequence)
+
+
+def _from_columns(columns: Mapping[str, Any], sequence: str | None) -> StoredPlace:
+    pose = {name: columns[name] for name in POSE_VALUES if columns[name] is not None}
+    try:
+        place = Place(
+            id=columns["id"],
+            pose_of=columns["pose_of"],
+            regions=columns["regions"],
+            picture=columns["picture"],
+            pose=Pose(**pose) if pose else None,
+            timestamp=columns["timestamp"],
+            sequence=sequence,
+            camera=columns["camera"],
+            metadata=json.loads(columns["metadata"]),
+            created_at=columns["created_at"],
+            updated_at=columns["updated_at"],
+        )
+    except ValueError as error:
+        raise DamagedRow(f"the row of place {columns['id']!r} is invalid") from error
+    return StoredPlace(**{name: columns[name] for name in _NUMBERS}, place=place)
+
+
+def _columns_of(stored: StoredPlace) -> dict[str, Any]:
+    place = stored.place
+    return {
+        **{name: getattr(stored, name) for name in _NUMBERS},
+        "id": place.id,
+        "regions": place.regions,
+        "picture": place.picture,
+        "pose_of": place.pose_of,
+        "created_at": moment_text(place.created_at),
+        "updated_at": moment_text(place.updated_at),
+        **field_columns(place),
+    }
+
+
+# Reading
+
+
+def find(connection: MapConnection, place_id: str) -> StoredPlace | None:
+    """The place of this id; None if there is none."""
+    values = connection.one(_BY_ID, id=place_id)
+    return None if values is None else _stored(values)
+
+
+def expect(connection: MapConnection, place_id: str) -> StoredPlace:
+    """The place of this id.
+
+    Raises:
+        UnknownPlace: there is none.
+    """
+    stored = find(connection, place_id)
+    if stored is None:
+        raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
+    return stored
+
+
+def of_ids(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, StoredPlace]:
+    """Places by id; ids that do not exist are left out."""
+    found = map(_stored, connection.execute(_BY_IDS, ids=list(place_ids)))
+    return {stored.place.id: stored for stored in found}
+
+
+def at_rows(connection: MapConnection, rows: Sequence[int]) -> dict[int, StoredPlace]:
+    """The places whose frames are in ``rows`` now, by row."""
+    return {stored.row: stored for stored in map(_stored, connection.execute(_BY_ROWS, rows=list(rows)))}
+
+
+def of_keys(connection: MapConnection, keys: Sequence[int]) -> list[StoredPlace]:
+    """The places of entities in Milvus, in any order."""
+    return [_stored(values) for values in connection.execute(_BY_KEYS, keys=list(keys))]
+
+
+def rows_of(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, int]:
+    """The rows of places by id; ids that do not exist are left out."""
+    return dict(connection.execute(_ROWS_OF, ids=list(place_ids)))
+
+
+def listed(connection: MapConnection, after: int, limit: int, wanted: PlaceFilter = EVERY_PLACE) -> list[StoredPlace]:
+    """Up to ``limit`` places behind number ``after`` that fulfil some conditions, in the order of their enrolment."""
+    statement, values = _listing(_conditions(wanted), False), _values(wanted)
+    return [_stored(found) for found in connection.execute(statement, after=after, most=limit, **values)]
+
+
+def ids_of(connection: MapConnection, wanted: PlaceFilter, limit: int) -> list[str]:
+    """The ids of up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
+    statement, values = _listing(_conditions(wanted), True), _values(wanted)
+    return [place_id for (place_id,) in connection.execute(statement, after=-1, most=limit, **values)]
+
+
+Conditions = tuple[tuple[str, ...], int]
+"""The conditions of a listing by name, and how many values of metadata are wanted."""
+
+
+def _conditions(wanted: PlaceFilter) -> Conditions:
+    names = ("ids", "sequence", "camera", "after", "before")
+    return tuple(name for name in names if getattr(wanted, name) is not None), len(wanted.metadata)
+
+
+def _values(wanted: PlaceFilter) -> dict[str, Any]:
+    given = {
+        "ids": None if wanted.ids is None else list(wanted.ids),
+        "sequence_name": wanted.sequence,
+        "camera_name": wanted.camera,
+        "from_moment": wanted.after and moment_text(wanted.after),
+        "to_moment": wanted.before and moment_text(wanted.before),
+        **{f"token_{at}": token for at, token in enumerate(_tokens(wanted.metadata, whole=True))},
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+@cache
+def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
+    names, values = conditions
+    query = _STORED
+    if ids_alone:
+        query = (
+            select(_P.id)
+            .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
+            .where(_P.map == bindparam("map"))
+        )
+    all_conditions = {
+        "ids": among(_P.id, "ids"),
+        "sequence": _S.name == bindparam("sequence_name"),
+        "camera": _P.camera == bindparam("camera_name"),
+        "after": _P.timestamp >= bindparam("from_moment"),
+        "before": _P.timestamp <= bindparam("to_moment"),
+    }
+    for name in names:
+        query = query.where(all_conditions[name])
+    for at in range(values):
+        with_token = select(_T.row).where(_T.map == bindparam("map"), _T.token == bindparam(f"token_{at}"))
+        query = query.where(_P.row.in_(with_token))
+    return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
+
+
+def outlines(connection: MapConnection) -> list[Outline]:
+    """All places in brief, in the order of their enrolment."""
+    return [Outline(*values) for values in connection.execute(_OUTLINES)]
+
+
+def stations(connection: MapConnection) -> dict[str, PlaceStation]:
+    """Where all places are along their sequences and tracks, by id, in the order of their enrolment."""
+    return {values[0]: PlaceStation(*values) for values in connection.execute(_STATIONS)}
+
+
+def handed_over(connection: MapConnection) -> dict[int, str]:
+    """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+    return dict(connection.execute(_HANDED_OVER))
+
+
+def count(connection: MapConnection) -> int:
+    """How many places there are."""
+    return int(connection.execute(_COUNT)[0][0])
+
+
+def count_without_image(connection: MapConnection) -> int:
+    """How many places keep no original image."""
+    return int(connection.execute(_WITHOUT_IMAGE)[0][0])
+
+
+def checksums(connection: MapConnection) -> list[tuple[int, str, int]]:
+    """Row, id and checksum of the descriptors of all places, in any order."""
+    return connection.execute(_CHECKSUMS)
+
+
+def pictured(connection: MapConnection) -> list[tuple[str, int, Keep, bytes, str | None]]:
+    """Id, row, kind of picture, digest and camera of all places, in the order of their enrolment."""
+    return connection.execute(_PICTURED)
+
+
+def unsound(connection: MapConnection) -> list[str]:
+    """The ids of the places whose row does not match its checksum."""
+    found, after = [], -1
+    while page := connection.execute(_SEALS, after=after, most=_AT_ONCE):
+        found += [str(columns[1]) for *columns, seal in page if not is_sound(columns, seal)]
+        after = page[-1][0]
+    return found
+
+
+# Writing
+
+
+def placed(item_id: str, fields: PlaceFields, sequence: int, ordinal: int, **values: Any) -> StoredPlace:
+    """A place that is not stored yet, with its fields as they will be read.
+
+    Args:
+        sequence, ordinal: the code of its sequence, and its position in it.
+        values: the other columns; moments as text.
+    """
+    columns = {
+        "id": item_id, "sequence": sequence, "ordinal": ordinal, "track": None, "station": None, "pose_of": None,
+        "key": None, **values, **field_columns(fields),
+    }  # fmt: skip
+    return _from_columns(columns, fields.sequence)
+
+
+def with_fields(stored: StoredPlace, fields: PlaceFields, now: datetime) -> StoredPlace:
+    """A place with other fields, as they will be read; its sequence's code and position stay."""
+    columns = {**_columns_of(stored), **field_columns(fields), "updated_at": moment_text(now)}
+    if fields.pose != stored.place.pose:
+        columns["pose_of"] = None
+    return _from_columns(columns, fields.sequence)
+
+
+def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:
+    """A place with other values of its :class:`Place`, which are valid."""
+    return replace(stored, place=stored.place.model_copy(update=changes))
+
+
+def insert(connection: MapConnection, stored: StoredPlace) -> None:
+    """Store a new place."""
+    connection.execute(_INSERT, **sealed(_COLUMNS, _columns_of(stored)))
+    _put_tokens(connection, stored.row, _tokens(stored.place.metadata))
+
+
+def put(connection: MapConnection, stored: StoredPlace, before: StoredPlace) -> None:
+    """Store a changed place in the place of its former state."""
+    values = sealed(_COLUMNS, _columns_of(stored))
+    del values["number"]
+    connection.execute(_UPDATE, which=stored.number, **{f"new_{name}": value for name, value in values.items()})
+    if (stored.row, stored.place.metadata) != (before.row, before.place.metadata):
+        _delete_tokens(connection, before)
+        _put_tokens(connection, stored.row, _tokens(stored.place.metadata))
+
+
+def remove(connection: MapConnection, stored: StoredPlace) -> None:
+    """Remove a place; what is stored of its frame stays."""
+    connection.execute(_DELETE, number=stored.number)
+    _delete_tokens(connection, stored)
+
+
+# Metadata
+
+
+def _tokens(metadata: Mapping[str, Any], whole: bool = False) -> list[str]:
+    """The tokens by which places with this metadata are found.
+
+    Args:
+        whole: also of long texts, by which none is found.
+    """
+    return [
+        token_of(key, value)
+        for key, value in metadata.items()
+        if not isinstance(value, dict | list) and (whole or not isinstance(value, str) or len(value) <= LONGEST_TEXT)
+    ]
+
+
+def tokens_of(metadata: Mapping[str, Any]) -> list[str]:
+    """A token for each value at the top level that is no list, no object and no long text, in any order.
+
+    Equal values under equal keys have equal tokens: numbers are equal as numbers (1 and 1.0), and true is not 1.  A
+    token has 64 bits, so that different values have the same one as good as never.
+    """
+    return _tokens(metadata)
+
+
+def token_of(key: str, value: Scalar) -> str:
+    """The token of one value under its key."""
+    number = isinstance(value, float) and value.is_integer()
+    text = json.dumps([key, int(value) if number else value])  # type: ignore[arg-type]
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _put_tokens(connection: MapConnection, row: int, tokens: Iterable[str]) -> None:
+    for token in tokens:
+        connection.execute(_PUT_TOKEN, token=token, row=row)
+
+
+def _delete_tokens(connection: MapConnection, stored: StoredPlace) -> None:
+    for token in _tokens(stored.place.metadata):
+        connection.execute(_DELETE_TOKEN, token=token, row=stored.row)
+
+
+def rows_with(
+    connection: MapConnection, metadata: Mapping[str, Scalar], rows: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Rows of the places whose metadata has these values under these keys: int64 [n], ascending.
+
+    Args:
+        metadata: at least one key with its value.
+        rows: to choose from; None: all.
+    """
+    found = None if rows is None else np.unique(rows)
+    for token in _tokens(metadata, whole=True):
+        if found is not None and len(found) <= FEW:
+            ((text,),) = connection.execute(_ROWS_WITH_AMONG, token=token, rows=found.tolist())
+        else:
+            ((text,),) = connection.execute(_ROWS_WITH, token=token)
+        having = np.fromstring(text or "", np.int64, sep=",")
+        having = having if np.all(having[1:] > having[:-1]) else np.unique(having)  # the index has them in order
+        found = having if found is None else np.intersect1d(found, having, assume_unique=True)
+    assert found is not None
+    return found
+
+
+def stale_tokens(connection: MapConnection, limit: int = 10) -> list[str]:
+    """Where the index of metadata does not match the places; :func:`rebuild_tokens` repairs it."""
+    stored = set(connection.execute(_TOKENS))
+    wanted = {
+        (row, token) for row, metadata in connection.execute(_METADATA) for token in _tokens(json.loads(metadata))
+    }
+    wrong = sorted(stored ^ wanted)
+    return [f"row {row} is not indexed correctly by its metadata" for row, _ in wrong[:limit]]
+
+
+def rebuild_tokens(connection: MapConnection) -> None:
+    """Make the index of metadata again, within a transaction."""
+    connection.execute(_DELETE_TOKENS)
+    for row, metadata in connection.execute(_METADATA):
+        _put_tokens(connection, row, _tokens(json.loads(metadata)))

@@ -1,0 +1,200 @@
+"""A map's record and counters: the row of the table ``maps``."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import bindparam, delete, select, update
+
+from core.errors import MapExists, UnknownMap
+from core.ledger.database import Connection
+from core.ledger.maps.checksums import DamagedRow, is_sound, sealed
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.schema import MAPS, SEQUENCES
+from core.ledger.statements import Statement
+from core.maps.records import MapRecord, validation_message
+from core.places import NO_SEQUENCE
+
+
+@dataclass(frozen=True)
+class MapState:
+    """The state of a map without its places.
+
+    number: never used for another map, also of the same id; 1 in a file.
+    places, rows: how many places there are; all their rows are below ``rows``.
+    numbers: the number of the next place.
+    revision: grows with every write.
+    inserted: the timestamp from which on Milvus sees all descriptors that count.
+    collection: Milvus's id of the collection that has them; 0 as long as there are none.
+    """
+
+    number: int
+    record: MapRecord
+    places: int = 0
+    rows: int = 0
+    numbers: int = 1
+    revision: int = 0
+    inserted: int = 0
+    collection: int = 0
+
+
+_SEALED = ("id", "record")  # the counters change with every write, and are compared with the places
+_COUNTERS = ("places", "rows", "numbers", "revision", "inserted", "collection")
+_STATE = (MAPS.c.number, MAPS.c.id, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
+
+_CREATE = Statement(
+    lambda insert: (
+        insert(MAPS)
+        .values({name: bindparam(name) for name in ("id", "record", "listed", "touched", "seal")})
+        .on_conflict_do_nothing()
+        .returning(MAPS.c.number)
+    )
+)
+_CREATE_SEQUENCE = Statement(lambda insert: insert(SEQUENCES).values(map=bindparam("map"), code=NO_SEQUENCE))
+_OF_NUMBER = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")))
+_OF_NUMBER_LOCKED = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")).with_for_update())
+_LISTED = Statement(select(*_STATE).where(MAPS.c.id == bindparam("id"), MAPS.c.listed == 1))
+_IS_LISTED = Statement(select(MAPS.c.listed).where(MAPS.c.id == bindparam("id")))
+_RECORDS = Statement(
+    select(*_STATE)
+    .where(MAPS.c.id > bindparam("after"), MAPS.c.listed == 1)
+    .order_by(MAPS.c.id)
+    .limit(bindparam("most"))
+)
+_UNLISTED = Statement(
+    select(MAPS.c.id, MAPS.c.number).where(MAPS.c.listed == 0, MAPS.c.touched <= bindparam("untouched_since"))
+)
+_PUBLISH = Statement(
+    update(MAPS)
+    .where(MAPS.c.number == bindparam("map"), MAPS.c.listed == 0)
+    .values(id=bindparam("new_id"), listed=1, seal=bindparam("new_seal"))
+)
+_UPDATE = Statement(
+    update(MAPS)
+    .where(MAPS.c.number == bindparam("map"))
+    .values({name: bindparam(f"new_{name}") for name in ("record", "seal")})
+)
+_COUNT = Statement(
+    update(MAPS)
+    .where(MAPS.c.number == bindparam("map"))
+    .values({name: bindparam(f"new_{name}") for name in ("touched", *_COUNTERS)})
+)
+_DELETE = Statement(delete(MAPS).where(MAPS.c.number == bindparam("map")))
+
+
+def create(connection: Connection, record: MapRecord, name: str | None = None, listed: bool = True) -> int:
+    """Insert a map without places; returns its number.
+
+    Args:
+        name: the id that it has until it is published; None: its own.
+
+    Raises:
+        MapExists: the id is taken.
+    """
+    values = sealed(_SEALED, {"id": name or record.id, "record": record.model_dump_json()})
+    made = connection.execute(_CREATE, **values, listed=int(listed), touched=time.time())
+    if not made:
+        raise taken(connection, name or record.id)
+    number = int(made[0][0])
+    connection.execute(_CREATE_SEQUENCE, map=number)
+    return number
+
+
+def taken(connection: Connection, map_id: str) -> MapExists:
+    """The error for an id that a map has."""
+    found = connection.execute(_IS_LISTED, id=map_id)
+    listed = not found or found[0][0]
+    return MapExists(f"There is already a map {map_id!r}." if listed else f"A map {map_id!r} is being made.")
+
+
+def is_taken(connection: Connection, map_id: str) -> bool:
+    """Whether a map has this id, or is being built to have it."""
+    return bool(connection.execute(_IS_LISTED, id=map_id))
+
+
+def publish(connection: Connection, map_number: int, map_id: str, record: MapRecord) -> None:
+    """List a map that was being built, under its id.
+
+    Raises:
+        UnknownMap: it is gone, or listed already.
+        MapExists: the id is taken by a listed map.
+    """
+    holder = connection.execute(_LISTED, id=map_id)
+    if holder:
+        raise MapExists(f"There is already a map {map_id!r}.")
+    seal = sealed(_SEALED, {"id": map_id, "record": record.model_dump_json()})["seal"]
+    if not connection.change(_PUBLISH, map=map_number, new_id=map_id, new_seal=seal):
+        raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
+
+
+def unlisted(connection: Connection, untouched_since: float | None = None) -> dict[str, int]:
+    """The numbers of the maps that are being built, by the ids that they have meanwhile.
+
+    Args:
+        untouched_since: only those without a write since this moment, in seconds since 1970; None: all.
+    """
+    since = float("inf") if untouched_since is None else untouched_since
+    return dict(connection.execute(_UNLISTED, untouched_since=since))
+
+
+def find(connection: Connection, map_id: str) -> MapState:
+    """The listed map of an id.
+
+    Raises:
+        UnknownMap: there is none.
+        DamagedRow: its row does not match its checksum, or is invalid.
+    """
+    return _expect(connection.execute(_LISTED, id=map_id), map_id)
+
+
+def state_of(connection: MapConnection, map_id: str, locked: bool = False) -> MapState:
+    """The state of the map of a connection, listed or not.
+
+    Args:
+        map_id: for the message.
+        locked: whether to keep others from writing to it until the transaction ends.
+
+    Raises:
+        UnknownMap: it is gone.
+        DamagedRow: its row does not match its checksum, or is invalid.
+    """
+    return _expect(connection.execute(_OF_NUMBER_LOCKED if locked else _OF_NUMBER), map_id)
+
+
+def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
+    if not found:
+        raise UnknownMap(f"There is no map {map_id[:80]!r}.")
+    return _state(found[0])
+
+
+def _state(values: tuple[Any, ...]) -> MapState:
+    number, name, text, seal, *counters = values
+    if not is_sound((name, text), seal):
+        raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
+    try:
+        return MapState(number, MapRecord.model_validate_json(text), *counters)
+    except ValueError as error:
+        raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
+
+
+def records_after(connection: Connection, after: str, limit: int) -> list[MapRecord]:
+    """Up to ``limit`` records of listed maps by id."""
+    return [_state(values).record for values in connection.execute(_RECORDS, after=after, most=limit)]
+
+
+def put_counters(connection: MapConnection, state: MapState) -> None:
+    """Store the counters of a map, as every write to it does."""
+    connection.change(_COUNT, new_touched=time.time(), **{f"new_{one}": getattr(state, one) for one in _COUNTERS})
+
+
+def put_record(connection: MapConnection, record: MapRecord) -> None:
+    """Store the record of a map that is listed under its id."""
+    values = sealed(_SEALED, {"id": record.id, "record": record.model_dump_json()})
+    connection.change(_UPDATE, new_record=values["record"], new_seal=values["seal"])
+
+
+def delete_map(connection: MapConnection) -> None:
+    """Delete a map with all that belongs to it."""
+    connection.change(_DELETE)

@@ -1,0 +1,65 @@
+"""Copying places from one map to another with their history, and deleting many places at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+
+from core.ledger.maps import places, sequences
+from core.ledger.maps.connection import Reading
+from core.ledger.maps.writing import Write
+from core.maps.records import Enrolment, History, Outline
+from core.places import Place
+
+
+class Transfer:
+    """Reads, copies and deletes many places of one map at once (:class:`core.maps.transfer.Transfer`).
+
+    Any thread may use it.  Every method may raise what ``reading`` and ``writing`` raise.
+
+    Args:
+        reading, writing: begin a transaction that reads the map, and a write to it.
+        paused_writes: keeps others from writing.
+    """
+
+    def __init__(
+        self,
+        reading: Reading,
+        writing: Callable[[], AbstractContextManager[Write]],
+        paused_writes: Callable[[], AbstractContextManager[None]],
+    ) -> None:
+        self._reading, self._writing, self.paused_writes = reading, writing, paused_writes
+
+    def outline(self) -> list[Outline]:
+        with self._reading() as connection:
+            return places.outlines(connection)
+
+    def count_without_image(self) -> int:
+        with self._reading() as connection:
+            return places.count_without_image(connection)
+
+    def sequence_ends(self) -> dict[str | None, int]:
+        with self._reading() as connection:
+            return sequences.ends(connection)
+
+    def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
+        with self._reading() as connection:
+            found = places.of_ids(connection, place_ids)
+        return {place_id: (stored.place, stored.row) for place_id, stored in found.items()}
+
+    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
+        if items:
+            with self._writing() as write:
+                write.expect(len(items))
+                for item, history in items:
+                    write.adopt(item, history)
+
+    def forget(self, frames: Mapping[str, bytes]) -> int:
+        if not frames:
+            return 0
+        with self._writing() as write:
+            found = places.of_ids(write.connection, list(frames))
+            going = [stored for place_id, stored in found.items() if stored.digest == frames[place_id]]
+            for stored in going:
+                write.forget(stored)
+        return len(going)

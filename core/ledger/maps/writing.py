@@ -1,0 +1,288 @@
+"""One write to a map: places, sequences, pictures and keypoints; an engine of vectors adds what it has to do."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry.keypoints import Keypoints
+from core.ledger.maps import frames, places, record, sequences
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.frames import StoredPicture
+from core.ledger.maps.places import StoredPlace
+from core.ledger.maps.record import MapState
+from core.maps.enrolling import picture_of
+from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
+from core.maps.stored_fields import moment_text, same_fields
+from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
+from core.places import Place, PlaceFields, Pose
+
+Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
+"""The descriptor, float32 [D], and the local descriptors, int8 [C, L], of one frame."""
+
+
+class Write(ABC):
+    """Collects the changes of one write within a transaction; ``finish`` comes before its COMMIT.
+
+    connection: of the transaction, in which nobody else writes to the map.
+    state: of the map, with the changes so far.
+    changed: whether anything was changed, the counters apart.
+    """
+
+    def __init__(self, connection: MapConnection, state: MapState) -> None:
+        self.connection, self.state, self.changed = connection, state, False
+        self._before = state
+        self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
+        self._now = datetime.now(UTC)
+
+    # An engine of vectors
+
+    @abstractmethod
+    def expect(self, count: int) -> None:
+        """Allocate room for more frames at once."""
+
+    @abstractmethod
+    def _add_descriptors(self, row: int, item: Enrolment) -> int:
+        """Take the descriptors of a new row; returns the checksum by which its place knows them, 0 if by none."""
+
+    @abstractmethod
+    def _descriptors_at(self, rows: Sequence[int]) -> list[Descriptors]:
+        """The descriptors of rows, those of this write included."""
+
+    @abstractmethod
+    def _let_go(self, stored: StoredPlace) -> None:
+        """Note that the row of a place, as it was, is no place's any more."""
+
+    def _prepared(self, stored: StoredPlace, before: StoredPlace | None, searched: bool) -> StoredPlace:
+        """A place as it is to be stored.
+
+        Args:
+            before: its state before; None: it is new.
+            searched: whether something has changed by which an engine searches.
+        """
+        return stored
+
+    @abstractmethod
+    def _note(self, stored: StoredPlace) -> None:
+        """Note a place that was stored, new or changed."""
+
+    def picture_to_store(self, picture: bytes) -> StoredPicture:
+        """A picture as its row has it."""
+        return picture
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Make the descriptors durable, before the COMMIT that refers to them."""
+
+    # Changes
+
+    @property
+    def record(self) -> MapRecord:
+        """The map's record."""
+        return self.state.record
+
+    def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
+        """Create a place, replace its frame, or change its fields if the frame is the same.
+
+        Args:
+            keep: the picture of the frame to store; by default that of the map's settings.
+            ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
+        """
+        stored = places.find(self.connection, item.id)
+        if stored is not None and stored.digest == item.digest:
+            if item.keypoints is not None and not frames.has_keypoints(self.connection, stored.row):
+                self._put_keypoints(stored, item.keypoints)
+            return self.set_fields(stored, item.fields)
+        row, (kind, picture) = self.state.rows, picture_of(item, self.record.keep if keep is None else keep)
+        checksum = self._add_descriptors(row, item)
+        self.state = replace(self.state, rows=row + 1)
+        frame: dict[str, Any] = {"row": row, "checksum": checksum, "digest": item.digest}
+        look = Look(item.descriptor, item.local, item.fields.pose)
+        if stored is None:
+            made = self._create(item, {**frame, "regions": item.regions, "picture": kind}, look, ordinal)
+        else:
+            shown = places.with_place(stored, regions=item.regions, picture=kind, pose_of=None)
+            shown = replace(shown, track=None, station=None, **frame)
+            made = self._put(self._with_fields(shown, item.fields, look, stored), stored)
+            self._leave(stored)
+        if picture is not None:
+            frames.put_picture(self.connection, row, self.picture_to_store(picture))
+        if item.keypoints is not None:
+            self._put_keypoints(made, item.keypoints)
+        return made.place, "created" if stored is None else "replaced"
+
+    def _create(self, item: Enrolment, values: dict[str, Any], look: Look, ordinal: int | None) -> StoredPlace:
+        code, at = sequences.code_of(self.connection, item.fields.sequence), ordinal
+        if at is None:
+            at = self._position(item.fields.sequence, look)
+        if at is None:
+            at = sequences.next_ordinal(self.connection, code)
+        now = moment_text(self._now)
+        made = places.placed(
+            item.id, item.fields, code, at, number=self.state.numbers, revision=self._revision,
+            created_at=now, updated_at=now, **values,
+        )  # fmt: skip
+        made = self.insert(made)
+        if (views := self._latest.get(item.fields.sequence or "")) is not None:
+            views.note(at, look)
+        return made
+
+    def insert(self, stored: StoredPlace) -> StoredPlace:
+        """Store a new place, whose row counts already."""
+        made = self._prepared(stored, None, True)
+        places.insert(self.connection, made)
+        self.state = replace(self.state, numbers=made.number + 1, places=self.state.places + 1)
+        self._note(made)
+        return made
+
+    def _put(self, stored: StoredPlace, before: StoredPlace, searched: bool = True) -> StoredPlace:
+        made = self._prepared(replace(stored, revision=self._revision), before, searched)
+        places.put(self.connection, made, before)
+        if made.sequence != before.sequence:
+            sequences.drop_if_empty(self.connection, before.sequence)
+        self.changed = True
+        self._note(made)
+        return made
+
+    @property
+    def _revision(self) -> int:
+        """The revision that the map is going to have."""
+        return self._before.revision + 1
+
+    def _leave(self, stored: StoredPlace) -> None:
+        self.changed = True
+        self._let_go(stored)
+
+    def _position(self, sequence: str | None, look: Look) -> int | None:
+        """The position at the end of a sequence of a frame that shows a view which is there already, else None."""
+        if sequence is None:
+            return None
+        if sequence not in self._latest:
+            positions = min(self.record.same_place_frames, MOST_HIDDEN)
+            last, first = sequences.latest(self.connection, sequence, positions)
+            self._latest[sequence] = latest_views(last, first, positions, self._reach, self._looks)
+        return self._latest[sequence].position_of(look)
+
+    def _looks(self, rows: list[int]) -> list[Look]:
+        """The content of the frames in some rows, those of this write included."""
+        poses = {row: stored.place.pose for row, stored in places.at_rows(self.connection, rows).items()}
+        return [
+            Look(descriptor, local, poses[row])
+            for row, (descriptor, local) in zip(rows, self._descriptors_at(rows), strict=True)
+        ]
+
+    @property
+    def _reach(self) -> float:
+        return reach_of(self.record.same_place_radius)
+
+    def _with_fields(
+        self, stored: StoredPlace, fields: PlaceFields, look: Look | None = None, shown: StoredPlace | None = None
+    ) -> StoredPlace:
+        """A place with other fields; its position in its sequence changes only with the sequence, or if it leaves it.
+
+        Args:
+            look: the look of its new frame; None: its frame stays.
+            shown: the place with its former frame; None: the frame stays.
+        """
+        before = stored if shown is None else shown
+        moves = fields.sequence != before.place.sequence
+        changed = places.with_fields(stored, fields, self._now)
+        if moves or self._leaves(before, fields, look):
+            new_look = look or replace(self._looks([stored.row])[0], pose=fields.pose)
+            at = self._position(fields.sequence, new_look)
+            code = sequences.code_of(self.connection, fields.sequence) if moves else stored.sequence
+            at = sequences.next_ordinal(self.connection, code) if at is None else at
+            changed = replace(changed, sequence=code, ordinal=at)
+        self._latest.clear()
+        return changed
+
+    def _leaves(self, stored: StoredPlace, fields: PlaceFields, look: Look | None) -> bool:
+        """Whether a place whose sequence stays does not belong to its position any more, because of a change."""
+        if fields.sequence is None or (look is None and fields.pose == stored.place.pose):
+            return False
+        code, ordinal, number = stored.sequence, stored.ordinal, stored.number
+        first = sequences.first_at(self.connection, code, ordinal, before=number)
+        if first is None:
+            return False
+        rows = [] if look is None else sequences.beside(self.connection, code, ordinal, number, stored.row)
+        began, *others = self._looks([first, *rows])
+        return leaves_view(fields.pose, look, began, others, self._reach)
+
+    def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
+        if self.record.verification:
+            frames.put_keypoints(self.connection, stored.row, stored.digest, found.record())
+            self.changed = True
+
+    def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
+        """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
+        stored = places.find(self.connection, frame.id)
+        if stored is None or stored.digest != frame.digest or frames.has_keypoints(self.connection, stored.row):
+            return False
+        self._put_keypoints(stored, found)
+        return self.record.verification
+
+    def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
+        """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
+        stored = places.find(self.connection, item.id)
+        return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
+
+    def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
+        """Change the fields of a place; its frame stays."""
+        if same_fields(stored.place, fields):
+            return stored.place, "unchanged"
+        return self._put(self._with_fields(stored, fields), stored).place, "updated"
+
+    def adopt(self, item: Enrolment, history: History) -> None:
+        """Store a place of another map with its history."""
+        self.enrol(item, history.picture, history.ordinal)
+        self._latest.clear()
+        stored = places.expect(self.connection, item.id)
+        moments = {"created_at": history.created_at, "updated_at": history.updated_at}
+        ordinal = stored.ordinal if history.ordinal is None else history.ordinal
+        changed = replace(places.with_place(stored, **moments), ordinal=ordinal)
+        self._put(changed, stored, searched=ordinal != stored.ordinal)
+        sequences.keep_free(self.connection, stored.sequence, max(ordinal + 1, history.behind))
+
+    def set_counterpart(
+        self, stored: StoredPlace, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
+    ) -> None:
+        """Set the station of a place, None for its own, its pose and the place from which it got the pose."""
+        if (track, station) == (stored.sequence, stored.ordinal):
+            track = station = None
+        fields: dict[str, Any] = {"pose_of": pose_of}
+        if moved := pose != stored.place.pose:
+            fields |= {"pose": pose, "updated_at": self._now}
+        changed = replace(places.with_place(stored, **fields), track=track, station=station)
+        self._put(changed, stored, searched=moved)
+
+    def forget(self, stored: StoredPlace) -> None:
+        """Delete a place."""
+        places.remove(self.connection, stored)
+        sequences.drop_if_empty(self.connection, stored.sequence)
+        self._latest.clear()
+        self.state = replace(self.state, places=self.state.places - 1)
+        self._leave(stored)
+
+    def edit(self, changed: MapRecord) -> None:
+        """Replace the map's record, with the next revision."""
+        made = changed.model_copy(update={"revision": self.record.revision + 1, "updated_at": self._now})
+        self.state = replace(self.state, record=made)
+        record.put_record(self.connection, made)
+
+    def finish(self) -> None:
+        """Store the state of the map, after what the engine of vectors has to do; nothing is left out of the COMMIT.
+
+        Raises:
+            StorageFull, StorageFailure, OSError, sqlite3.Error: one of them refuses.
+        """
+        if self.changed or self.state != self._before:
+            self.state = replace(self.state, revision=self._revision)
+        self._finish()
+        if self.state != self._before:
+            record.put_counters(self.connection, self.state)

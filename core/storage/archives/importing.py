@@ -1,0 +1,132 @@
+"""Filling a new map from an export file, whatever keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidArchive, InvalidField
+from core.ledger.maps import frames, places, sequences
+from core.ledger.maps.cameras import put_camera
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.frames import StoredPicture
+from core.ledger.maps.places import StoredPlace
+from core.ledger.maps.record import MapState
+from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
+from core.maps.archives.reading import Archive
+from core.maps.cameras import CameraRecord
+from core.maps.stored_fields import moment_text
+from core.places import NO_SEQUENCE
+from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking
+from core.storage.files.segment_files import Layout
+
+
+class ImportWrite(Protocol):
+    """A write that takes descriptors as an export file has them."""
+
+    connection: MapConnection
+    state: MapState
+    changed: bool
+
+    def expect(self, count: int) -> None: ...
+    def add_stored(self, frame: NDArray[np.void]) -> int: ...
+    def insert(self, stored: StoredPlace) -> StoredPlace: ...
+    def picture_to_store(self, picture: bytes) -> StoredPicture: ...
+
+
+class Importing(Unpacking):
+    """Fills a map without places from a file.
+
+    Args:
+        writing: begins a write to the map.
+        Others: as of :class:`core.storage.archives.unpacking.Unpacking`.
+    """
+
+    def __init__(
+        self,
+        archive: Archive,
+        layout: Layout,
+        advance: Advance,
+        check_picture: CheckPicture,
+        most_picture_bytes: int,
+        writing: Callable[[], AbstractContextManager[ImportWrite]],
+    ) -> None:
+        super().__init__(archive, layout, advance, check_picture, most_picture_bytes)
+        self._writing = writing
+        self._codes: dict[str, int] = {}
+        self._lost: dict[int, int] = {}  # the codes of the tracks whose sequences are gone, by their numbers there
+
+    def fill(self) -> None:
+        """Store all of the file.
+
+        Raises:
+            InvalidArchive: the file is damaged, or its content is not valid for a map.
+            StorageFull, StorageFailure, OSError, sqlite3.Error: the part stored until then has to be removed.
+        """
+        self.unpack()
+        with self._writing() as write:
+            wrong = sequences.wrong(write.connection, 1)
+        if wrong:
+            raise InvalidArchive(f"The sequence {wrong[0]!r} is empty, or its places stand behind its end.")
+
+    def put_sequences_and_cameras(self, sequence_lines: Iterator[SequenceLine], cameras: Iterator[CameraLine]) -> None:
+        with self._writing() as write:
+            for line in sequence_lines:
+                if line.name is not None:
+                    if line.name in self._codes:
+                        raise InvalidArchive(f"The sequence {line.name!r} is listed twice.")
+                    self._codes[line.name] = sequences.new_sequence(write.connection, line.name)
+                code = NO_SEQUENCE if line.name is None else self._codes[line.name]
+                sequences.keep_free(write.connection, code, line.next_ordinal)
+            seen = set()
+            for camera in cameras:
+                if camera.name in seen:
+                    raise InvalidArchive(f"The camera {camera.name!r} is listed twice.")
+                seen.add(camera.name)
+                values = {name: getattr(camera, name) for name in CameraRecord.model_fields}
+                put_camera(write.connection, CameraRecord(**values))
+            write.changed = True
+
+    def put_places(self, lines: Sequence[PlaceLine], stored: NDArray[np.void], contents: Iterator[Content]) -> None:
+        with self._writing() as write:
+            write.expect(len(lines))
+            known = places.rows_of(write.connection, [line.id for line in lines])
+            for at, (line, content) in enumerate(zip(lines, contents, strict=True)):
+                if line.id in known:
+                    raise InvalidArchive(f"The place {line.id!r} is listed twice.")
+                known[line.id] = row = write.state.rows
+                made = write.insert(self._place(write, line, row, write.add_stored(stored[at : at + 1])))
+                if content.picture is not None:
+                    frames.put_picture(write.connection, row, write.picture_to_store(content.picture[0]))
+                if content.keypoints is not None:
+                    frames.put_keypoints(write.connection, row, made.digest, content.keypoints)
+
+    def _place(self, write: ImportWrite, line: PlaceLine, row: int, checksum: int) -> StoredPlace:
+        code = NO_SEQUENCE if line.sequence is None else self._code(line.sequence, line)
+        try:
+            return places.placed(
+                line.id, line.fields(), code, line.ordinal, number=write.state.numbers, row=row, checksum=checksum,
+                digest=bytes.fromhex(line.digest), regions=line.regions,
+                picture="none" if line.picture is None else line.picture.kind, track=self._track(write, line),
+                station=line.station, pose_of=line.pose_of, revision=write.state.revision + 1,
+                created_at=moment_text(line.created_at), updated_at=moment_text(line.updated_at),
+            )  # fmt: skip
+        except InvalidField as error:
+            raise InvalidArchive(f"The place {line.id!r} cannot be stored: {error}") from None
+
+    def _code(self, name: str, line: PlaceLine) -> int:
+        if name not in self._codes:
+            raise InvalidArchive(f"The place {line.id!r} is of a sequence that the file does not list.")
+        return self._codes[name]
+
+    def _track(self, write: ImportWrite, line: PlaceLine) -> int | None:
+        """The code of a place's track; one whose sequence is gone gets a code that no sequence will ever have."""
+        if line.track is None or isinstance(line.track, str):
+            return None if line.track is None else self._code(line.track, line)
+        if line.track not in self._lost:
+            self._lost[line.track] = sequences.new_code(write.connection)
+        return self._lost[line.track]
