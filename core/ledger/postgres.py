@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Literal
 
 import psycopg
-from psycopg import Connection
+from psycopg import Connection, IsolationLevel
 from psycopg.conninfo import conninfo_to_dict
 from psycopg_pool import ConnectionPool, PoolTimeout
 
@@ -234,7 +234,7 @@ class PostgresLedger(Postgres):
 
     Args:
         tables: of the parts that are kept in it.
-        statement_seconds: how long a statement may take.
+        statement_seconds: how long a statement may take; 0: as long as it takes.
     """
 
     def __init__(
@@ -269,3 +269,48 @@ class PostgresLedger(Postgres):
             if lock is not None:
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (lock,))
             yield PostgresConnection(connection)
+
+    @contextmanager
+    def reading(self, action: str = "read") -> Iterator[PostgresConnection]:
+        """A transaction that sees the moment of its first statement, and writes nothing."""
+        with self.connection(action) as connection:
+            connection.isolation_level, connection.read_only = IsolationLevel.REPEATABLE_READ, True
+            try:
+                with connection.transaction():
+                    yield PostgresConnection(connection)
+            finally:
+                with suppress(psycopg.Error):  # a lost connection is thrown away
+                    connection.isolation_level, connection.read_only = None, None
+
+    @contextmanager
+    def locked(
+        self, action: str, kind: int, number: int, wait: bool = True, shared: bool = False
+    ) -> Iterator[PostgresConnection | None]:
+        """Hold a lock of the database on a connection of its own; None if another has it and ``wait`` is not set.
+
+        Others may hold a ``shared`` one as well, if theirs is shared too.  The lock is gone when the connection is
+        lost, and then the connection takes no further statement.
+        """
+        key, how = (kind, number % 2**31), "_shared" if shared else ""
+        with self.connection(action) as connection:
+            if wait:
+                connection.execute(f"SELECT pg_advisory_lock{how}(%s::int, %s::int)", key)
+            elif connection.execute(f"SELECT pg_try_advisory_lock{how}(%s::int, %s::int)", key).fetchone() != (True,):
+                yield None
+                return
+            try:
+                yield PostgresConnection(connection)
+            finally:
+                with suppress(psycopg.Error):  # a lost connection has no lock
+                    connection.execute(f"SELECT pg_advisory_unlock{how}(%s::int, %s::int)", key)
+
+    def check(self) -> None:
+        """Ask it whether it takes writes.
+
+        Raises:
+            StoreUnavailable, StoreOfAnotherVersion, StorageFailure: it does not.
+        """
+        with self.connection("answer") as connection:
+            found = connection.execute("SELECT pg_is_in_recovery()").fetchone()
+        if found != (False,):
+            raise Unreachable("PostgreSQL", "takes no writes: it is a standby.")

@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING
 
 from core.errors import MissingExtra
-from core.milvus.pictures.bucket import Bucket
+from core.postgres.pictures.bucket import Bucket
 
 if TYPE_CHECKING:
     from core.milvus.store import MilvusStore

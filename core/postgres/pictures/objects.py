@@ -23,9 +23,9 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
+from core.ledger.maps.frames import StoredObject
 from core.ledger.outage import Outage, Unreachable
-from core.milvus.pictures.bucket import Bucket
-from core.milvus.pictures.stored import StoredObject
+from core.postgres.pictures.bucket import Bucket
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, S3Config
