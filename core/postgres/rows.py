@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from sqlalchemy import and_, bindparam, case, delete, func, literal_column, select, union, update
+from sqlalchemy import and_, bindparam, case, column, delete, func, select, table, union, update
 
 from core.errors import UnknownMap
 from core.ledger.database import Connection
@@ -90,7 +90,7 @@ _KNOWN_KEYS = Statement(
     union(select(PLACES.c.key).where(among(PLACES.c.key, "keys")), select(_K.key).where(among(_K.key, "keys")))
 )
 _NEW_KEY = Statement(select(func.nextval("keys")))
-_LAST_KEY = Statement(select(literal_column("last_value")).select_from(literal_column("keys")))
+_LAST_KEY = Statement(select(table("keys", column("last_value")).c.last_value))
 
 
 # Descriptors
@@ -198,8 +198,8 @@ _CLEAR_OBJECTS = Statement(delete(DEAD_OBJECTS).where(among(DEAD_OBJECTS.c.name,
 _KNOWN_OBJECTS = Statement(
     union(
         *(
-            select(column).where(and_(column.is_not(None), among(column, "names")))
-            for column in (PICTURES.c.object, FRAMES.c.object, DEAD_OBJECTS.c.name)
+            select(name).where(and_(name.is_not(None), among(name, "names")))
+            for name in (PICTURES.c.object, FRAMES.c.object, DEAD_OBJECTS.c.name)
         )
     )
 )
