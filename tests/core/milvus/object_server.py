@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx
 
 from core.errors import StorageFailure
-from core.milvus.pictures.bucket import Bucket
-from core.milvus.pictures.objects import Objects
+from core.postgres.pictures.bucket import Bucket
+from core.postgres.pictures.objects import Objects
 
 ROOT = Path(__file__).parents[3]
 WEED = ROOT / ".venv-cluster/bin/weed"

@@ -17,8 +17,8 @@ from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.maps import MapSettings, ReviewSetting
 from core.milvus import Bucket, ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.objects import Objects
-from core.milvus.pictures.stored import StoredObject
+from core.postgres.pictures.objects import Objects
+from core.ledger.maps.frames import StoredObject
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
 from tests.core.maps.review import check_pages_are_of_one_moment
