@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from service.access.gate import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.app.application import create_app
 from service.errors.faults import RateExceeded
 from service.settings import Settings
@@ -67,7 +67,7 @@ def test_what_counts_as_one_caller() -> None:
 
 @pytest.mark.anyio
 async def test_a_key_over_its_rate_learns_when_to_come_again(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path)
+    store = Keys.of(tmp_path)
     (_, first), (_, second) = store.create("ann", "query"), store.create("bob", "query")
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path, rate_per_key=0.25, rate_burst=3))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)

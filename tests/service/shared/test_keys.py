@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.access.keys import Key, KeyRecords, KeyStore
+from service.access.keys import Key, KeyRecords, Keys
 from service.errors.faults import Fault
 from service.shared.database import SharedDatabase
 from service.shared.keys import SharedKeys
@@ -69,7 +69,7 @@ def test_they_are_stored_as_in_a_file(
     steps: list[tuple[str, str, str, frozenset[str] | None, bool]],
 ) -> None:
     database.query("empty the table", "TRUNCATE service.keys")
-    shared, file = SharedKeys(database), KeyStore(tmp_path_factory.mktemp("keys"))
+    shared, file = SharedKeys(database), Keys.of(tmp_path_factory.mktemp("keys"))
     for step in steps:
         assert outcome(shared, step) == outcome(file, step), step
         assert [traits(key) for key in shared.all()] == [traits(key) for key in file.all()]
