@@ -16,8 +16,21 @@ from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache
 
-from sqlalchemy import ARRAY, Column, Float, MetaData, String, Table, bindparam, cast, column, delete, extract, func
-from sqlalchemy import select
+from sqlalchemy import (
+    ARRAY,
+    Column,
+    Float,
+    MetaData,
+    String,
+    Table,
+    bindparam,
+    cast,
+    column,
+    delete,
+    extract,
+    func,
+    select,
+)
 
 from core.errors import StorageFailure, StorageFull
 from core.ledger import Ledger, Statement, Tables

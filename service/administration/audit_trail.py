@@ -47,7 +47,10 @@ TABLES = Tables("audit", 1, _METADATA)
 
 _ADD = Statement(lambda insert: insert(_AUDIT).values(replica=bindparam("replica"), line=bindparam("line")))
 _LATEST = Statement(
-    select(_AUDIT).where(_AUDIT.c.number < bindparam("before")).order_by(_AUDIT.c.number.desc()).limit(LINES_AT_ONCE)
+    select(_AUDIT)
+    .where(_AUDIT.c.number < bindparam("before"))
+    .order_by(_AUDIT.c.number.desc())
+    .limit(bindparam("at_most"))
 )
 
 Source = Literal["database", "file", "memory"]
@@ -200,7 +203,7 @@ class AuditTable(logging.Handler):
 
     def lines(self, before: Position | None) -> Iterator[AuditLine]:
         reached = (1 << 63) - 1 if before is None else before.offset
-        while found := self._ledger.execute("read the audit trail", _LATEST, before=reached):
+        while found := self._ledger.execute("read the audit trail", _LATEST, before=reached, at_most=LINES_AT_ONCE):
             for number, replica, line in found:
                 yield AuditLine(Position(0, number), len(line), {**json.loads(line), "replica": replica})
             reached = found[-1][0]

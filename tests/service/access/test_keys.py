@@ -18,9 +18,9 @@ from sqlalchemy import bindparam, delete, select, update
 
 from core.errors import InvalidIdentifier
 from core.ledger import Statement
-from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
 from service.access.key_file import FILE
 from service.access.key_table import KEYS
+from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
 from service.access.keys import Key, Keys
 from service.access.roles import TOKEN, Principal, Role
 from service.errors.faults import Fault, InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable, LastAdminKey
@@ -167,7 +167,9 @@ def test_a_row_that_was_changed_lets_nobody_in(store: Keys, change: dict[str, An
 
     def forge() -> None:
         with store.place.changing() as connection:
-            assert connection.change(Statement(update(KEYS).values({name: bindparam(name) for name in change})), **change)
+            assert connection.change(
+                Statement(update(KEYS).values({name: bindparam(name) for name in change})), **change
+            )
 
     expect_closed(store, token, forge)
 
