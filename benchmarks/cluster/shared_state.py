@@ -105,14 +105,22 @@ def of_rates(database: SharedDatabase, rounds: int) -> None:
     print(f"rate, an exchange of 100 keys    {'':>8}  {median(rounds, exchange):8.2f}")
 
 
+def _look(keys: Keys, _: int) -> None:
+    keys.place.version(expected=True)
+
+
+def _read(keys: Keys, _: int) -> None:
+    keys.all()
+
+
 def of_keys(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """Looking whether a key has changed, and reading all keys."""
     both = Keys.of(folder), Keys.of(folder, database)
     for keys in both:
         for number in range(100):
             keys.create(f"robot-{number}", "query")
-    looks = [median(rounds, lambda _, keys=keys: keys.place.version(expected=True)) for keys in both]
-    reads = [median(rounds, lambda _, keys=keys: keys.all()) for keys in both]
+    looks = [median(rounds, partial(_look, keys)) for keys in both]
+    reads = [median(rounds, partial(_read, keys)) for keys in both]
     print(f"keys, whether they changed       {looks[0]:8.2f}  {looks[1]:8.2f}")
     print(f"keys, reading 100 of them        {reads[0]:8.2f}  {reads[1]:8.2f}")
     both[0].place.close()

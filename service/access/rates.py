@@ -85,7 +85,7 @@ log = logging.getLogger("placerec.shared")
 class Buckets:
     """Token buckets by name.  A bucket holds up to ``burst`` tokens, and ``rate`` tokens are added each second.
 
-    Any thread may use them.
+    One thread takes tokens; another one may exchange them meanwhile.
 
     Args:
         rate: tokens a second; 0 means that there is no limit.
@@ -108,20 +108,26 @@ class Buckets:
         """Take a token and return 0.0; if there is none, return the seconds until there will be one."""
         if not self.rate:
             return 0.0
+        if self._kind is None:
+            return self._take(name)
         with self._lock:
-            now = self._clock()
-            # The state of a bucket is one number: when it will be full again.
-            full_at = max(self._full_at.get(name, now), now) + 1 / self.rate
-            lacking = full_at - now - self.burst / self.rate
-            if lacking > 1e-9:
-                return lacking
-            self._full_at[name] = full_at
-            self._full_at.move_to_end(name)
-            if len(self._full_at) > MOST_CALLERS:
-                self._full_at.popitem(last=False)
-            if self._kind is not None and (name in self._taken or len(self._taken) < MOST_CALLERS):
+            wait = self._take(name)
+            if not wait and (name in self._taken or len(self._taken) < MOST_CALLERS):
                 self._taken[name] = self._taken.get(name, 0) + 1
-            return 0.0
+        return wait
+
+    def _take(self, name: str) -> float:
+        now = self._clock()
+        # The state of a bucket is one number: when it will be full again.
+        full_at = max(self._full_at.get(name, now), now) + 1 / self.rate
+        lacking = full_at - now - self.burst / self.rate
+        if lacking > 1e-9:
+            return lacking
+        self._full_at[name] = full_at
+        self._full_at.move_to_end(name)
+        if len(self._full_at) > MOST_CALLERS:
+            self._full_at.popitem(last=False)
+        return 0.0
 
     def exchange(self, ledger: Ledger) -> None:
         """Add what was taken here to the common buckets, and learn how full they are.

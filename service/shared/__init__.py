@@ -1,7 +1,8 @@
-"""State that any number of services share in PostgreSQL: sessions, keys, jobs, rates, statistics and events.
+"""State that any number of services share in PostgreSQL: sessions, jobs, statistics and events.
 
 Each part has its embedded twin, which keeps the same in the data directory and is the default; nothing here is imported
-unless PLACEREC_POSTGRES is set.  docs/explanation/replicas.md says what holds over all services, and at what cost.
+unless PLACEREC_POSTGRES is set.  Keys, rates and the audit trail are one class each for both (``service.access``,
+``service.administration``).  docs/explanation/replicas.md says what holds over all services, and at what cost.
 """
 
 from __future__ import annotations
