@@ -16,21 +16,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache
 
-from sqlalchemy import (
-    ARRAY,
-    Column,
-    Float,
-    MetaData,
-    String,
-    Table,
-    bindparam,
-    cast,
-    column,
-    delete,
-    extract,
-    func,
-    select,
-)
+from sqlalchemy import Column, MetaData, Table, bindparam, cast, column, delete, extract, func, select
+from sqlalchemy.types import ARRAY, Float, String
 
 from core.errors import StorageFailure, StorageFull
 from core.ledger import Ledger, Statement, Tables
