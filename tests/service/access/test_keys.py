@@ -18,6 +18,7 @@ from sqlalchemy import bindparam, delete, select, update
 
 from core.errors import InvalidIdentifier
 from core.ledger import Statement
+from core.ledger.sqlite import SqliteConnection
 from service.access.key_file import FILE
 from service.access.key_table import KEYS
 from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
@@ -81,6 +82,14 @@ def test_the_file_is_its_owners_and_has_no_secret(file_store: Keys, tmp_path: Pa
     (path,) = tmp_path.iterdir()
     assert path.name == FILE and stat.S_IMODE(path.stat().st_mode) == 0o600
     assert token.rpartition("_")[2].encode() not in path.read_bytes() and token.encode() not in path.read_bytes()
+
+
+def test_a_change_of_the_file_leaves_no_journal_that_could_come_back(file_store: Keys) -> None:
+    file_store.create("ann", "query")
+    with file_store.place.changing() as connection:
+        assert isinstance(connection, SqliteConnection)
+        assert connection.driver.execute("PRAGMA synchronous").fetchone() == (3,), "EXTRA, which syncs the folder"
+        assert connection.driver.execute("PRAGMA journal_mode").fetchone() == ("delete",)
 
 
 def test_what_cannot_be_a_key_is_refused(store: Keys) -> None:
