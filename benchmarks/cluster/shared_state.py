@@ -16,7 +16,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.access.gate import Buckets
+from service.access.keys import Keys
+from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
@@ -24,8 +25,6 @@ from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
-from service.shared.keys import SharedKeys
-from service.shared.rates import SharedBuckets
 from service.shared.replica import ServiceReplica
 from service.shared.sessions import SessionTable
 from service.shared.statistics import SharedStatistics
@@ -94,16 +93,37 @@ def _token(buckets: Buckets, number: int) -> None:
 
 def of_rates(database: SharedDatabase, rounds: int) -> None:
     """A token, and an exchange for a hundred keys."""
-    alone, shared = Buckets(1e6, 1000), SharedBuckets(database, "request", 1e6, 1000)
+    alone, shared = Buckets(1e6, 1000), Buckets(1e6, 1000, kind="request")
     taken = [median(rounds, partial(_token, buckets)) for buckets in (alone, shared)]
     print(f"rate, a token                    {taken[0]:8.4f}  {taken[1]:8.4f}")
 
     def exchange(_: int) -> None:
         for number in range(100):
             shared.take(f"k{number}")
-        shared.exchange()
+        shared.exchange(database)
 
     print(f"rate, an exchange of 100 keys    {'':>8}  {median(rounds, exchange):8.2f}")
+
+
+def _look(keys: Keys, _: int) -> None:
+    keys.place.version(expected=True)
+
+
+def _read(keys: Keys, _: int) -> None:
+    keys.all()
+
+
+def of_keys(folder: Path, database: SharedDatabase, rounds: int) -> None:
+    """Looking whether a key has changed, and reading all keys."""
+    both = Keys.of(folder), Keys.of(folder, database)
+    for keys in both:
+        for number in range(100):
+            keys.create(f"robot-{number}", "query")
+    looks = [median(rounds, partial(_look, keys)) for keys in both]
+    reads = [median(rounds, partial(_read, keys)) for keys in both]
+    print(f"keys, whether they changed       {looks[0]:8.2f}  {looks[1]:8.2f}")
+    print(f"keys, reading 100 of them        {reads[0]:8.2f}  {reads[1]:8.2f}")
+    both[0].place.close()
 
 
 def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
@@ -162,9 +182,7 @@ def main() -> None:
         of_jobs(folders[1], database, rounds)
         of_rates(database, rounds)
         of_statistics(folders[0], database, rounds)
-        print(
-            f"keys, asking for their version   {'':>8}  {median(rounds, lambda _: SharedKeys(database).version()):8.2f}"
-        )
+        of_keys(folders[0], database, rounds)
         of_notices(folders[2:], postgres.address, rounds)
         database.close()
 

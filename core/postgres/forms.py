@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from core.maps.records import MapRecord
 from core.storage.files.row_formats import (
+    inner_products,
     pack_descriptors,
     pack_local,
     resting_types,
@@ -43,6 +44,11 @@ class Form:
         """Descriptors, float32 [n, D], from their stored form."""
         rows = np.frombuffer(b"".join(stored), self._descriptor)["stored"]
         return unpack_descriptors(rows, self._precision, self._dimension)
+
+    def inner_products(self, queries: NDArray[np.float32], stored: Sequence[bytes]) -> NDArray[np.float32]:
+        """Inner products of queries, float32 [B, D], with descriptors in stored form: float32 [B, n]."""
+        rows = np.frombuffer(b"".join(stored), self._descriptor)["stored"]
+        return inner_products(queries, rows, self._precision)
 
     def locals(self, stored: Sequence[bytes]) -> NDArray[np.int8]:
         """Local descriptors, int8 [n, C, L], from their stored form."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from sqlalchemy import and_, bindparam, case, column, delete, func, select, table, union, update
 
@@ -14,7 +14,7 @@ from core.ledger.maps.review import FRAMES
 from core.ledger.maps.schema import MAPS, PICTURES, PLACES
 from core.ledger.postgres import PostgresConnection
 from core.ledger.statements import Statement, among, seconds_now
-from core.postgres.tables import DEAD_KEYS, DEAD_OBJECTS, DEAD_ROWS, DESCRIPTORS, OBJECT_STORE
+from core.postgres.tables import DEAD_KEYS, DEAD_OBJECTS, DEAD_ROWS, DESCRIPTORS, OBJECT_STORE, REVISIONS
 
 WAIT_SECONDS = 10
 """A write that waits for others to the same map is refused after this time."""
@@ -42,6 +42,23 @@ _PUT = Statement(
 _DESCRIPTORS_AT = Statement(select(_D.row, _D.descriptor).where(_OF_MAP, among(_D.row, "rows")))
 _LOCALS_AT = Statement(select(_D.row, _D.local).where(_OF_MAP, among(_D.row, "rows")))
 _BOTH_AT = Statement(select(_D.row, _D.descriptor, _D.local).where(_OF_MAP, among(_D.row, "rows")))
+_CODES_AT = Statement(select(_D.row, _D.code).where(_OF_MAP, among(_D.row, "rows")))
+_ALL_CODES = Statement(select(_D.row, _D.code).where(_OF_MAP).order_by(_D.row))
+_PUT_CODE = Statement(
+    update(DESCRIPTORS).where(_OF_MAP, _D.row == bindparam("which")).values(code=bindparam("new_code"))
+)
+_DEAD_SINCE = Statement(select(_R.row).where(_R.map == bindparam("map"), _R.revision > bindparam("after")))
+_NOTE_REVISION = Statement(
+    lambda insert: insert(REVISIONS).values(
+        {name: bindparam(name) for name in ("map", "revision", "stamp")} | {"since": seconds_now()}
+    )
+)
+_STAMP_OF = Statement(
+    select(REVISIONS.c.stamp).where(REVISIONS.c.map == bindparam("map"), REVISIONS.c.revision == bindparam("revision"))
+)
+_FORGET_REVISIONS = Statement(
+    delete(REVISIONS).where(REVISIONS.c.map == bindparam("map"), REVISIONS.c.since < seconds_now() - bindparam("age"))
+)
 _DELETE_AT = Statement(delete(DESCRIPTORS).where(_OF_MAP, among(_D.row, "rows")))
 _ROOM = Statement(
     select(func.coalesce(func.sum(func.octet_length(_D.descriptor) + func.octet_length(_D.local)), 0)).where(_OF_MAP)
@@ -90,15 +107,20 @@ _KNOWN_KEYS = Statement(
     union(select(PLACES.c.key).where(among(PLACES.c.key, "keys")), select(_K.key).where(among(_K.key, "keys")))
 )
 _NEW_KEY = Statement(select(func.nextval("keys")))
-_LAST_KEY = Statement(select(table("keys", column("last_value")).c.last_value))
+_LAST_KEY = Statement(select(column("last_value")).select_from(table("keys")))
 
 
 # Descriptors
 
 
-def put_descriptors(connection: MapConnection, stored: Iterable[tuple[int, bytes, bytes]]) -> None:
-    """Store the descriptors of new rows: row, descriptor and local descriptors."""
-    values = [{"row": row, "descriptor": descriptor, "local": local} for row, descriptor, local in stored]
+def put_descriptors(
+    connection: MapConnection, stored: Mapping[int, tuple[bytes, bytes]], codes: Mapping[int, bytes]
+) -> None:
+    """Store the descriptors of new rows, and their codes if there are any."""
+    values = [
+        {"row": row, "descriptor": descriptor, "local": local, "code": codes.get(row)}
+        for row, (descriptor, local) in stored.items()
+    ]
     if values:
         connection.execute_many(_PUT, values)
 
@@ -117,6 +139,21 @@ def both_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, tuple[b
     """Both by row; rows that are gone are left out."""
     found = connection.execute(_BOTH_AT, rows=list(rows))
     return {row: (descriptor, local) for row, descriptor, local in found}
+
+
+def codes_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, bytes | None]:
+    """The codes of rows; rows that are gone are left out."""
+    return dict(connection.execute(_CODES_AT, rows=list(rows)))
+
+
+def all_codes(connection: MapConnection, at_once: int) -> Iterator[list[tuple[int, bytes | None]]]:
+    """Row and code of all rows, in order, some at a time."""
+    return connection.pages(_ALL_CODES, at_once)
+
+
+def put_codes(connection: MapConnection, codes: Mapping[int, bytes]) -> None:
+    """Store codes of rows in the place of those that they have."""
+    connection.execute_many(_PUT_CODE, [{"which": row, "new_code": code} for row, code in codes.items()])
 
 
 def room(connection: MapConnection) -> int:
@@ -140,7 +177,27 @@ def clear_rows(connection: MapConnection) -> int:
         frames.delete_frames(connection, rows)
         connection.execute(_CLEAR_ROWS, rows=rows)
         connection.execute(_FORGET_ROWS, age=REMEMBERED_SECONDS)
+        connection.execute(_FORGET_REVISIONS, age=REMEMBERED_SECONDS)
     return len(rows)
+
+
+def dead_since(connection: MapConnection, revision: int) -> list[int]:
+    """The rows that died after a revision of the map."""
+    return [row for (row,) in connection.execute(_DEAD_SINCE, after=revision)]
+
+
+# Revisions
+
+
+def note_revision(connection: MapConnection, revision: int, stamp: str) -> None:
+    """Store the stamp of a revision, within the write that makes it."""
+    connection.execute(_NOTE_REVISION, revision=revision, stamp=stamp)
+
+
+def stamp_of(connection: MapConnection, revision: int) -> str | None:
+    """The stamp of a revision; None: it was never made, or long ago."""
+    found = connection.one(_STAMP_OF, revision=revision)
+    return None if found is None else str(found[0])
 
 
 # Keys of entities
@@ -198,8 +255,8 @@ _CLEAR_OBJECTS = Statement(delete(DEAD_OBJECTS).where(among(DEAD_OBJECTS.c.name,
 _KNOWN_OBJECTS = Statement(
     union(
         *(
-            select(name).where(and_(name.is_not(None), among(name, "names")))
-            for name in (PICTURES.c.object, FRAMES.c.object, DEAD_OBJECTS.c.name)
+            select(named).where(and_(named.is_not(None), among(named, "names")))
+            for named in (PICTURES.c.object, FRAMES.c.object, DEAD_OBJECTS.c.name)
         )
     )
 )

@@ -10,10 +10,11 @@ from core.ledger.statements import binary, integer, real, text
 
 _METADATA = MetaData()
 
-# The descriptors of each row in the map's precision: [D] and [C, L].
+# The descriptors of each row in the map's precision, [D] and [C, L], and the code by which services find it
+# (:mod:`core.index`); NULL where an engine has no codes.
 DESCRIPTORS = Table(
     "descriptors", _METADATA, Column("map", integer(), nullable=False), Column("row", integer(), nullable=False),
-    Column("descriptor", binary(), nullable=False), Column("local", binary(), nullable=False),
+    Column("descriptor", binary(), nullable=False), Column("local", binary(), nullable=False), Column("code", binary()),
     PrimaryKeyConstraint("map", "row"),
 )  # fmt: skip
 
@@ -26,6 +27,13 @@ DEAD_ROWS = Table(
 )  # fmt: skip
 Index("dead_rows_in_order", DEAD_ROWS.c.map, DEAD_ROWS.c.cleared, DEAD_ROWS.c.since)
 Index("dead_rows_by_revision", DEAD_ROWS.c.map, DEAD_ROWS.c.revision)
+
+# The stamps of a map's last revisions.
+REVISIONS = Table(
+    "revisions", _METADATA, Column("map", integer(), nullable=False), Column("revision", integer(), nullable=False),
+    Column("stamp", text(), nullable=False), Column("since", real(), nullable=False),
+    PrimaryKeyConstraint("map", "revision"),
+)  # fmt: skip
 
 # Keys of entities in Milvus that are no place's any more.
 DEAD_KEYS = Table(
@@ -46,13 +54,22 @@ DEAD_OBJECTS = Table("dead_objects", _METADATA, Column("name", text(), primary_k
 
 _OF_MAPS = [
     f"ALTER TABLE {table} ADD FOREIGN KEY (map) REFERENCES maps ON DELETE CASCADE"
-    for table in ("descriptors", "dead_rows", "dead_keys", "review_frames", "review_pictures", "review_numbers")
+    for table in (
+        "descriptors",
+        "dead_rows",
+        "dead_keys",
+        "revisions",
+        "review_frames",
+        "review_pictures",
+        "review_numbers",
+    )
 ]
 _MORE = [
     *_OF_MAPS,
     # Compressing them would only take time.
     "ALTER TABLE descriptors ALTER COLUMN descriptor SET STORAGE EXTERNAL",
     "ALTER TABLE descriptors ALTER COLUMN local SET STORAGE EXTERNAL",
+    "ALTER TABLE descriptors ALTER COLUMN code SET STORAGE EXTERNAL",
     # Keys of entities and of objects are never used twice, also if their transaction fails.
     "CREATE SEQUENCE keys",
     "INSERT INTO object_store (single, folder) VALUES (1, gen_random_uuid()::text)",

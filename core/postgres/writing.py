@@ -83,7 +83,9 @@ class PostgresWrite(Write):
         Raises:
             StorageFull, StorageFailure: one of them refuses; nothing counts of what they may have taken.
         """
-        rows.put_descriptors(self.connection, ((row, *both) for row, both in self._new.items()))
+        rows.put_descriptors(self.connection, self._new, self._codes())
+        if self.state != self._before:
+            rows.note_revision(self.connection, self.state.revision, self.state.stamp)
         if self._objects is None or not self._pictures:
             self._index()
             return
@@ -93,6 +95,10 @@ class PostgresWrite(Write):
         except BaseException:
             self._objects.discard(list(self._pictures))
             raise
+
+    def _codes(self) -> dict[int, bytes]:
+        """The codes of new rows, if the engine has any."""
+        return {}
 
     def _index(self) -> None:
         """Give an engine what is new, before the COMMIT."""

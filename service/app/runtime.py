@@ -114,7 +114,8 @@ class Runtime:
         state.health_examinations = self.health_examinations
         state.similarity_matrices = self.similarity_matrices
         state.exports, state.imports = self.exports, self.imports
-        state.audit_trail = None if self.shared is None else self.shared.audit
+        if self.shared is not None:
+            state.audit_trail = self.shared.audit
 
     def start(self) -> None:
         """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""

@@ -11,10 +11,12 @@ from psycopg import Connection
 
 from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
+from service.access import key_table, rates
+from service.administration import audit_trail
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = ()
+TABLES: Sequence[Tables] = (key_table.TABLES, rates.TABLES, audit_trail.TABLES)
 """The tables of the parts that are written for both databases."""
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from service.administration.audit_trail import AuditTable, detach
 from service.engine.engine import Engine
 from service.events.events import Events
 from service.jobs.jobs import Jobs
 from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings
-from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
 from service.shared.differences import ReplicaDifferences
 from service.shared.events import SharedEvents
@@ -59,5 +59,5 @@ class SharedState:
     def close(self) -> None:
         """Leave the others; blocks."""
         self.events.close()
-        self.audit.close()
+        detach(self.audit)
         self.replica.close()

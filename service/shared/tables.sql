@@ -36,34 +36,6 @@ CREATE INDEX IF NOT EXISTS living_sessions ON service.sessions (map) WHERE ended
 CREATE INDEX IF NOT EXISTS ended_sessions ON service.sessions (used) WHERE ended IS NOT NULL;
 ALTER TABLE service.sessions ALTER COLUMN state SET STORAGE EXTERNAL; -- compressing it would only take time
 
--- As in keys.sqlite; each row has a checksum.
-CREATE TABLE IF NOT EXISTS service.keys (
-    id text COLLATE "C" PRIMARY KEY,
-    name text COLLATE "C" NOT NULL,
-    role text NOT NULL,
-    maps text,
-    digest bytea NOT NULL,
-    created_at text COLLATE "C" NOT NULL,
-    expires_at text,
-    revoked_at text,
-    seal bytea NOT NULL,
-    last_used_at text COLLATE "C"
-);
-
--- Numbers that grow with every change of something, so that nobody reads it in vain.
-CREATE TABLE IF NOT EXISTS service.versions (
-    name text PRIMARY KEY,
-    number bigint NOT NULL
-);
-INSERT INTO service.versions VALUES ('keys', 0) ON CONFLICT DO NOTHING;
-
--- The audit trail: one JSON object a line.
-CREATE TABLE IF NOT EXISTS service.audit (
-    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
-    replica text COLLATE "C" NOT NULL,
-    line text NOT NULL
-);
-
 CREATE TABLE IF NOT EXISTS service.jobs (
     number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
     id text COLLATE "C" NOT NULL UNIQUE,
@@ -93,12 +65,6 @@ CREATE TABLE IF NOT EXISTS service.jobs (
 );
 CREATE INDEX IF NOT EXISTS open_jobs ON service.jobs (map, number) WHERE state IN ('queued', 'running');
 CREATE SEQUENCE IF NOT EXISTS service.yields;
-
--- When the bucket of a caller will be full again.  A crash of PostgreSQL fills all of them.
-CREATE UNLOGGED TABLE IF NOT EXISTS service.rates (
-    name text COLLATE "C" PRIMARY KEY,
-    full_at timestamptz NOT NULL
-);
 
 -- Statistics of answers, as in statistics.sqlite.
 CREATE TABLE IF NOT EXISTS service.counted_maps (

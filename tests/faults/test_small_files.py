@@ -16,7 +16,7 @@ import pytest
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
 from core.maps.archives.reading import Archive, check
 from core.storage import Atlas
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords
 from service.queries.statistics import QueryStatistics, Statistics
@@ -72,7 +72,7 @@ def use_statistics(folder: Path) -> object:
 
 def use_keys(folder: Path) -> object:
     """Read all keys."""
-    return [(key.id, key.name, key.role, key.maps, key.digest) for key in KeyStore(folder).all()]
+    return [(key.id, key.name, key.role, key.maps, key.digest) for key in Keys.of(folder).all()]
 
 
 def use_export(folder: Path) -> object:
@@ -98,7 +98,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for _ in range(4):
         for use in (use_jobs, use_sessions, use_statistics):
             use(folder)
-    store = KeyStore(folder)
+    store = Keys.of(folder)
     for name in ("robot", "operator"):
         store.create(name, "query" if name == "robot" else "admin")
     atlas = Atlas(folder / "maps", rows_per_segment=4)

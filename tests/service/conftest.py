@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import httpx
 import pytest
@@ -12,6 +13,10 @@ import pytest
 from tests.service.encoders import install_coarse_encoder, install_two_stage_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+    from tests.service.shared.postgres import Postgres
 
 _numbers = itertools.count()
 
@@ -96,6 +101,26 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     running = Server(tmp_path_factory.mktemp("strict"), settings=STRICT).wait()
     yield running
     assert running.stop() == 0
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A real PostgreSQL."""
+    from tests.service.shared.postgres import running_postgres  # needs what speaks to it
+
+    with running_postgres() as postgres:
+        yield postgres
+
+
+@pytest.fixture
+def database(postgres: Postgres) -> Iterator[SharedDatabase]:
+    """The ledger of services, with nothing in it."""
+    from service.shared.database import SharedDatabase
+
+    postgres.empty()
+    database = SharedDatabase(postgres.address)
+    yield database
+    database.close()
 
 
 @pytest.fixture

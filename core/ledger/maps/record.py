@@ -24,7 +24,8 @@ class MapState:
     number: never used for another map, also of the same id; 1 in a file.
     places, rows: how many places there are; all their rows are below ``rows``.
     numbers: the number of the next place.
-    revision: grows with every write.
+    revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
+        and made again is told from the first one.
     inserted: the timestamp from which on Milvus sees all descriptors that count.
     collection: Milvus's id of the collection that has them; 0 as long as there are none.
     """
@@ -35,12 +36,13 @@ class MapState:
     rows: int = 0
     numbers: int = 1
     revision: int = 0
+    stamp: str = ""
     inserted: int = 0
     collection: int = 0
 
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
-_COUNTERS = ("places", "rows", "numbers", "revision", "inserted", "collection")
+_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "inserted", "collection")
 _STATE = (MAPS.c.number, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
 
 _CREATE = Statement(

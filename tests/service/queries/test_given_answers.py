@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.queries import given_answers
 from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame, RecentAnswers
 from service.queries.schemas import QueryAnswer
@@ -106,7 +106,7 @@ def test_a_new_map_of_the_same_name_has_no_answers(server: Server, map_id: str) 
 
 @pytest.mark.thorough
 def test_only_admins_see_who_asked(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path / "data")
+    store = Keys.of(tmp_path / "data")
     _, admin = store.create("ops", "admin")
     _, robot = store.create("robot", "query", ["lab"])
     server = Server(tmp_path, key=admin).wait()
