@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from core.errors import MapExists, StorageFailure, UnknownMap
+from core.ledger import Lock
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -128,7 +129,7 @@ class PostgresStore(ABC):
             updated_at=now,
             **(settings or MapSettings()).model_dump(),
         )
-        with self.database.transaction(f"create map {map_id!r}") as connection:
+        with self.database.transaction(f"create map {map_id!r}", Lock.MAPS) as connection:
             number = record.create(connection, made, listed=not unlisted)
         return self._map(map_id, number)
 
@@ -155,7 +156,7 @@ class PostgresStore(ABC):
             layout = layout_of(archive.manifest)
             Importing(archive, layout, advance, check_picture, most_picture_bytes, writing).fill()
             before_listing()
-            with self.database.transaction(f"import map {map_id!r}") as connection:
+            with self.database.transaction(f"import map {map_id!r}", Lock.MAPS) as connection:
                 record.publish(connection, number, map_id)
         except BaseException:
             with suppress(StorageFailure, UnknownMap):  # the next sweep removes it
@@ -211,7 +212,7 @@ class PostgresStore(ABC):
         return []
 
     def publish(self, map_id: str) -> PostgresMap:
-        with self.database.transaction(f"publish map {map_id!r}") as connection:
+        with self.database.transaction(f"publish map {map_id!r}", Lock.MAPS) as connection:
             number = record.unlisted(connection).get(map_id)
             if number is None:
                 raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
@@ -292,7 +293,7 @@ class PostgresStore(ABC):
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
         wanted = one_more(limit)
         listing: Listing = ["maps"]
-        after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
+        after = decode_name(listing, cursor)
         self._expect_open()
         with self.database.reading() as connection:
             found = record.records_after(connection, after, wanted)
