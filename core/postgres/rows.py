@@ -37,7 +37,9 @@ _D, _R, _K = DESCRIPTORS.c, DEAD_ROWS.c, DEAD_KEYS.c
 _OF_MAP = _D.map == bindparam("map")
 
 _PUT = Statement(
-    lambda insert: insert(DESCRIPTORS).values({name: bindparam(name) for name in ("map", "row", "descriptor", "local")})
+    lambda insert: insert(DESCRIPTORS).values(
+        {name: bindparam(name) for name in ("map", "row", "descriptor", "local", "code")}
+    )
 )
 _DESCRIPTORS_AT = Statement(select(_D.row, _D.descriptor).where(_OF_MAP, among(_D.row, "rows")))
 _LOCALS_AT = Statement(select(_D.row, _D.local).where(_OF_MAP, among(_D.row, "rows")))
@@ -106,8 +108,8 @@ _ALL_KEYS = Statement(
 _KNOWN_KEYS = Statement(
     union(select(PLACES.c.key).where(among(PLACES.c.key, "keys")), select(_K.key).where(among(_K.key, "keys")))
 )
-_NEW_KEY = Statement(select(func.nextval("keys")))
-_LAST_KEY = Statement(select(column("last_value")).select_from(table("keys")))
+_NEW_KEY = Statement(select(func.nextval("drawn_keys")))
+_LAST_KEY = Statement(select(column("last_value")).select_from(table("drawn_keys")))
 
 
 # Descriptors
@@ -248,7 +250,7 @@ def last_key(connection: Connection) -> int:
 _SHARE = Statement(
     select(MAPS.c.number).where(MAPS.c.number == bindparam("map")).with_for_update(key_share=True, read=True)
 )
-_OBJECT_KEY = Statement(select(OBJECT_STORE.c.folder, func.nextval("keys")))
+_OBJECT_KEY = Statement(select(OBJECT_STORE.c.folder, func.nextval("drawn_keys")))
 _FOLDER = Statement(select(OBJECT_STORE.c.folder))
 _DEAD_OBJECTS = Statement(select(DEAD_OBJECTS.c.name).limit(ORPHANS_AT_ONCE))
 _CLEAR_OBJECTS = Statement(delete(DEAD_OBJECTS).where(among(DEAD_OBJECTS.c.name, "names")))

@@ -71,7 +71,7 @@ _MORE = [
     "ALTER TABLE descriptors ALTER COLUMN local SET STORAGE EXTERNAL",
     "ALTER TABLE descriptors ALTER COLUMN code SET STORAGE EXTERNAL",
     # Keys of entities and of objects are never used twice, also if their transaction fails.
-    "CREATE SEQUENCE keys",
+    "CREATE SEQUENCE drawn_keys",
     "INSERT INTO object_store (single, folder) VALUES (1, gen_random_uuid()::text)",
     "CREATE FUNCTION note_dead_object() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN"
     " INSERT INTO dead_objects (name) VALUES (OLD.object) ON CONFLICT DO NOTHING; RETURN NULL; END $$",

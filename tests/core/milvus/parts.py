@@ -15,9 +15,9 @@ from pymilvus import Collection, connections
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StorageFailure
+from core.ledger.maps.frames import StoredObject
 from core.milvus.collection import collection_name
 from core.postgres.pictures.objects import Objects
-from core.ledger.maps.frames import StoredObject
 from tests.core.milvus.clients import ProcessClient
 from tests.core.milvus.servers import Server, Servers
 from tests.core.storage.frames import DIMENSION, ENCODER

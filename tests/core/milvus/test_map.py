@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import psycopg
 import pytest
+from core.milvus.ledger import VERSION
 
 from core.errors import RevisionMismatch, StoreOfAnotherVersion, StoreUnavailable
 from core.frames.images import encode_png
@@ -19,7 +20,6 @@ from core.maps.selection import Conditions
 from core.maps.views import Look, shows_same
 from core.method.catalogue import EncoderCatalogue
 from core.milvus import open_store
-from core.milvus.ledger import VERSION
 from core.milvus.map import MilvusMap
 from core.milvus.snapshot import SHORTLIST
 from core.milvus.store import MilvusStore

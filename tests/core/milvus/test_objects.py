@@ -14,12 +14,12 @@ import obstore
 import pytest
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
+from core.ledger.maps.frames import StoredObject
 from core.maps import MapSettings, ReviewSetting
 from core.milvus import Bucket, ledger, open_store
 from core.milvus.map import MilvusMap
-from core.postgres.pictures.objects import Objects
-from core.ledger.maps.frames import StoredObject
 from core.milvus.store import MilvusStore
+from core.postgres.pictures.objects import Objects
 from core.storage import Atlas
 from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.milvus.object_server import PORTS, object_store, reading_only

@@ -44,6 +44,4 @@ class TwoServices(StoreContract):
 
 def test_contract(postgres: Postgres) -> None:
     TwoServices.server = postgres
-    run_state_machine_as_test(
-        TwoServices, settings=settings(max_examples=15, stateful_step_count=20, deadline=None)
-    )
+    run_state_machine_as_test(TwoServices, settings=settings(max_examples=15, stateful_step_count=20, deadline=None))
