@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -133,15 +134,11 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Coded
                     case 1:
                         map_.enrol([frame(f"p{number}", 100_000 * seed + step, sequence="walk")])
                     case 2:
-                        try:
+                        with suppress(UnknownPlace):
                             map_.patch(f"p{number}", {"pose": {"x": float(step), "y": float(seed)}})
-                        except UnknownPlace:
-                            pass
                     case _:
-                        try:
+                        with suppress(UnknownPlace):
                             map_.forget(f"p{number}")
-                        except UnknownPlace:
-                            pass
                 snapshot = map_.snapshot()
                 assert int(np.count_nonzero(snapshot.alive)) == len(snapshot)
         except BaseException as error:
