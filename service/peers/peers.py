@@ -1,4 +1,4 @@
-"""What a service can say to those with which it shares its state, and hear from them."""
+"""The interface between a service and those with which it shares its state."""
 
 from __future__ import annotations
 
