@@ -24,7 +24,6 @@ from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
 from service.shared.keys import SharedKeys
 from service.shared.rates import SharedBuckets
 from service.shared.sessions import SessionTable
@@ -69,9 +68,9 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
     replica = ServiceReplica(database, folder)
-    shared = SharedJobs(replica, database, shared_maps=True)
+    shared = Jobs(database, replica, shared_maps=True)
     found = []
-    for jobs in (Jobs(folder), shared):
+    for jobs in (Jobs.of_directory(folder), shared):
         jobs.register("nothing", lambda _: {})
         if jobs is shared:
             replica.start()

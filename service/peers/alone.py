@@ -11,8 +11,7 @@ from service.peers.peers import Heard
 class Alone:
     """The only service of a data directory (:class:`service.peers.peers.Peers`)."""
 
-    id = "alone"
-    living = True
+    id, alone, living = "alone", True, True
 
     def __init__(self) -> None:
         self._heard: dict[str, Heard] = {}

@@ -19,6 +19,10 @@ class Peers(Protocol):
         """The id of this service, the same after a restart."""
 
     @property
+    def alone(self) -> bool:
+        """Whether this service shares its state with no other one."""
+
+    @property
     def living(self) -> bool:
         """Whether the others still count this service as there."""
 

@@ -77,6 +77,8 @@ class ServiceReplica:
         StorageFull, StorageFailure: the directory cannot be written to.
     """
 
+    alone = False
+
     def __init__(self, database: PostgresLedger, directory: Path) -> None:
         self.database = database
         self.id, self.process = _id_of(directory), secrets.token_hex(8)

@@ -11,11 +11,12 @@ from psycopg import Connection
 
 from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
+from service.jobs import rows
 from service.peers import replica
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = (replica.TABLES,)
+TABLES: Sequence[Tables] = (replica.TABLES, rows.TABLES)
 """The tables of the parts that are written for both databases."""
 
 

@@ -13,7 +13,6 @@ from service.settings import Settings
 from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
 from service.shared.events import SharedEvents
-from service.shared.jobs import SharedJobs
 from service.shared.sessions import SharedSessions
 from service.shared.statistics import SharedStatistics
 
@@ -41,8 +40,8 @@ class SharedState:
     def jobs(self, events: Events) -> Jobs:
         """All jobs of all services."""
         given = self._settings
-        return SharedJobs(
-            self.replica, self._database, self._shared_maps, given.job_workers, given.job_queue, given.job_history,
+        return Jobs(
+            self._database, self.replica, self._shared_maps, given.job_workers, given.job_queue, given.job_history,
             given.job_watchers, events,
         )  # fmt: skip
 

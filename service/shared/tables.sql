@@ -52,36 +52,6 @@ CREATE TABLE IF NOT EXISTS service.audit (
     line text NOT NULL
 );
 
-CREATE TABLE IF NOT EXISTS service.jobs (
-    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
-    id text COLLATE "C" NOT NULL UNIQUE,
-    kind text NOT NULL,
-    map text COLLATE "C",
-    state text NOT NULL,
-    arguments text NOT NULL,
-    resumable boolean NOT NULL,
-    cancelling boolean NOT NULL,
-    attempt integer NOT NULL,
-    change bigint NOT NULL,
-    done bigint NOT NULL,
-    total bigint,
-    message text NOT NULL,
-    notes text NOT NULL,
-    result text,
-    problem text,
-    created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
-    started_at timestamptz,
-    ended_at timestamptz,
-    maps text NOT NULL,
-    asker text NOT NULL,
-    home text COLLATE "C",                  -- the only service that can do it; NULL: any
-    owner text COLLATE "C",                 -- the service that does it
-    behind bigint,                          -- it gave way to the jobs up to this number; NULL: never
-    yielded bigint NOT NULL DEFAULT 0       -- orders those that gave way to the same ones; 0: never
-);
-CREATE INDEX IF NOT EXISTS open_jobs ON service.jobs (map, number) WHERE state IN ('queued', 'running');
-CREATE SEQUENCE IF NOT EXISTS service.yields;
-
 -- When the bucket of a caller will be full again.  A crash of PostgreSQL fills all of them.
 CREATE UNLOGGED TABLE IF NOT EXISTS service.rates (
     name text COLLATE "C" PRIMARY KEY,

@@ -1,4 +1,4 @@
-"""A service without HTTP that does jobs until it is killed: ``python -m tests.service.shared.worker ADDRESS DIR``."""
+"""A service without HTTP that does jobs until it is killed: ``python -m tests.service.jobs.worker ADDRESS DIR``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from service.jobs.context import JobContext
+from service.jobs.jobs import Jobs
 from service.peers.replica import ServiceReplica
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
 
 STEPS = 200
 
@@ -32,7 +32,7 @@ def main() -> None:
     address, folder = sys.argv[1], Path(sys.argv[2])
     database = SharedDatabase(address)
     replica = ServiceReplica(database, folder)
-    jobs = SharedJobs(replica, database, shared_maps=True)
+    jobs = Jobs(database, replica, shared_maps=True)
     jobs.register("walk", walk)
     replica.start()
     jobs.start()
