@@ -108,6 +108,7 @@ class Jobs:
         self._jobs: dict[str, Job] = {}  # those that this service does
         self._lost: set[str] = set()  # those of them that another one has taken over
         self._taking = threading.Lock()  # held while a job is taken, and while it is looked what is to be let go
+        self._resumed = False  # whether the jobs of the last run wait again, or have ended
         self._news = 0  # grows whenever there may be a job to take
         self._counts: Counter[JobState] = Counter()  # over all services, some seconds ago
         self._watchers: list[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = []
@@ -150,7 +151,7 @@ class Jobs:
 
     def start(self) -> None:
         """Resume the jobs of the last run of the service and start the workers; all kinds must be registered before."""
-        with suppress(StoreUnavailable):  # it is done as soon as PostgreSQL can be reached
+        with suppress(*REFUSALS):  # it is done before the first job is taken
             self.keep_up()
         for number in range(self._workers):
             thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
@@ -193,6 +194,7 @@ class Jobs:
                 self._discard(job)
             self._announce(job)
         self._counts = self._table.counts()
+        self._resumed = True
         self._rouse()
 
     def _mirror(self, held: Iterable[Job], owned: Mapping[tuple[str, int], bool]) -> None:
@@ -400,6 +402,8 @@ class Jobs:
         return None
 
     def _take_one(self) -> Job | None:
+        if not self._resumed:
+            self.keep_up()
         with self._taking:
             taken = self._table.take(self._kinds, self._works.copy())
             if taken is None:

@@ -86,12 +86,17 @@ def job_of(row: Sequence[Any] | Mapping[str, Any]) -> Job:
 
 
 def _whole(columns: Mapping[str, Any]) -> Job:
-    values = {"map_id": columns["map"], **{name: columns[name] for name in _NAMES if name != "map"}}
+    values = {name: columns[name] for name in _NAMES}
+    values["map_id"] = values.pop("map")
     for name in _JSON:
-        values[name] = None if values[name] is None else dict(json.loads(values[name]))
+        if (text := values[name]) is not None:
+            values[name] = {} if text == "{}" else dict(json.loads(text))
     for name in _MOMENTS:
-        values[name] = None if values[name] is None else datetime.fromtimestamp(values[name], UTC)
-    job = Job(**values | {name: bool(values[name]) for name in ("resumable", "cancelling")})
+        if (moment := values[name]) is not None:
+            values[name] = datetime.fromtimestamp(moment, UTC)
+    for name in ("resumable", "cancelling"):
+        values[name] = bool(values[name])
+    job = Job(**values)
     if job.state not in STATES or job.ended != (job.ended_at is not None):
         raise ValueError("its state is unknown")
     return job

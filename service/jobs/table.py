@@ -345,7 +345,7 @@ class JobTable:
                 if not ended:
                     connection.change(_CANCEL, id=job_id)
                 found = connection.execute(_GET, id=job_id)
-                trimmed = self._trim(connection)
+                trimmed = self._trim(connection) if ended else []
             jobs = self._learn(found)
             self._forget(trimmed)
         if not jobs:
@@ -381,7 +381,7 @@ class JobTable:
                     problem = json.dumps(dict(problem_of(lost)))
                     rows += connection.execute(_FAIL, number=lost.number, problem=problem, now=_now())
                 rows += connection.execute(_LET_GO, **given)
-                trimmed = self._trim(connection)
+                trimmed = self._trim(connection) if rows else []
             jobs = self._learn(rows)
             self._forget(trimmed)
         return jobs

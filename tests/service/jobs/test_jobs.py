@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, UnknownMap
+from core.ledger.sqlite import SqliteLedger
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
 from service.jobs.context import JobContext
 from service.jobs.file import FILE
@@ -231,8 +233,6 @@ def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
     [(TABLES.version + 1, DataDirectoryTooNew), (1, DataDirectoryTooOld), (TABLES.version - 1, DataDirectoryTooOld)],
 )
 def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refusal: type[Exception]) -> None:
-    import sqlite3
-
     with running_alone(tmp_path):
         pass
     connection = sqlite3.connect(tmp_path / FILE)
@@ -244,14 +244,20 @@ def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refu
     assert (tmp_path / FILE).read_bytes() == before
 
 
+def driver_of(jobs: Jobs) -> sqlite3.Connection:
+    """The connection to the file of jobs, by which it can be made to refuse writes."""
+    ledger = jobs._table._ledger
+    assert isinstance(ledger, SqliteLedger)
+    return ledger._connection.driver
+
+
 def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path) -> None:
     gate = Gate()
     kinds: Kinds = {"note": lambda _: {}}
     with running_alone(tmp_path, kinds) as jobs:
         job, waiting = jobs.submit("gate", None, gate), jobs.submit("note", None)
         assert gate.begun.wait(60)
-        driver = jobs._table._ledger._connection.driver  # type: ignore[attr-defined]
-        driver.execute("PRAGMA query_only = ON")
+        driver_of(jobs).execute("PRAGMA query_only = ON")
         with pytest.raises(StorageFailure):
             jobs.submit("note", None)
         with pytest.raises(StorageFailure):
@@ -261,22 +267,39 @@ def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path) -> None:
         assert ended.state == "succeeded" and not ended.cancelling
         assert [found.id for found in jobs.all()] == [job.id, waiting.id], "what was refused is not there"
         assert jobs.all()[0] == ended
-        driver.execute("PRAGMA query_only = OFF")
+        driver_of(jobs).execute("PRAGMA query_only = OFF")
         assert end_of(jobs, waiting).state == "succeeded"
     with running_alone(tmp_path, kinds) as jobs:
         assert jobs.get(job.id) == ended, "its end was written when the disk took it"
 
 
+def test_jobs_are_resumed_when_the_disk_takes_it_at_last(tmp_path: Path) -> None:
+    gate = Gate()
+    with running_alone(tmp_path, {"gate": gate}) as jobs:
+        job = jobs.submit("gate", "lab")
+        assert gate.begun.wait(60)
+        driver_of(jobs).execute("PRAGMA query_only = ON")  # it stays a running one
+    gate.open.set()
+    jobs = Jobs.of_directory(tmp_path)
+    jobs.register("gate", gate)
+    driver_of(jobs).execute("PRAGMA query_only = ON")
+    jobs.start()
+    assert jobs.get(job.id).state == "running"
+    driver_of(jobs).execute("PRAGMA query_only = OFF")
+    ended = end_of(jobs, job)
+    assert (ended.state, ended.attempt) == ("succeeded", 2)
+    jobs.close()
+
+
 def test_notes_that_the_disk_refuses_fail_the_job(tmp_path: Path) -> None:
     with running_alone(tmp_path) as jobs:
-        driver = jobs._table._ledger._connection.driver  # type: ignore[attr-defined]
 
         def noting(context: JobContext) -> Mapping[str, Any]:
-            driver.execute("PRAGMA query_only = ON")
+            driver_of(jobs).execute("PRAGMA query_only = ON")
             try:
                 context.remember(step=1)
             finally:
-                driver.execute("PRAGMA query_only = OFF")
+                driver_of(jobs).execute("PRAGMA query_only = OFF")
             return {}
 
         failed = end_of(jobs, jobs.submit("note", None, noting))
@@ -297,8 +320,6 @@ def test_a_job_of_an_unknown_kind_fails_at_the_start(running: Running, tmp_path:
 
 @pytest.mark.parametrize("how", ["a record", "the file"])
 def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) -> None:
-    import sqlite3
-
     gate = Gate()
     with running_alone(tmp_path, {"gate": gate}) as jobs:
         done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
