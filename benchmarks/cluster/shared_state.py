@@ -19,13 +19,12 @@ from pathlib import Path
 from service.access.keys import Keys
 from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
+from service.peers.replica import ServiceReplica
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
 from service.shared.sessions import SessionTable
 from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
@@ -68,9 +67,9 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
     replica = ServiceReplica(database, folder)
-    shared = SharedJobs(replica, shared_maps=True)
+    shared = Jobs(database, replica, shared_maps=True)
     found = []
-    for jobs in (Jobs(folder), shared):
+    for jobs in (Jobs.of_directory(folder), shared):
         jobs.register("nothing", lambda _: {})
         if jobs is shared:
             replica.start()

@@ -220,13 +220,13 @@ def _outcome(check: Callable[[], None]) -> str:
 
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
-    return Jobs(
+    return Jobs.of_directory(
         settings.data_dir,
-        settings.job_workers,
-        settings.job_queue,
-        settings.job_history,
-        settings.job_watchers,
-        engine.events,
+        workers=settings.job_workers,
+        longest_queue=settings.job_queue,
+        history=settings.job_history,
+        most_watchers=settings.job_watchers,
+        events=engine.events,
     )
 
 

@@ -2,18 +2,6 @@
 
 CREATE SCHEMA IF NOT EXISTS service;
 
--- One row for each data directory that ever served; its service says at intervals that it is there.
-CREATE TABLE IF NOT EXISTS service.replicas (
-    id text COLLATE "C" PRIMARY KEY,        -- kept in the data directory
-    process text NOT NULL,                  -- made anew at each start
-    seen timestamptz NOT NULL DEFAULT clock_timestamp()
-);
-ALTER TABLE service.replicas ADD COLUMN IF NOT EXISTS settings text; -- what all should have in common, as JSON
-
--- A service that has not said that it is there for ten seconds counts as gone.
-CREATE OR REPLACE VIEW service.living AS
-    SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '10 seconds';
-
 CREATE TABLE IF NOT EXISTS service.sessions (
     id text COLLATE "C" PRIMARY KEY,
     map text COLLATE "C" NOT NULL,
@@ -36,35 +24,6 @@ CREATE INDEX IF NOT EXISTS living_sessions ON service.sessions (map) WHERE ended
 CREATE INDEX IF NOT EXISTS ended_sessions ON service.sessions (used) WHERE ended IS NOT NULL;
 ALTER TABLE service.sessions ALTER COLUMN state SET STORAGE EXTERNAL; -- compressing it would only take time
 
-CREATE TABLE IF NOT EXISTS service.jobs (
-    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
-    id text COLLATE "C" NOT NULL UNIQUE,
-    kind text NOT NULL,
-    map text COLLATE "C",
-    state text NOT NULL,
-    arguments text NOT NULL,
-    resumable boolean NOT NULL,
-    cancelling boolean NOT NULL,
-    attempt integer NOT NULL,
-    change bigint NOT NULL,
-    done bigint NOT NULL,
-    total bigint,
-    message text NOT NULL,
-    notes text NOT NULL,
-    result text,
-    problem text,
-    created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
-    started_at timestamptz,
-    ended_at timestamptz,
-    maps text NOT NULL,
-    asker text NOT NULL,
-    home text COLLATE "C",                  -- the only service that can do it; NULL: any
-    owner text COLLATE "C",                 -- the service that does it
-    behind bigint,                          -- it gave way to the jobs up to this number; NULL: never
-    yielded bigint NOT NULL DEFAULT 0       -- orders those that gave way to the same ones; 0: never
-);
-CREATE INDEX IF NOT EXISTS open_jobs ON service.jobs (map, number) WHERE state IN ('queued', 'running');
-CREATE SEQUENCE IF NOT EXISTS service.yields;
 
 -- Statistics of answers, as in statistics.sqlite.
 CREATE TABLE IF NOT EXISTS service.counted_maps (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import secrets
 import shutil
 import sqlite3
 from collections import Counter
@@ -18,7 +19,10 @@ from core.maps.archives.reading import Archive, check
 from core.storage import Atlas
 from service.access.keys import Keys
 from service.errors.faults import KeysUnreadable
-from service.jobs.records import Job, JobRecords
+from service.jobs.file import open_file
+from service.jobs.job import Job
+from service.jobs.table import JobTable
+from service.peers.alone import Alone
 from service.queries.statistics import QueryStatistics, Statistics
 from service.sessions.store import SessionStore, StoredSession
 from tests.core.storage.archives.files import exported
@@ -37,14 +41,15 @@ KEY = ("lab", "2026-11-21T10:00:00+00:00")
 
 def use_jobs(folder: Path) -> object:
     """Read all jobs, then add one."""
-    records = JobRecords(folder)
+    ledger, _ = open_file(folder)
     try:
-        found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in records.read()]
-        number = records.last_number() + 1
-        records.put(Job(number, f"j{number}", "verify", "lab", {"a": "x" * 50}, True, datetime(2026, 1, 1, tzinfo=UTC)))
+        table = JobTable(ledger, Alone(), longest_queue=1000, history=1000)
+        found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in table.all()]
+        job_id = secrets.token_hex(8)
+        table.add(Job(0, job_id, "verify", "lab", {"a": "x" * 50}, True, datetime(2026, 1, 1, tzinfo=UTC)))
         return found
     finally:
-        records.close()
+        ledger.close()
 
 
 def use_sessions(folder: Path) -> object:

@@ -12,7 +12,7 @@ from typing import Any
 
 import httpx
 
-from service.jobs.records import JobRecords
+from service.jobs.file import open_file
 from service.sessions.store import SessionStore
 from tests.durability.model import Lost, World
 from tests.durability.server import operations as requests
@@ -97,7 +97,7 @@ def power(
 
 def _check(processes: StorageProcesses, image: Path, may: list[Moment]) -> None:
     check(processes, image, [moment.world for moment in may])
-    JobRecords(image).close()
+    open_file(image)[0].close()
     store = SessionStore(image)
     found = {one.id: one.number or 0 for one in store.all() if one.ended is None}
     store.close()
