@@ -12,7 +12,7 @@ class Alone:
     """The only service of a data directory (:class:`service.peers.peers.Peers`)."""
 
     id = "alone"
-    living = True
+    alone = living = True
 
     def __init__(self) -> None:
         self._heard: dict[str, Heard] = {}

@@ -19,6 +19,10 @@ class Peers(Protocol):
         """The id of this service, the same after a restart."""
 
     @property
+    def alone(self) -> bool:
+        """Whether there is no other service, now or later, that writes to the same ledger."""
+
+    @property
     def living(self) -> bool:
         """Whether the others still count this service as there."""
 

@@ -68,6 +68,7 @@ class ServiceReplica:
     """This service among those that share state in PostgreSQL (:class:`service.peers.peers.Peers`).
 
     id: of the data directory, the same after a restart.
+    alone: whether nobody else writes to the database.
 
     Args:
         database: shared by the services; it is closed by its owner.
@@ -76,6 +77,8 @@ class ServiceReplica:
     Raises:
         StorageFull, StorageFailure: the directory cannot be written to.
     """
+
+    alone = False
 
     def __init__(self, database: PostgresLedger, directory: Path) -> None:
         self.database = database

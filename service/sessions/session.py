@@ -103,6 +103,11 @@ class Session:
             answer=self.answer,
         )
 
+    def see(self, head: SessionRecord) -> None:
+        """Note the revision of the record, and when the last frame came."""
+        self.used, self.recorded = head.used, max(self.recorded, head.revision)
+        self.idle_since = max(self.idle_since, time.monotonic() - max(0.0, head.idle))
+
     @property
     def idle(self) -> float:
         """Seconds since the last frame."""

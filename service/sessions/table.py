@@ -173,7 +173,7 @@ _FORGET_ENDED = Statement(
 )
 
 
-def open_file(folder: Path) -> SqliteLedger:
+def session_file(folder: Path) -> SqliteLedger:
     """The file of the sessions of one data directory, which is made if it is missing; a damaged one is put aside.
 
     Raises:

@@ -12,10 +12,11 @@ from psycopg import Connection
 from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
 from service.peers import replica
+from service.sessions import table as sessions
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = (replica.TABLES,)
+TABLES: Sequence[Tables] = (replica.TABLES, sessions.TABLES)
 """The tables of the parts that are written for both databases."""
 
 

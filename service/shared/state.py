@@ -14,7 +14,6 @@ from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
 from service.shared.events import SharedEvents
 from service.shared.jobs import SharedJobs
-from service.shared.sessions import SharedSessions
 from service.shared.statistics import SharedStatistics
 
 
@@ -48,7 +47,7 @@ class SharedState:
 
     def sessions(self, events: Events) -> Sessions:
         """All sessions of all services."""
-        return SharedSessions(self._settings, events, self.replica, self._database)
+        return Sessions(self._settings, events, self._database, self.replica)
 
     def start(self) -> None:
         """Begin to take part; all parts must be made before."""
