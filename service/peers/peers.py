@@ -20,7 +20,7 @@ class Peers(Protocol):
 
     @property
     def alone(self) -> bool:
-        """Whether this service shares its state with no other one."""
+        """Whether there is no other service, now or later, that writes to the same ledger."""
 
     @property
     def living(self) -> bool:

@@ -68,6 +68,7 @@ class ServiceReplica:
     """This service among those that share state in PostgreSQL (:class:`service.peers.peers.Peers`).
 
     id: of the data directory, the same after a restart.
+    alone: whether nobody else writes to the database.
 
     Args:
         database: shared by the services; it is closed by its owner.

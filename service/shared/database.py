@@ -15,11 +15,12 @@ from service.access import key_table, rates
 from service.administration import audit_trail
 from service.jobs import rows
 from service.peers import replica
+from service.sessions import table as sessions
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
 TABLES: Sequence[Tables] = (
-    replica.TABLES, rows.TABLES, key_table.TABLES, rates.TABLES, audit_trail.TABLES,
+    replica.TABLES, rows.TABLES, sessions.TABLES, key_table.TABLES, rates.TABLES, audit_trail.TABLES,
 )  # fmt: skip
 """The tables of the parts that are written for both databases."""
 

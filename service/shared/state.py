@@ -13,7 +13,6 @@ from service.sessions.sessions import Sessions
 from service.settings import Settings
 from service.shared.database import SharedDatabase
 from service.shared.events import SharedEvents
-from service.shared.sessions import SharedSessions
 from service.shared.statistics import SharedStatistics
 
 
@@ -47,7 +46,7 @@ class SharedState:
 
     def sessions(self, events: Events) -> Sessions:
         """All sessions of all services."""
-        return SharedSessions(self._settings, events, self.replica, self._database)
+        return Sessions(self._settings, events, self._database, self.replica)
 
     def start(self) -> None:
         """Begin to take part; all parts must be made before."""

@@ -2,28 +2,6 @@
 
 CREATE SCHEMA IF NOT EXISTS service;
 
-CREATE TABLE IF NOT EXISTS service.sessions (
-    id text COLLATE "C" PRIMARY KEY,
-    map text COLLATE "C" NOT NULL,
-    map_created_at text NOT NULL,
-    options text NOT NULL,                  -- NewSession as JSON
-    expires_after double precision NOT NULL,
-    created timestamptz NOT NULL DEFAULT clock_timestamp(),
-    used timestamptz NOT NULL DEFAULT clock_timestamp(),
-    number bigint,
-    moment double precision,
-    request text,
-    lost bigint,
-    ended text,                             -- why; NULL while it lives
-    begun_by text,                          -- who, with which request, as JSON
-    revision bigint NOT NULL DEFAULT 0,     -- grows with every frame
-    state bytea,
-    answer text
-);
-CREATE INDEX IF NOT EXISTS living_sessions ON service.sessions (map) WHERE ended IS NULL;
-CREATE INDEX IF NOT EXISTS ended_sessions ON service.sessions (used) WHERE ended IS NOT NULL;
-ALTER TABLE service.sessions ALTER COLUMN state SET STORAGE EXTERNAL; -- compressing it would only take time
-
 
 -- Statistics of answers, as in statistics.sqlite.
 CREATE TABLE IF NOT EXISTS service.counted_maps (

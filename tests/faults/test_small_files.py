@@ -6,14 +6,15 @@ import os
 import random
 import secrets
 import shutil
-import sqlite3
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from core.disk.files import Damage
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
 from core.maps.archives.reading import Archive, check
 from core.storage import Atlas
@@ -24,7 +25,7 @@ from service.jobs.job import Job
 from service.jobs.table import JobTable
 from service.peers.alone import Alone
 from service.queries.statistics import QueryStatistics, Statistics
-from service.sessions.store import SessionStore, StoredSession
+from service.sessions.table import SessionRecord, SessionTable, session_file
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map
@@ -54,13 +55,14 @@ def use_jobs(folder: Path) -> object:
 
 def use_sessions(folder: Path) -> object:
     """Read all sessions with their beliefs, then add one."""
-    store = SessionStore(folder)
+    file = session_file(folder)
+    table = SessionTable(file)
     try:
-        found = [store.read(session.id) for session in store.all()]
-        store.write(StoredSession(f"s{len(found)}", "lab", KEY[1], "{}", 1.0, 2.0, state=b"believed" * 20))
-        return found
+        found = [table.read(session.id) for session in table.living()]
+        table.add(SessionRecord(f"s{len(found)}", "lab", KEY[1], "{}", 900.0, state=b"believed" * 20), most=100)
+        return [None if one is None else replace(one, idle=0.0) for one in found]
     finally:
-        store.close()
+        file.close()
 
 
 def use_statistics(folder: Path) -> object:
@@ -140,8 +142,8 @@ def run_cases(sound: Path, folder: Path, name: str, count: int) -> Counter[str]:
             found = USES[name](copy)
             put_aside = list(copy.glob(f"{name}.damaged*"))
             outcomes["put aside" if put_aside else "harmless" if found == expected else "other"] += 1
-        except (*REFUSALS, sqlite3.Error) as refusal:
-            assert not isinstance(refusal, sqlite3.Error) or name == "sessions.sqlite"
+        except (*REFUSALS, Damage) as refusal:
+            assert not isinstance(refusal, Damage) or name == "sessions.sqlite"
             assert str(refusal)
             outcomes["refused"] += 1
         except Exception as error:
