@@ -13,20 +13,19 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from service.access.keys import Keys
 from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
+from service.peers.replica import ServiceReplica
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
-from service.sessions.store import SessionStore, StoredSession
+from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
-from service.shared.sessions import SessionTable
 from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
 
@@ -50,27 +49,29 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
 
 
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
-    """A frame of a session: the reads before it and the writes after it."""
-    session = StoredSession(
-        "s-1", "lab", "2026", '{"expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
-        bytes(BELIEF_BYTES), '{"frame": 7}' + " " * 4000,
+    """A frame of a session: the look before it and the write after it."""
+    file = session_file(folder)
+    session = SessionRecord(
+        "s-1", "lab", "2026", "{}", 900.0, number=7, moment=3.5, request="robot", lost=0, state=bytes(BELIEF_BYTES),
+        answer='{"frame": 7}' + " " * 4000,
     )  # fmt: skip
-    store, table = SessionStore(folder), SessionTable(database)
-    store.write(session)
-    table.write(session)
-    read = median(rounds, lambda _: (table.head("s-1"), table.newer("s-1", 0)))
-    print(f"session, read before a frame     {'':>8}  {read:8.2f}")
-    saved = median(rounds, lambda _: store.renew(session)), median(rounds, lambda n: table.renew(session, n))
+    read, saved = [], []
+    for ledger in (file, database):
+        table = SessionTable(ledger)
+        table.add(session, 100)
+        saved.append(median(rounds, lambda number, table=table: table.renew(replace(session, revision=number))))
+        read.append(median(rounds, lambda _, table=table: table.head("s-1")))
+    print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
-    store.close()
+    file.close()
 
 
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
     replica = ServiceReplica(database, folder)
-    shared = SharedJobs(replica, shared_maps=True)
+    shared = Jobs(database, replica, shared_maps=True)
     found = []
-    for jobs in (Jobs(folder), shared):
+    for jobs in (Jobs.of_directory(folder), shared):
         jobs.register("nothing", lambda _: {})
         if jobs is shared:
             replica.start()

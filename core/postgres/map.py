@@ -16,7 +16,9 @@ from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
 from core.ledger.postgres import PostgresConnection, PostgresLedger, postgres_errors
 from core.maps.records import MapRecord
-from core.maps.status import KeypointsStatus, StorageStatus
+from core.maps.selection import Selection
+from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
+from core.maps.store import Scope, Snapshot
 from core.postgres import rows
 from core.postgres.exporter import Exporter
 from core.postgres.review import PostgresReview
@@ -115,6 +117,29 @@ class PostgresMap(LedgerMap):
                 )
                 self._room = state.revision, status
             return self._room[1]
+
+    # An engine
+
+    @property
+    @abstractmethod
+    def held(self) -> bool:
+        """Whether a search of the map needs neither the disk nor another process."""
+
+    @abstractmethod
+    def snapshot(self) -> Snapshot:
+        """All places at this moment."""
+
+    @abstractmethod
+    def scope(self, selection: Selection | None = None) -> Scope:
+        """The places that a query may find at this moment; None: all."""
+
+    @abstractmethod
+    def index_status(self) -> IndexStatus:
+        """How the map is searched."""
+
+    @abstractmethod
+    def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
+        """Build the index again from the descriptors."""
 
     # Writing
 

@@ -37,7 +37,9 @@ _D, _R, _K = DESCRIPTORS.c, DEAD_ROWS.c, DEAD_KEYS.c
 _OF_MAP = _D.map == bindparam("map")
 
 _PUT = Statement(
-    lambda insert: insert(DESCRIPTORS).values({name: bindparam(name) for name in ("map", "row", "descriptor", "local")})
+    lambda insert: insert(DESCRIPTORS).values(
+        {name: bindparam(name) for name in ("map", "row", "descriptor", "local", "code")}
+    )
 )
 _DESCRIPTORS_AT = Statement(select(_D.row, _D.descriptor).where(_OF_MAP, among(_D.row, "rows")))
 _LOCALS_AT = Statement(select(_D.row, _D.local).where(_OF_MAP, among(_D.row, "rows")))

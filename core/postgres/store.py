@@ -17,7 +17,7 @@ from core.ledger import Lock
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
-from core.ledger.postgres import PostgresLedger
+from core.ledger.postgres import LONG_SECONDS, PostgresLedger
 from core.maps.archives.reading import Archive
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
@@ -304,7 +304,7 @@ class PostgresStore(ABC):
 
     def _remove(self, map_id: str, number: int | None) -> None:
         found = self._map(map_id, number)
-        with self._deleting(found), self.database.transaction(f"delete map {map_id!r}") as whole:
+        with self._deleting(found), self.database.transaction(f"delete map {map_id!r}", seconds=LONG_SECONDS) as whole:
             connection = MapConnection(whole, found.number)
             record.state_of(connection, map_id, locked=True)
             record.delete_map(connection)

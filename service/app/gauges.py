@@ -17,7 +17,7 @@ from core.maps import MapRecord
 from core.maps.status import Tier
 from service.app.runtime import Runtime
 from service.http.bodies import UploadMemory
-from service.jobs.records import JobState
+from service.jobs.job import JobState
 
 
 class RuntimeCollector(Collector):

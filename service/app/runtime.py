@@ -22,6 +22,7 @@ from service.jobs.jobs import Jobs
 from service.maps import calibration, storage_jobs
 from service.maps.exports import Exports
 from service.maps.imports import Imports
+from service.peers.alone import Alone
 from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder
 from service.places.plans import Plans
@@ -30,6 +31,7 @@ from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
 from service.ray_serve import encoders_for
 from service.sessions.sessions import Sessions
+from service.sessions.table import session_file
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
 from service.upkeep import alignment, keypoints, merging, pruning, reencoding
@@ -68,7 +70,8 @@ class Runtime:
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
             if self.shared is None:
-                self.sessions = Sessions(settings, self.engine.events)
+                ledger = session_file(settings.data_dir)
+                self.sessions = Sessions(settings, self.engine.events, ledger, Alone())
             else:
                 self.sessions = self.shared.sessions(self.engine.events)
             opened.pop_all()
@@ -220,13 +223,13 @@ def _outcome(check: Callable[[], None]) -> str:
 
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
-    return Jobs(
+    return Jobs.of_directory(
         settings.data_dir,
-        settings.job_workers,
-        settings.job_queue,
-        settings.job_history,
-        settings.job_watchers,
-        engine.events,
+        workers=settings.job_workers,
+        longest_queue=settings.job_queue,
+        history=settings.job_history,
+        most_watchers=settings.job_watchers,
+        events=engine.events,
     )
 
 

@@ -30,8 +30,8 @@ from service.http.event_stream import (
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
+from service.jobs.job import Job, JobState
 from service.jobs.jobs import Jobs
-from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
 from service.worker_threads import in_thread

@@ -13,11 +13,20 @@ from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
 from service.access import key_table, rates
 from service.administration import audit_trail
+from service.jobs import rows
+from service.peers import replica
+from service.sessions import table as sessions
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = (key_table.TABLES, rates.TABLES, audit_trail.TABLES)
+TABLES: Sequence[Tables] = (
+    replica.TABLES, rows.TABLES, sessions.TABLES, key_table.TABLES, rates.TABLES, audit_trail.TABLES,
+)  # fmt: skip
 """The tables of the parts that are written for both databases."""
+
+
+LIVING = f"SELECT id FROM replicas WHERE seen > extract(epoch FROM clock_timestamp()) - {replica.GONE_SECONDS}"
+"""The ids of the services that are there, for statements given as text."""
 
 
 def make_tables(connection: Connection[Any]) -> None:

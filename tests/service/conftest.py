@@ -161,3 +161,23 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A real PostgreSQL."""
+    from tests.service.shared.postgres import running_postgres
+
+    with running_postgres() as postgres:
+        yield postgres
+
+
+@pytest.fixture
+def database(postgres: Postgres) -> Iterator[SharedDatabase]:
+    """The database that services share, with nothing in it."""
+    from service.shared.database import SharedDatabase
+
+    postgres.empty()
+    database = SharedDatabase(postgres.address)
+    yield database
+    database.close()

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from core.ledger.maps.places import LONGEST_TEXT
 from core.maps import Enrolment
 from core.maps.place_filter import Scalar
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
 from core.storage.database.connections import FILE
-from core.ledger.maps.places import LONGEST_TEXT
 from tests.core.storage import frames
 
 DIMENSION = 4

@@ -46,7 +46,7 @@ def test_a_request_that_changed_nothing_is_no_change(caplog: pytest.LogCaptureFi
 def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before = Jobs(tmp_path)
+    before = Jobs.of_directory(tmp_path)
     before.register("prune", lambda _context: {})
     token = ASKER.set(EVE)
     try:
@@ -55,7 +55,7 @@ def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     finally:
         ASKER.reset(token)
     before.close(0.0)
-    after = Jobs(tmp_path)
+    after = Jobs.of_directory(tmp_path)
     after.register("prune", lambda _context: {})
     after.start()
     while not after.get(job.id).ended:

@@ -1,14 +1,13 @@
-"""Jobs that services share: as in a data directory, and over several services, of which some are killed."""
+"""Jobs over several services, of which some are killed."""
 
 from __future__ import annotations
 
-import inspect
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,58 +15,13 @@ import pytest
 
 from service.errors.faults import JobQueueFull
 from service.jobs.context import JobContext
-from service.shared import replica as replicas
+from service.peers import replica as replicas
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
-from tests.service.jobs import test_jobs as embedded
-from tests.service.jobs.test_jobs import Gate, Kinds, end_of
+from tests.service.jobs.services import Gate, Service, end_of
+from tests.service.jobs.worker import walk
 from tests.service.server import ROOT
-from tests.service.shared.worker import walk
 
 pytestmark = [pytest.mark.cluster]
-
-CONTRACT: list[Callable[..., None]] = [
-    embedded.test_a_job_runs_and_is_remembered,
-    embedded.test_a_failed_job_says_why_but_hides_internal_errors,
-    embedded.test_jobs_take_turns_and_the_queue_is_bounded,
-    embedded.test_two_workers_never_work_on_one_map,
-    embedded.test_cancelling,
-    embedded.test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start,
-    embedded.test_a_job_that_cannot_be_resumed_fails_when_the_service_stops,
-    embedded.test_a_resumed_job_has_its_notes_and_is_still_cancelled,
-    embedded.test_progress_grows_and_its_versions_differ,
-    embedded.test_long_jobs_give_way_to_those_of_other_maps_in_turn,
-    embedded.test_a_job_that_has_given_way_is_cancelled_at_once,
-]
-
-
-class Service:
-    """The jobs of one service, without the rest of it."""
-
-    def __init__(self, address: str, folder: Path, kinds: Kinds, shared_maps: bool = True, **limits: Any) -> None:
-        folder.mkdir(exist_ok=True)
-        self.database = SharedDatabase(address)
-        self.replica = ServiceReplica(self.database, folder)
-        self.jobs = SharedJobs(self.replica, shared_maps, **limits)
-        for kind, work in kinds.items():
-            self.jobs.register(kind, work)
-
-    def start(self) -> Service:
-        self.replica.start()
-        self.jobs.start()
-        return self
-
-    def close(self) -> None:
-        self.jobs.close(30)
-        self.replica.close()
-        self.database.close()
-
-    def fall_silent(self) -> None:
-        """Neither say that it is there nor hear anything any more, as if it was stopped for a while."""
-        self.replica._stopping.set()
-        for thread in self.replica._threads:
-            thread.join()
 
 
 @pytest.fixture
@@ -75,29 +29,8 @@ def quick(database: SharedDatabase, monkeypatch: pytest.MonkeyPatch) -> str:
     """Services that count as gone after two seconds, so that no test has to wait for ten; the database's address."""
     monkeypatch.setattr(replicas, "BEAT_SECONDS", 0.2)
     monkeypatch.setattr(replicas, "LOSING_SECONDS", 1.2)
-    monkeypatch.setattr("service.shared.jobs.BEAT_SECONDS", 0.2)
-    view = "SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '2 seconds'"
-    database.query("shorten the time", f"CREATE OR REPLACE VIEW service.living AS {view}")
-    # Whoever connects makes the tables again.
-    monkeypatch.setattr("service.shared.database.TABLES", "SELECT 1")
+    monkeypatch.setattr(replicas, "GONE_SECONDS", 2.0)
     return database.address
-
-
-@pytest.mark.parametrize("test", CONTRACT, ids=lambda test: test.__name__)
-def test_as_in_a_data_directory(
-    test: Callable[..., None], database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    @contextmanager
-    def running(folder: Path, kinds: Kinds | None = None, **limits: Any) -> Iterator[SharedJobs]:
-        service = Service(database.address, folder, kinds or {}, **limits).start()
-        try:
-            yield service.jobs
-        finally:
-            service.close()
-
-    monkeypatch.setattr(embedded, "running", running)
-    given = {"tmp_path": tmp_path, "monkeypatch": monkeypatch}
-    test(**{name: given[name] for name in inspect.signature(test).parameters})
 
 
 def test_jobs_of_two_services(quick: str, tmp_path: Path) -> None:
@@ -178,7 +111,7 @@ def test_a_job_is_taken_over_from_its_checkpoint(quick: str, tmp_path: Path) -> 
 
 def test_a_killed_service(database: SharedDatabase, tmp_path: Path) -> None:
     (tmp_path / "killed").mkdir()
-    command = [sys.executable, "-m", "tests.service.shared.worker", database.address, str(tmp_path / "killed")]
+    command = [sys.executable, "-m", "tests.service.jobs.worker", database.address, str(tmp_path / "killed")]
     process = subprocess.Popen(command, cwd=ROOT)
     service = Service(database.address, tmp_path / "here", {"walk": walk})
     job = service.jobs.submit("walk", "lab", arguments={})
