@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core.milvus.ledger import VERSION
 
 from core.errors import StoreUnavailable
 from core.frames.images import encode_png
