@@ -59,8 +59,8 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     for ledger in (file, database):
         table = SessionTable(ledger)
         table.add(session, 100)
-        saved.append(median(rounds, lambda number, table=table: table.renew(replace(session, revision=number))))
-        read.append(median(rounds, lambda _, table=table: table.head("s-1")))
+        saved.append(median(rounds, lambda number, table=table: table.renew(replace(session, revision=number))))  # type: ignore[misc]
+        read.append(median(rounds, lambda _, table=table: table.head("s-1")))  # type: ignore[misc]
     print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
     file.close()

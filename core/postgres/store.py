@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.ledger import Lock
@@ -49,8 +49,11 @@ SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 
 log = logging.getLogger(__name__)
 
+Made = TypeVar("Made", bound=PostgresMap)
+"""The map of an engine."""
 
-class PostgresStore(ABC):
+
+class PostgresStore(ABC, Generic[Made]):
     """Maps by id (:class:`core.maps.store.Store`).
 
     Any thread may call any method, and any number of processes may use the same maps.
@@ -65,7 +68,7 @@ class PostgresStore(ABC):
             address: such as ``postgresql://placerec@localhost/placerec``.
             bucket: where new pictures are put; None: in PostgreSQL.
         """
-        self._maps: OrderedDict[int, PostgresMap] = OrderedDict()
+        self._maps: OrderedDict[int, Made] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
         self._sweeper: threading.Thread | None = None
@@ -75,11 +78,11 @@ class PostgresStore(ABC):
     # An engine
 
     @abstractmethod
-    def _map_of(self, state: MapState) -> PostgresMap:
+    def _map_of(self, state: MapState) -> Made:
         """The map that was found in this state."""
 
     @abstractmethod
-    def _deleting(self, map_: PostgresMap) -> AbstractContextManager[None]:
+    def _deleting(self, map_: Made) -> AbstractContextManager[None]:
         """What an engine does about a map that is deleted in the block."""
 
     @abstractmethod
@@ -101,7 +104,7 @@ class PostgresStore(ABC):
         local_shape: tuple[int, int] = (0, 0),
         unlisted: bool = False,
         precision: Precision = "half",
-    ) -> PostgresMap:
+    ) -> Made:
         """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
@@ -163,7 +166,7 @@ class PostgresStore(ABC):
                 self._remove(map_id, number)
             raise
 
-    def get(self, map_id: str) -> PostgresMap:
+    def get(self, map_id: str) -> Made:
         """A map, ready for use; the same object as long as the map is the same.
 
         Raises:
@@ -171,15 +174,15 @@ class PostgresStore(ABC):
         """
         return self._map(map_id, None)
 
-    def find(self, map_id: str) -> PostgresMap:
+    def find(self, map_id: str) -> Made:
         """The same as :meth:`get`."""
         return self.get(map_id)
 
-    def opened(self, map_id: str) -> PostgresMap | None:
+    def opened(self, map_id: str) -> Made | None:
         """None: only PostgreSQL knows whether a map is still there."""
         return None
 
-    def _map(self, map_id: str, number: int | None) -> PostgresMap:
+    def _map(self, map_id: str, number: int | None) -> Made:
         self._expect_open()
         with self.database.reading() as whole:
             if number is None:
@@ -196,7 +199,7 @@ class PostgresStore(ABC):
         found.note(state)
         return found
 
-    def unlisted(self) -> dict[str, PostgresMap]:
+    def unlisted(self) -> dict[str, Made]:
         self._expect_open()
         with self.database.reading() as connection:
             found = record.unlisted(connection)
@@ -211,7 +214,7 @@ class PostgresStore(ABC):
         """None: another service may build them; a sweep removes those that nobody has written to for a while."""
         return []
 
-    def publish(self, map_id: str) -> PostgresMap:
+    def publish(self, map_id: str) -> Made:
         with self.database.transaction(f"publish map {map_id!r}", Lock.MAPS) as connection:
             number = record.unlisted(connection).get(map_id)
             if number is None:
