@@ -20,7 +20,7 @@ from service.access.gate import Buckets
 from service.jobs.jobs import Jobs
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
-from service.queries.statistics import QueryStatistics
+from service.queries.statistics import QueryStatistics, statistics_file
 from service.sessions.store import SessionStore, StoredSession
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
@@ -28,7 +28,6 @@ from service.shared.keys import SharedKeys
 from service.shared.rates import SharedBuckets
 from service.shared.replica import ServiceReplica
 from service.shared.sessions import SessionTable
-from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
 
 BELIEF_BYTES = 8 << 10
@@ -109,9 +108,8 @@ def of_rates(database: SharedDatabase, rounds: int) -> None:
 def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """Adding the counts of some answers, and the answers themselves."""
     sizes, present = {KEY: ANSWERS}, {f"p{n}" for n in range(ANSWERS)}
-    embedded = QueryStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared = SharedStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared.share(database)
+    embedded = QueryStatistics(statistics_file(folder), 3600, lambda: sizes, lambda _: present)
+    shared = QueryStatistics(database, 3600, lambda: sizes, lambda _: present, shared=True)
     found = []
     for counted in (embedded, shared):
 

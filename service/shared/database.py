@@ -11,10 +11,11 @@ from psycopg import Connection
 
 from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
+from service.queries import recent_answers, statistics
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = ()
+TABLES: Sequence[Tables] = (statistics.TABLES, recent_answers.TABLES)
 """The tables of the parts that are written for both databases."""
 
 

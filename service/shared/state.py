@@ -15,7 +15,6 @@ from service.shared.events import SharedEvents
 from service.shared.jobs import SharedJobs
 from service.shared.replica import ServiceReplica
 from service.shared.sessions import SharedSessions
-from service.shared.statistics import SharedStatistics
 
 
 class SharedState:
@@ -36,7 +35,7 @@ class SharedState:
 
     def statistics(self, engine: Engine) -> QueryStatistics:
         """The statistics of all services."""
-        return SharedStatistics.of_services(engine, self.replica.database)
+        return QueryStatistics.of_engine(engine, self.replica.database)
 
     def jobs(self, events: Events) -> Jobs:
         """All jobs of all services."""

@@ -19,7 +19,8 @@ from core.storage import Atlas
 from service.access.keys import KeyStore
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords
-from service.queries.statistics import QueryStatistics, Statistics
+from service.queries.counts import Statistics
+from service.queries.statistics import QueryStatistics, statistics_file
 from service.sessions.store import SessionStore, StoredSession
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
@@ -60,7 +61,7 @@ def use_sessions(folder: Path) -> object:
 
 def use_statistics(folder: Path) -> object:
     """Read the statistics of a map, then count one more answer."""
-    statistics = QueryStatistics(folder, 3600, lambda: {KEY: 5}, lambda _: set())
+    statistics = QueryStatistics(statistics_file(folder), 3600, lambda: {KEY: 5}, lambda _: set())
     try:
         found: Statistics = statistics.read(KEY)
         statistics.observe(KEY, "recognized", "p0", 0.5, 0.5)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 import pytest
@@ -12,6 +14,10 @@ import pytest
 from tests.service.encoders import install_coarse_encoder, install_two_stage_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+    from tests.service.shared.postgres import Postgres
 
 _numbers = itertools.count()
 
@@ -136,3 +142,31 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A real PostgreSQL."""
+    from tests.service.shared.postgres import running_postgres
+
+    with running_postgres() as postgres:
+        yield postgres
+
+
+@pytest.fixture
+def database(postgres: Postgres) -> Iterator[SharedDatabase]:
+    """What services share, with nothing in it."""
+    from service.shared.database import SharedDatabase
+
+    postgres.empty()
+    database = SharedDatabase(postgres.address)
+    yield database
+    database.close()
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the data of a service that has one map."""
+    from tests.service.shared.services import prepare
+
+    folder = tmp_path_factory.mktemp("prepared")
+    prepare(folder)
+    return folder

@@ -31,6 +31,8 @@ class Postgres:
         """Forget everything."""
         with psycopg.connect(self.address) as connection:
             connection.execute("DROP SCHEMA IF EXISTS service CASCADE")
+            connection.execute("DROP SCHEMA public CASCADE")
+            connection.execute("CREATE SCHEMA public")
         database = SharedDatabase(self.address)
         database.query("make its tables", "SELECT 1")
         database.close()
