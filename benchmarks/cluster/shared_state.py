@@ -18,6 +18,7 @@ from pathlib import Path
 
 from service.access.gate import Buckets
 from service.jobs.jobs import Jobs
+from service.peers.replica import ServiceReplica
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics, statistics_file
@@ -26,7 +27,6 @@ from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
 from service.shared.keys import SharedKeys
 from service.shared.rates import SharedBuckets
-from service.shared.replica import ServiceReplica
 from service.shared.sessions import SessionTable
 from tests.service.shared.postgres import running_postgres
 
@@ -68,7 +68,7 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
     replica = ServiceReplica(database, folder)
-    shared = SharedJobs(replica, shared_maps=True)
+    shared = SharedJobs(replica, database, shared_maps=True)
     found = []
     for jobs in (Jobs(folder), shared):
         jobs.register("nothing", lambda _: {})

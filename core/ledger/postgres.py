@@ -260,3 +260,19 @@ class PostgresLedger(Postgres):
             if lock is not None:
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (lock,))
             yield PostgresConnection(connection)
+
+    def notify(self, action: str, channel: str, text: str) -> None:
+        """Send a text, of at most 7999 bytes, to those who listen to a channel now."""
+        with self.connection(action) as connection:
+            connection.execute("SELECT pg_notify(%s, %s)", (channel, text))
+
+    @contextmanager
+    def listening(self, channel: str) -> Iterator[Callable[[float], Iterator[str]]]:
+        """Listen to a channel in the block, by a connection outside the pool.
+
+        Yields:
+            A function that waits for some seconds, and gives the texts that arrive meanwhile.
+        """
+        with self.alone("listen") as connection:
+            connection.execute(f"LISTEN {channel}")
+            yield lambda seconds: (notice.payload for notice in connection.notifies(timeout=seconds))

@@ -11,12 +11,17 @@ from psycopg import Connection
 
 from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
+from service.peers import replica
 from service.queries import recent_answers, statistics
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = (statistics.TABLES, recent_answers.TABLES)
+TABLES: Sequence[Tables] = (replica.TABLES, statistics.TABLES, recent_answers.TABLES)
 """The tables of the parts that are written for both databases."""
+
+
+LIVING = f"SELECT id FROM replicas WHERE seen > extract(epoch FROM clock_timestamp()) - {replica.GONE_SECONDS}"
+"""The ids of the services that are there, for statements given as text."""
 
 
 def make_tables(connection: Connection[Any]) -> None:

@@ -14,7 +14,8 @@ from collections import deque
 from core.errors import StorageFailure, StorageFull
 from service.events.events import Events
 from service.events.feed import Feed, FeedEvent
-from service.shared.replica import LIVING, ServiceReplica
+from service.peers.replica import ServiceReplica
+from service.shared.database import LIVING, SharedDatabase
 
 EVENT, LISTENING = "event", "listening"
 """Topics between services: there are new events, and somebody listens to other maps than before."""
@@ -41,9 +42,9 @@ class SharedEvents(Events):
     Nobody who publishes an event waits for PostgreSQL.
     """
 
-    def __init__(self, replica: ServiceReplica, most_listeners: int) -> None:
+    def __init__(self, replica: ServiceReplica, database: SharedDatabase, most_listeners: int) -> None:
         super().__init__(most_listeners)
-        self._replica, self._database = replica, replica.database
+        self._replica, self._database = replica, database
         self._elsewhere: dict[str, bool] = {}  # maps with listeners at other services; whether they want pictures
         self._said: dict[str, bool] = {}  # the same of this service, as the others know it
         self._outbox: deque[tuple[str, str | None]] = deque(maxlen=MOST_WAITING)

@@ -26,8 +26,8 @@ from service.events.events import Events
 from service.jobs.context import JobInterrupted, Work
 from service.jobs.jobs import Jobs, note_event, problem_of_job
 from service.jobs.records import Job, JobState
-from service.shared.database import SharedDatabase
-from service.shared.replica import BEAT_SECONDS, LIVING, ServiceReplica
+from service.peers.replica import BEAT_SECONDS, ServiceReplica
+from service.shared.database import LIVING, SharedDatabase
 
 TAKING = 7_061_636_575
 """The lock of whoever adds or takes a job."""
@@ -267,6 +267,7 @@ class SharedJobs(Jobs):
     def __init__(
         self,
         replica: ServiceReplica,
+        database: SharedDatabase,
         shared_maps: bool,
         workers: int = 1,
         longest_queue: int = 32,
@@ -275,7 +276,7 @@ class SharedJobs(Jobs):
         events: Events | None = None,
     ) -> None:
         self._replica, self._shared_maps = replica, shared_maps
-        self._table = JobTable(replica.database, replica.id)
+        self._table = JobTable(database, replica.id)
         self._counts: Counter[JobState] = Counter()
         self._lost: set[str] = set()
         self._taking = threading.Lock()  # held while a job is taken, and while it is looked what is to be let go

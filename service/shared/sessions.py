@@ -19,6 +19,7 @@ from core.errors import StorageFailure, StorageFull
 from core.maps import Map
 from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
+from service.peers.replica import ServiceReplica
 from service.sessions.schemas import NewSession
 from service.sessions.sessions import (
     EXPIRED,
@@ -38,7 +39,6 @@ from service.sessions.sessions import (
 from service.sessions.store import COLUMNS, StoredSession
 from service.settings import Settings
 from service.shared.database import SharedDatabase
-from service.shared.replica import ServiceReplica
 
 ADDING = 7_061_636_574
 """The lock of whoever adds a session, so that together they keep to the limit."""
@@ -218,8 +218,8 @@ class SharedSessions(Sessions):
     the same, and says so; the next one at this service goes on from it.
     """
 
-    def __init__(self, settings: Settings, events: Events, replica: ServiceReplica) -> None:
-        self._table, self._counted, self._beats = SessionTable(replica.database), 0, 0
+    def __init__(self, settings: Settings, events: Events, replica: ServiceReplica, database: SharedDatabase) -> None:
+        self._table, self._counted, self._beats = SessionTable(database), 0, 0
         super().__init__(settings, events, self._table)
         replica.every(self.tidy)
 

@@ -2,18 +2,6 @@
 
 CREATE SCHEMA IF NOT EXISTS service;
 
--- One row for each data directory that ever served; its service says at intervals that it is there.
-CREATE TABLE IF NOT EXISTS service.replicas (
-    id text COLLATE "C" PRIMARY KEY,        -- kept in the data directory
-    process text NOT NULL,                  -- made anew at each start
-    seen timestamptz NOT NULL DEFAULT clock_timestamp()
-);
-ALTER TABLE service.replicas ADD COLUMN IF NOT EXISTS settings text; -- what all should have in common, as JSON
-
--- A service that has not said that it is there for ten seconds counts as gone.
-CREATE OR REPLACE VIEW service.living AS
-    SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '10 seconds';
-
 CREATE TABLE IF NOT EXISTS service.sessions (
     id text COLLATE "C" PRIMARY KEY,
     map text COLLATE "C" NOT NULL,

@@ -142,6 +142,8 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
+
+
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Postgres]:
     """A real PostgreSQL."""
@@ -153,7 +155,7 @@ def postgres() -> Iterator[Postgres]:
 
 @pytest.fixture
 def database(postgres: Postgres) -> Iterator[SharedDatabase]:
-    """What services share, with nothing in it."""
+    """The database that services share, with nothing in it."""
     from service.shared.database import SharedDatabase
 
     postgres.empty()

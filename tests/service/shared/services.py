@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.shared.replica import FILE
+from service.peers.replica import FILE
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from service.peers.differences import COMMON, ReplicaDifferences
+from service.peers.replica import FILE, ServiceReplica
 from service.settings import Settings
 from service.shared.database import SharedDatabase
-from service.shared.differences import COMMON, ReplicaDifferences
-from service.shared.replica import FILE, ServiceReplica
 from tests.service.encoders import COARSE, install_two_stage_encoder
 from tests.service.server import Server
 from tests.service.sessions.test_sessions import begin

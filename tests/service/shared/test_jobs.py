@@ -16,10 +16,10 @@ import pytest
 
 from service.errors.faults import JobQueueFull
 from service.jobs.context import JobContext
-from service.shared import replica as replicas
-from service.shared.database import SharedDatabase
+from service.peers import replica as replicas
+from service.peers.replica import ServiceReplica
+from service.shared.database import LIVING, SharedDatabase
 from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
 from tests.service.jobs import test_jobs as embedded
 from tests.service.jobs.test_jobs import Gate, Kinds, end_of
 from tests.service.server import ROOT
@@ -49,7 +49,7 @@ class Service:
         folder.mkdir(exist_ok=True)
         self.database = SharedDatabase(address)
         self.replica = ServiceReplica(self.database, folder)
-        self.jobs = SharedJobs(self.replica, shared_maps, **limits)
+        self.jobs = SharedJobs(self.replica, self.database, shared_maps, **limits)
         for kind, work in kinds.items():
             self.jobs.register(kind, work)
 
@@ -76,10 +76,8 @@ def quick(database: SharedDatabase, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setattr(replicas, "BEAT_SECONDS", 0.2)
     monkeypatch.setattr(replicas, "LOSING_SECONDS", 1.2)
     monkeypatch.setattr("service.shared.jobs.BEAT_SECONDS", 0.2)
-    view = "SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '2 seconds'"
-    database.query("shorten the time", f"CREATE OR REPLACE VIEW service.living AS {view}")
-    # Whoever connects makes the tables again.
-    monkeypatch.setattr("service.shared.database.TABLES", "SELECT 1")
+    monkeypatch.setattr(replicas, "GONE_SECONDS", 2.0)
+    monkeypatch.setattr("service.shared.jobs.LIVING", LIVING.replace("10.0", "2.0"))
     return database.address
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from service.jobs.context import JobContext
+from service.peers.replica import ServiceReplica
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
 
 STEPS = 200
 
@@ -30,8 +30,9 @@ def walk(context: JobContext) -> Mapping[str, Any]:
 def main() -> None:
     """Do jobs."""
     address, folder = sys.argv[1], Path(sys.argv[2])
-    replica = ServiceReplica(SharedDatabase(address), folder)
-    jobs = SharedJobs(replica, shared_maps=True)
+    database = SharedDatabase(address)
+    replica = ServiceReplica(database, folder)
+    jobs = SharedJobs(replica, database, shared_maps=True)
     jobs.register("walk", walk)
     replica.start()
     jobs.start()

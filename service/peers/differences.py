@@ -15,9 +15,13 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from sqlalchemy import bindparam, select, update
+
+from core.ledger import Ledger, Statement
+from core.ledger.statements import seconds_now
 from core.method.catalogue import EncoderCatalogue
+from service.peers.replica import GONE_SECONDS, IS_LIVING, REPLICAS
 from service.settings import Settings
-from service.shared.database import SharedDatabase
 
 COMMON = (
     "encoder",
@@ -55,6 +59,9 @@ CLOCK_SECONDS = 2.0
 
 log = logging.getLogger("placerec.shared")
 
+_WRITE = Statement(update(REPLICAS).where(REPLICAS.c.id == bindparam("service")).values(settings=bindparam("text")))
+_READ = Statement(select(REPLICAS.c.id, REPLICAS.c.settings, seconds_now()).where(IS_LIVING).order_by(REPLICAS.c.id))
+
 
 class ReplicaDifferences:
     """Tells the other services what this one has, and compares it with what they have.
@@ -65,7 +72,7 @@ class ReplicaDifferences:
         replica: the id of this service.
     """
 
-    def __init__(self, settings: Settings, database: SharedDatabase, replica: str) -> None:
+    def __init__(self, settings: Settings, database: Ledger, replica: str) -> None:
         self._settings, self._database, self._replica = settings, database, replica
         self._catalogue = EncoderCatalogue(settings.models_directory)
         self._written: str | None = None
@@ -82,15 +89,10 @@ class ReplicaDifferences:
             self._mine, self._read = self._read_mine(), time.monotonic()
         mine = self._mine
         if (text := json.dumps(mine)) != self._written:
-            query = "UPDATE service.replicas SET settings = %s WHERE id = %s"
-            self._database.query("tell its settings", query, (text, self._replica))
+            self._database.execute("tell its settings", _WRITE, service=self._replica, text=text)
             self._written = text
-        query = (
-            "SELECT r.id, r.settings, extract(epoch FROM clock_timestamp())::float8"
-            " FROM service.replicas r JOIN service.living USING (id) ORDER BY r.id"
-        )
         sent = time.time()
-        found = self._database.query("compare settings", query)
+        found = self._database.execute("compare settings", _READ, gone=GONE_SECONDS)
         answered = time.time()
         differences = [
             difference

@@ -10,9 +10,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from sqlalchemy import Column, MetaData, Table, bindparam, select, update
+
 from core.disk.files import disk_errors, write_file
 from core.errors import StorageFailure
-from service.shared.database import SharedDatabase
+from core.ledger import Connection, Statement, Tables
+from core.ledger.postgres import PostgresLedger
+from core.ledger.statements import real, seconds_now, text
+from service.peers.peers import Heard
 
 FILE = "replica"
 
@@ -21,22 +26,46 @@ BEAT_SECONDS = 2.0
 
 LOSING_SECONDS = 7.0
 """A service that cannot write its beat for this time stops its jobs, by its own clock: before it counts as gone by the
-database's, and others take them over (``service.living`` in tables.sql)."""
+database's, and others take them over."""
 
-LIVING = "SELECT id FROM service.living"
-"""The ids of the services that are there."""
+GONE_SECONDS = 10.0
+"""A service that has not said for this time that it is there counts as gone."""
 
 CHANNEL = "placerec"
 RECONNECT_SECONDS = 1.0
 
-Heard = Callable[[str | None], None]
-"""Called with a message; None: the connection was lost for a while, so any message may have been missed."""
-
 log = logging.getLogger("placerec.shared")
+
+# One row for each data directory that ever served.
+_METADATA = MetaData()
+REPLICAS = Table(
+    "replicas",
+    _METADATA,
+    Column("id", text(), primary_key=True),  # of the data directory
+    Column("process", text(), nullable=False),  # made anew at each start
+    Column("seen", real(), nullable=False),  # when it last said that it is there, in seconds since 1970; 0: it left
+    Column("settings", text()),  # what all should have in common, as JSON
+)
+TABLES = Tables("replicas", 1, _METADATA)
+
+IS_LIVING = REPLICAS.c.seen > seconds_now() - bindparam("gone")
+"""Whether the service of a row is there; ``gone`` is ``GONE_SECONDS``."""
+
+_THIS = (REPLICAS.c.id == bindparam("service")) & (REPLICAS.c.process == bindparam("of_process"))
+_ENTER = Statement(
+    lambda insert: (
+        insert(REPLICAS)
+        .values(id=bindparam("service"), process=bindparam("of_process"), seen=seconds_now())
+        .on_conflict_do_update(index_elements=["id"], set_={"process": bindparam("of_process"), "seen": seconds_now()})
+    )
+)
+_BEAT = Statement(update(REPLICAS).where(_THIS).values(seen=seconds_now()))
+_LEAVE = Statement(update(REPLICAS).where(_THIS).values(seen=0.0))
+_LIVING = Statement(select(REPLICAS.c.id).where(IS_LIVING).order_by(REPLICAS.c.id))
 
 
 class ServiceReplica:
-    """This service among those that share state.  Any thread may use it.
+    """This service among those that share state in PostgreSQL (:class:`service.peers.peers.Peers`).
 
     id: of the data directory, the same after a restart.
 
@@ -48,9 +77,10 @@ class ServiceReplica:
         StorageFull, StorageFailure: the directory cannot be written to.
     """
 
-    def __init__(self, database: SharedDatabase, directory: Path) -> None:
+    def __init__(self, database: PostgresLedger, directory: Path) -> None:
         self.database = database
         self.id, self.process = _id_of(directory), secrets.token_hex(8)
+        self._this = {"service": self.id, "of_process": self.process}
         self.displaced = False
         """Whether another service runs under this id, because its data directory is a copy."""
         self._entered, self._beaten = False, -math.inf
@@ -88,11 +118,7 @@ class ServiceReplica:
         for thread in self._threads:
             thread.join(5)
         try:
-            self.database.query(
-                "leave",
-                "UPDATE service.replicas SET seen = '-infinity' WHERE id = %s AND process = %s",
-                (self.id, self.process),
-            )
+            self.database.execute("leave", _LEAVE, **self._this)
         except Exception as error:
             log.warning("the service cannot take its leave: %s", error)
 
@@ -110,7 +136,11 @@ class ServiceReplica:
 
     def say(self, topic: str, text: str = "") -> None:
         """Send a message to all services, this one included; it is not stored for those that are not connected."""
-        self.database.query("notify other services", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
+        self.database.notify("notify other services", CHANNEL, f"{topic} {text}")
+
+    def living_ids(self, connection: Connection) -> list[str]:
+        """The ids of the services that are there, within a transaction of the database."""
+        return [name for (name,) in connection.execute(_LIVING, gone=GONE_SECONDS)]
 
     # The threads
 
@@ -143,17 +173,12 @@ class ServiceReplica:
         """
         began = time.monotonic()
         if not self._entered:
-            enter = (
-                "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
-                " SET process = excluded.process, seen = clock_timestamp()"
-            )
-            self.database.query("enter", enter, (self.id, self.process))
+            self.database.execute("enter", _ENTER, **self._this)
             self._entered, self._beaten = True, began
             return
-        query = "UPDATE service.replicas SET seen = clock_timestamp() WHERE id = %s AND process = %s RETURNING id"
         if self.displaced:
             return
-        if self.database.query("say that it is there", query, (self.id, self.process)):
+        if self.database.change("say that it is there", _BEAT, **self._this):
             self._beaten = began
         else:
             self.displaced = True
@@ -168,14 +193,13 @@ class ServiceReplica:
                 self._stopping.wait(RECONNECT_SECONDS)
 
     def _listen(self) -> None:
-        with self.database.alone("listen") as connection:
-            connection.execute(f"LISTEN {CHANNEL}")
+        with self.database.listening(CHANNEL) as messages:
             for heard in self._heard.values():
                 heard(None)
             self._note("the service does not hear the others", None)
             while not self._stopping.is_set():
-                for notice in connection.notifies(timeout=0.5):
-                    topic, _, text = notice.payload.partition(" ")
+                for message in messages(0.5):
+                    topic, _, text = message.partition(" ")
                     if topic in self._heard:
                         self._heard[topic](text)
 
