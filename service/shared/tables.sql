@@ -87,18 +87,3 @@ CREATE UNLOGGED TABLE IF NOT EXISTS service.rates (
     name text COLLATE "C" PRIMARY KEY,
     full_at timestamptz NOT NULL
 );
-
--- Which services have listeners of which maps, and the events that are on their way to them.
-CREATE UNLOGGED TABLE IF NOT EXISTS service.listening (
-    replica text COLLATE "C" NOT NULL,
-    map text COLLATE "C" NOT NULL,
-    pictures boolean NOT NULL,
-    PRIMARY KEY (replica, map)
-);
-CREATE UNLOGGED TABLE IF NOT EXISTS service.events (
-    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
-    replica text COLLATE "C" NOT NULL,      -- that tells it
-    map text COLLATE "C" NOT NULL,
-    event text,                             -- NULL: the map was deleted
-    at timestamptz NOT NULL DEFAULT clock_timestamp()
-);
