@@ -19,9 +19,10 @@ from pathlib import Path
 from service.access.gate import Buckets
 from service.jobs.jobs import Jobs
 from service.peers.replica import ServiceReplica
+from service.queries.count_tables import statistics_file
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
-from service.queries.statistics import QueryStatistics, statistics_file
+from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
 from service.shared.database import SharedDatabase
 from service.shared.jobs import SharedJobs

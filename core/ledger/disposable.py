@@ -15,7 +15,8 @@ from core.ledger.database import Lock
 from core.ledger.sqlite import SqliteConnection, SqliteLedger
 from core.ledger.statements import Statement
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class Replaced(StorageFailure):

@@ -46,8 +46,8 @@ from service.maps.schemas import (
     ReviewChanges,
 )
 from service.queries.answers import StatisticsDep
-from service.queries.given_answers import MapKey
 from service.queries.counts import VerdictCounts
+from service.queries.given_answers import MapKey
 from service.queries.statistics import QueryStatistics, map_key
 
 router = APIRouter(

@@ -16,10 +16,10 @@ from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, MapId, PlaceId, PrincipalDep, single_values
 from service.http.schemas import Parameters
 from service.queries.answers import StatisticsDep
+from service.queries.counts import HourCount
 from service.queries.given_answers import GivenAnswer
 from service.queries.recent_answers import MOST_OF_MAP
 from service.queries.schemas import EstimatedPose
-from service.queries.counts import HourCount
 from service.queries.statistics import map_key
 
 router = APIRouter(prefix="/v1/maps/{map}", tags=["queries"], dependencies=[Depends(single_values)])

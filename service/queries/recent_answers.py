@@ -43,9 +43,7 @@ def _deletion_beyond(*only: ColumnElement[bool]) -> Statement:
 _ADD = Statement(
     insert(_ANSWERS).values(map=bindparam("id"), made=bindparam("made"), answer=bindparam("answer")).inline()
 )
-_READ = Statement(
-    select(_ANSWERS.c.answer).where(*_OF_MAP).order_by(_ANSWERS.c.number.desc()).limit(bindparam("most"))
-)
+_READ = Statement(select(_ANSWERS.c.answer).where(*_OF_MAP).order_by(_ANSWERS.c.number.desc()).limit(bindparam("most")))
 _TRIM_MAP, _TRIM = _deletion_beyond(*_OF_MAP), _deletion_beyond()
 
 _JSON = TypeAdapter(GivenAnswer, config=ConfigDict(defer_build=True))

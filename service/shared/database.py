@@ -13,11 +13,11 @@ from core.ledger.postgres import PostgresLedger, prepare
 from core.ledger.tables import Tables
 from service.events import relay
 from service.peers import replica
-from service.queries import recent_answers, statistics
+from service.queries import count_tables, recent_answers
 
 TEXT = (Path(__file__).parent / "tables.sql").read_text()
 
-TABLES: Sequence[Tables] = (replica.TABLES, statistics.TABLES, recent_answers.TABLES, relay.TABLES)
+TABLES: Sequence[Tables] = (replica.TABLES, count_tables.TABLES, recent_answers.TABLES, relay.TABLES)
 """The tables of the parts that are written for both databases."""
 
 

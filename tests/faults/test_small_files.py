@@ -19,8 +19,9 @@ from core.storage import Atlas
 from service.access.keys import KeyStore
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords
+from service.queries.count_tables import statistics_file
 from service.queries.counts import Statistics
-from service.queries.statistics import QueryStatistics, statistics_file
+from service.queries.statistics import QueryStatistics
 from service.sessions.store import SessionStore, StoredSession
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES

@@ -84,9 +84,7 @@ def revisions(events: list[FeedEvent]) -> list[int]:
     return [json.loads(event.full)["revision"] for event in events]
 
 
-async def test_a_listener_hears_the_events_of_its_map_at_all_services(
-    database: SharedDatabase, tmp_path: Path
-) -> None:
+async def test_a_listener_hears_the_events_of_its_map_at_all_services(database: SharedDatabase, tmp_path: Path) -> None:
     with two_relays(database, tmp_path) as (one, other):
         one.publish(edited(0))
         with other.listening("lab") as listener:

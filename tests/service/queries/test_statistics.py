@@ -20,10 +20,11 @@ from core.ledger import Ledger, Statement
 from core.ledger.disposable import DisposableLedger
 from core.ledger.postgres import PostgresLedger
 from core.upkeep.drift import Week
-from service.queries import recent_answers, statistics
+from service.queries import count_tables, recent_answers, statistics
+from service.queries.count_tables import FILE, MOST_WEEKS, TABLES, statistics_file
 from service.queries.counts import AnswerCounts, PlaceCount, VerdictCounts
 from service.queries.given_answers import MapKey
-from service.queries.statistics import FILE, MOST_WEEKS, SPARE_PLACES, TABLES, QueryStatistics, statistics_file
+from service.queries.statistics import SPARE_PLACES, QueryStatistics
 from tests.service.shared.postgres import Postgres
 
 LAB: MapKey = ("lab", "2026-11-20T09:00:00+00:00")
@@ -62,7 +63,7 @@ def counting(request: pytest.FixtureRequest, tmp_path: Path, maps: Maps) -> Iter
     def begun() -> QueryStatistics:
         if request.param == "sqlite":
             return in_folder(tmp_path, maps)
-        ledgers.append(PostgresLedger(server.address, [statistics.TABLES, recent_answers.TABLES]))
+        ledgers.append(PostgresLedger(server.address, [TABLES, recent_answers.TABLES]))
         return QueryStatistics(ledgers[-1], 3600, lambda: maps.sizes, lambda _: maps.present, shared=True)
 
     yield begun
@@ -207,7 +208,8 @@ class Now(datetime):
 
 
 def test_the_last_day_is_counted_by_the_hour(counting: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(statistics, "datetime", Now)
+    for module in (statistics, count_tables):
+        monkeypatch.setattr(module, "datetime", Now)
     monkeypatch.setattr(Now, "moment", Now.moment)  # set back at the end
     counted = counting()
     counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
@@ -233,9 +235,11 @@ def test_the_last_day_is_counted_by_the_hour(counting: Counting, monkeypatch: py
 def test_counts_of_one_place(counting: Counting) -> None:
     counted = counting()
     counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    first = counted.of_place(LAB, "p1")
     counted.observe(LAB, "unknown", "p1", 0.1, 0.2)
     found = counted.of_place(LAB, "p1")
-    assert (found.best, found.recognized) == (2, 1) and found.last
+    assert (found.best, found.recognized) == (2, 1)
+    assert datetime.fromisoformat(found.last) >= datetime.fromisoformat(first.last)
     assert counted.of_place(LAB, "p2") == counted.of_place(HALL, "p1") == PlaceCount()
     counted.close()
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.queries.statistics import FILE, map_key
+from service.queries.count_tables import FILE
+from service.queries.statistics import map_key
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.engines import runtime_at
 from tests.service.map_jobs import enrol_frames, enrol_many, wait_until, walk_frames
