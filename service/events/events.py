@@ -68,7 +68,7 @@ class Events:
 
     def heard(self, map_id: str) -> bool:
         """Whether an event of a map would be sent or stored; call this before an event is made."""
-        return map_id in self._feeds or map_id in self._elsewhere
+        return map_id in self._feeds or (self._relay is not None and map_id in self._relay.elsewhere)
 
     def publish(self, event: Event, frame: bytes | None = None, maps: frozenset[str | None] | None = None) -> None:
         """Tell an event to the listeners of its map, if it is heard.

@@ -5,11 +5,11 @@ The tables are bounded: they have one row for each place of a map, and for each 
 
 from __future__ import annotations
 
-from collections import Counter
+import json
 from collections.abc import Callable, Collection, Mapping
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from sqlalchemy import Column, ForeignKey, MetaData, Table, UniqueConstraint, bindparam, delete, func, select
 from sqlalchemy.sql.elements import ClauseElement, ColumnElement
@@ -18,6 +18,7 @@ from core.disk.sqlite_file import DURABLE
 from core.judgement.verdict import Verdict
 from core.ledger import Connection, Ledger, Statement, Tables
 from core.ledger.disposable import DisposableLedger
+from core.ledger.rows import given_rows
 from core.ledger.sqlite import file_of
 from core.ledger.statements import Insert, among, greatest, integer, real, text
 from core.upkeep.drift import SCORE_BINS, Week
@@ -52,7 +53,7 @@ def _texts(*names: str) -> list[Column[str]]:
     return [Column(name, text(), nullable=False) for name in names]
 
 
-_VERDICTS = "recognized", "ambiguous", "unknown"
+_VERDICTS: Final = get_args(Verdict)
 _SUMS = "score", "score_squares", "decision", "decision_squares"
 _BINS = tuple(f"bin{number}" for number in range(SCORE_BINS))
 
@@ -81,11 +82,12 @@ Combination = Callable[[ColumnElement[Any], ColumnElement[Any]], ColumnElement[A
 
 
 def _putting(table: Table, combined: Combination) -> Statement:
-    """Put a row into a table, combined with the one that it has already."""
+    """Put the ``rows`` into a table, each combined with the one that it has already."""
     keys = [column.name for column in table.primary_key]
 
     def made(insert: Insert) -> ClauseElement:
-        put = insert(table).values({column.name: bindparam(column.name) for column in table.columns})
+        columns = list(table.columns)
+        put = insert(table).from_select([column.name for column in columns], given_rows("rows", columns))
         new = {one.name: combined(one, put.excluded[one.name]) for one in table.columns if one.name not in keys}
         return put.on_conflict_do_update(index_elements=keys, set_=new)
 
@@ -112,7 +114,7 @@ _NUMBER = Statement(
         .returning(_CODE)
     )
 )
-_ADD_PLACE, _ADD_WEEK, _ADD_HOUR = (_putting(table, _added) for table in (_PLACES, _WEEKS, _HOURS))
+_ADD_PLACES, _ADD_WEEKS, _ADD_HOURS = (_putting(table, _added) for table in (_PLACES, _WEEKS, _HOURS))
 _OLDEST = select(_WEEKS.c.monday).where(_of(_WEEKS)).order_by(_WEEKS.c.monday.desc()).offset(MOST_WEEKS).limit(1)
 _DELETE_WEEKS = Statement(
     delete(_WEEKS).where(_of(_WEEKS), _WEEKS.c.monday <= _OLDEST.correlate(None).scalar_subquery())
@@ -152,9 +154,11 @@ def statistics_file(directory: Path) -> DisposableLedger:
 def add_counts(connection: Connection, key: MapKey, counted: AnswerCounts) -> None:
     """Add counts of a map to those of the ledger, and delete those of weeks and hours that are too old."""
     code = _number(connection, key, counted.since)
-    connection.execute_many(_ADD_PLACE, _place_rows(code, counted.places))
-    connection.execute_many(_ADD_WEEK, [_week_row(code, week) for week in counted.weeks.values()])
-    connection.execute_many(_ADD_HOUR, _hour_rows(code, counted.hours))
+    places = [(code, place, count.best, count.recognized, count.last) for place, count in counted.places.items()]
+    hours = [(code, hour, *(counts[verdict] for verdict in _VERDICTS)) for hour, counts in counted.hours.items()]
+    connection.execute(_ADD_PLACES, rows=json.dumps(places))
+    connection.execute(_ADD_WEEKS, rows=json.dumps([_week_row(code, week) for week in counted.weeks.values()]))
+    connection.execute(_ADD_HOURS, rows=json.dumps(hours))
     connection.execute(_DELETE_WEEKS, code=code)
     connection.execute(_DELETE_HOURS, code=code, oldest=hour_of(datetime.now(UTC) - timedelta(hours=HOURS)))
 
@@ -213,7 +217,7 @@ def read_hours(ledger: Ledger, oldest: int, key: MapKey | None) -> dict[MapKey, 
 def put_calibration(connection: Connection, key: MapKey, at: str, report: str, trials: str) -> None:
     """Store the measurements of a map's calibration, in place of earlier ones."""
     code = _number(connection, key, at)
-    connection.execute(_PUT_CALIBRATION, map=code, at=at, report=report, trials=trials)
+    connection.execute(_PUT_CALIBRATION, rows=json.dumps([(code, at, report, trials)]))
 
 
 def read_calibration(connection: Connection, key: MapKey) -> tuple[datetime, str, str] | None:
@@ -229,19 +233,9 @@ def _number(connection: Connection, key: MapKey, since: str) -> int:
     return int(code)
 
 
-def _place_rows(code: int, places: Mapping[str, PlaceCount]) -> list[dict[str, Any]]:
-    return [
-        {"map": code, "id": place, "best": count.best, "recognized": count.recognized, "last": count.last}
-        for place, count in places.items()
-    ]
-
-
-def _hour_rows(code: int, hours: Mapping[int, Counter[Verdict]]) -> list[dict[str, Any]]:
-    return [{"map": code, "hour": hour, **VerdictCounts.of(counts).model_dump()} for hour, counts in hours.items()]
-
-
-def _week_row(code: int, week: Week) -> dict[str, Any]:
-    return {**vars(week), **dict(zip(_BINS, week.bins, strict=True)), "map": code, "monday": week.monday.isoformat()}
+def _week_row(code: int, week: Week) -> tuple[Any, ...]:
+    numbers = [getattr(week, name) for name in (*_VERDICTS, "blank", *_SUMS)]
+    return code, week.monday.isoformat(), *numbers, *week.bins
 
 
 def _week_of(monday: str, *counts: Any) -> Week:
