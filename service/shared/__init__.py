@@ -1,4 +1,4 @@
-"""State that any number of services share in PostgreSQL: sessions, keys, jobs, rates, statistics and events.
+"""State that any number of services share in PostgreSQL: sessions, keys, jobs and rates.
 
 Each part has its embedded twin, which keeps the same in the data directory and is the default; nothing here is imported
 unless PLACEREC_POSTGRES is set.  docs/explanation/replicas.md says what holds over all services, and at what cost.
