@@ -21,12 +21,12 @@ from service.access.keys import Keys
 from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
 from service.peers.replica import ServiceReplica
+from service.queries.count_tables import statistics_file
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.shared.database import SharedDatabase
-from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
 
 BELIEF_BYTES = 8 << 10
@@ -130,9 +130,8 @@ def of_keys(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """Adding the counts of some answers, and the answers themselves."""
     sizes, present = {KEY: ANSWERS}, {f"p{n}" for n in range(ANSWERS)}
-    embedded = QueryStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared = SharedStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared.share(database)
+    embedded = QueryStatistics(statistics_file(folder), 3600, lambda: sizes, lambda _: present)
+    shared = QueryStatistics(database, 3600, lambda: sizes, lambda _: present, shared=True)
     found = []
     for counted in (embedded, shared):
 

@@ -19,7 +19,6 @@ from core.milvus.map import MilvusMap
 from core.milvus.sweep import sweep
 from core.postgres import rows
 from core.postgres.forms import Form
-from core.postgres.map import PostgresMap
 from core.postgres.pictures.bucket import Bucket
 from core.postgres.store import PostgresStore
 from core.postgres.verification import inspect
@@ -27,7 +26,7 @@ from core.postgres.verification import inspect
 log = logging.getLogger(__name__)
 
 
-class MilvusStore(PostgresStore):
+class MilvusStore(PostgresStore[MilvusMap]):
     """Maps by id (:class:`core.maps.store.Store`), in PostgreSQL and Milvus."""
 
     def __init__(
@@ -64,8 +63,7 @@ class MilvusStore(PostgresStore):
         return self._collections[encoder]
 
     @contextmanager
-    def _deleting(self, map_: PostgresMap) -> Iterator[None]:
-        assert isinstance(map_, MilvusMap)
+    def _deleting(self, map_: MilvusMap) -> Iterator[None]:
         with map_.viewing() as (connection, _):
             keys = rows.all_keys(connection)
         yield
@@ -83,7 +81,6 @@ class MilvusStore(PostgresStore):
             UnknownMap, StorageFailure.
         """
         map_ = self.get(map_id)
-        assert isinstance(map_, MilvusMap)
         collection = map_.collection
 
         def searched(stored: Sequence[StoredPlace], descriptors: Mapping[int, bytes]) -> dict[int, str]:

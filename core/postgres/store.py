@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.ledger.maps import record
@@ -46,10 +46,12 @@ ABANDONED_SECONDS = 3600
 SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 """Between two sweeps, and after one that the servers refused."""
 
+MapT = TypeVar("MapT", bound=PostgresMap)
+
 log = logging.getLogger(__name__)
 
 
-class PostgresStore(ABC):
+class PostgresStore(ABC, Generic[MapT]):
     """Maps by id (:class:`core.maps.store.Store`).
 
     Any thread may call any method, and any number of processes may use the same maps.
@@ -64,7 +66,7 @@ class PostgresStore(ABC):
             address: such as ``postgresql://placerec@localhost/placerec``.
             bucket: where new pictures are put; None: in PostgreSQL.
         """
-        self._maps: OrderedDict[int, PostgresMap] = OrderedDict()
+        self._maps: OrderedDict[int, MapT] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
         self._sweeper: threading.Thread | None = None
@@ -74,11 +76,11 @@ class PostgresStore(ABC):
     # An engine
 
     @abstractmethod
-    def _map_of(self, state: MapState) -> PostgresMap:
+    def _map_of(self, state: MapState) -> MapT:
         """The map that was found in this state."""
 
     @abstractmethod
-    def _deleting(self, map_: PostgresMap) -> AbstractContextManager[None]:
+    def _deleting(self, map_: MapT) -> AbstractContextManager[None]:
         """What an engine does about a map that is deleted in the block."""
 
     @abstractmethod
@@ -100,7 +102,7 @@ class PostgresStore(ABC):
         local_shape: tuple[int, int] = (0, 0),
         unlisted: bool = False,
         precision: Precision = "half",
-    ) -> PostgresMap:
+    ) -> MapT:
         """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
@@ -162,7 +164,7 @@ class PostgresStore(ABC):
                 self._remove(map_id, number)
             raise
 
-    def get(self, map_id: str) -> PostgresMap:
+    def get(self, map_id: str) -> MapT:
         """A map, ready for use; the same object as long as the map is the same.
 
         Raises:
@@ -170,15 +172,15 @@ class PostgresStore(ABC):
         """
         return self._map(map_id, None)
 
-    def find(self, map_id: str) -> PostgresMap:
+    def find(self, map_id: str) -> MapT:
         """The same as :meth:`get`."""
         return self.get(map_id)
 
-    def opened(self, map_id: str) -> PostgresMap | None:
+    def opened(self, map_id: str) -> MapT | None:
         """None: only PostgreSQL knows whether a map is still there."""
         return None
 
-    def _map(self, map_id: str, number: int | None) -> PostgresMap:
+    def _map(self, map_id: str, number: int | None) -> MapT:
         self._expect_open()
         with self.database.reading() as whole:
             if number is None:
@@ -195,7 +197,7 @@ class PostgresStore(ABC):
         found.note(state)
         return found
 
-    def unlisted(self) -> dict[str, PostgresMap]:
+    def unlisted(self) -> dict[str, MapT]:
         self._expect_open()
         with self.database.reading() as connection:
             found = record.unlisted(connection)
@@ -210,7 +212,7 @@ class PostgresStore(ABC):
         """None: another service may build them; a sweep removes those that nobody has written to for a while."""
         return []
 
-    def publish(self, map_id: str) -> PostgresMap:
+    def publish(self, map_id: str) -> MapT:
         with self.database.transaction(f"publish map {map_id!r}") as connection:
             number = record.unlisted(connection).get(map_id)
             if number is None:

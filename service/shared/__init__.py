@@ -1,8 +1,8 @@
-"""State that any number of services share in PostgreSQL: sessions, jobs, statistics and events.
+"""State that any number of services share in PostgreSQL.
 
-Each part has its embedded twin, which keeps the same in the data directory and is the default; nothing here is imported
-unless PLACEREC_POSTGRES is set.  Keys, rates and the audit trail are one class each for both (``service.access``,
-``service.administration``).  docs/explanation/replicas.md says what holds over all services, and at what cost.
+Each part is one class for both databases, in its own room; this puts those together that share their state.  Nothing
+here is imported unless a PostgreSQL is set.  docs/explanation/replicas.md says what holds over all services, and at
+what cost.
 """
 
 from __future__ import annotations

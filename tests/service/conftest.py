@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import httpx
@@ -163,21 +164,12 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
+
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    """A real PostgreSQL."""
-    from tests.service.shared.postgres import running_postgres
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the data of a service that has one map."""
+    from tests.service.shared.services import prepare
 
-    with running_postgres() as postgres:
-        yield postgres
-
-
-@pytest.fixture
-def database(postgres: Postgres) -> Iterator[SharedDatabase]:
-    """The database that services share, with nothing in it."""
-    from service.shared.database import SharedDatabase
-
-    postgres.empty()
-    database = SharedDatabase(postgres.address)
-    yield database
-    database.close()
+    folder = tmp_path_factory.mktemp("prepared")
+    prepare(folder)
+    return folder

@@ -13,7 +13,6 @@ from core.maps.records import VerifyReport
 from core.maps.status import Progress, no_progress
 from core.postgres import rows
 from core.postgres.forms import Form
-from core.postgres.map import PostgresMap
 from core.postgres.pictures.bucket import Bucket
 from core.postgres.search.cache import BYTES, RowCache
 from core.postgres.search.map import CodedMap
@@ -21,7 +20,7 @@ from core.postgres.store import PostgresStore
 from core.postgres.verification import inspect
 
 
-class CodedStore(PostgresStore):
+class CodedStore(PostgresStore[CodedMap]):
     """Maps by id (:class:`core.maps.store.Store`), in PostgreSQL alone.
 
     Args:
@@ -37,7 +36,7 @@ class CodedStore(PostgresStore):
         return CodedMap(self.database, state, self.cache, self.objects)
 
     @contextmanager
-    def _deleting(self, map_: PostgresMap) -> Iterator[None]:
+    def _deleting(self, map_: CodedMap) -> Iterator[None]:
         yield
 
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:

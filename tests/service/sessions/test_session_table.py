@@ -151,7 +151,9 @@ def test_any_order_of_writes(table: SessionTable, steps: list[tuple[str, str, in
             model[name] = replace(NEW, id=name, state=state)
             table.add(model[name], MOST)
         elif kind == "renew":
-            frame = replace(known or replace(NEW, id=name), number=number, moment=number / 7, frames=number, state=state)
+            frame = replace(
+                known or replace(NEW, id=name), number=number, moment=number / 7, frames=number, state=state
+            )
             lives = known is not None and known.ended is None
             assert table.renew(frame) == lives
             if lives:
