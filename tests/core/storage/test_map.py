@@ -27,6 +27,7 @@ from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
+from core.storage.database.schema import driver_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
@@ -417,12 +418,13 @@ def test_a_deleted_map_answers_no_more(lab: Map, atlas: Atlas) -> None:
 def test_a_damaged_picture_is_not_handed_out(lab: Map, value: str) -> None:
     lab.enrol([frame("p")])
     with lab._writing() as write:
+        driver = driver_of(write.connection)
         if value == "x'00'":
-            write.connection.execute(f"UPDATE pictures SET bytes = {value}")
+            driver.execute(f"UPDATE pictures SET bytes = {value}")
         else:  # a flipped bit may change the type of a value, which the table itself does not allow
-            write.connection.execute("DROP TABLE pictures")
-            write.connection.execute("CREATE TABLE pictures (place, bytes, digest)")
-            write.connection.execute(f"INSERT INTO pictures SELECT number, {value}, x'00' FROM places")
+            driver.execute("DROP TABLE pictures")
+            driver.execute("CREATE TABLE pictures (map, row, digest, size, bytes, object)")
+            driver.execute(f"INSERT INTO pictures SELECT map, row, x'00', 1, {value}, NULL FROM places")
     for read in (lab.thumbnail, lab.picture):
         with pytest.raises(StorageFailure, match="damaged"):
             read("p")

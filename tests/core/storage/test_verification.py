@@ -9,9 +9,10 @@ import pytest
 
 from core.errors import MapQuarantined
 from core.index.flat import vectors
+from core.ledger.maps import frames
 from core.maps import MapSettings
 from core.storage import Atlas, Map
-from core.storage.database import keypoints
+from core.storage.database.schema import driver_of
 from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
@@ -40,7 +41,7 @@ def folder(directory: Path) -> Path:
 def execute(hall: Map, statement: str) -> None:
     """Behind the back of everything that keeps the map in order."""
     with hall._writing() as write:
-        write.connection.execute(statement)
+        driver_of(write.connection).execute(statement)
 
 
 def test_a_good_map(hall: Map, folder: Path) -> None:
@@ -48,9 +49,10 @@ def test_a_good_map(hall: Map, folder: Path) -> None:
     assert (report.ok, report.places, report.rows) == (True, 9, 10)
     assert (report.problems, report.stale_caches) == ([], [])
     with hall._reading() as connection:
-        _, of_keypoints = keypoints.room(connection)
+        _, of_keypoints, of_pictures = frames.room(connection)
     assert of_keypoints > 9 * 68
     assert report.checked_bytes == 10 * RECORD_BYTES + 9 * len("image 0") + of_keypoints
+    assert of_pictures == 9 * len("image 0")
 
 
 def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:
@@ -92,18 +94,18 @@ def test_a_missing_segment_does_not_hide_the_others(hall: Map, folder: Path) -> 
 
 
 def test_a_damaged_picture_is_named(hall: Map) -> None:
-    execute(hall, "UPDATE pictures SET bytes = x'00' WHERE place = 3")
+    execute(hall, "UPDATE pictures SET bytes = x'00' WHERE row = 2")
     assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
 
 
 def test_an_image_that_is_not_the_one_enrolled_is_named(hall: Map) -> None:
     digest = sha256(b"x").hexdigest()
-    execute(hall, f"UPDATE pictures SET bytes = x'78', digest = x'{digest}' WHERE place = 3")
+    execute(hall, f"UPDATE pictures SET bytes = x'78', digest = x'{digest}' WHERE row = 2")
     assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
 
 
 def test_a_picture_that_is_missing_is_named(hall: Map) -> None:
-    execute(hall, "DELETE FROM pictures WHERE place = 3")
+    execute(hall, "DELETE FROM pictures WHERE row = 2")
     assert hall.verify().problems == ["map.sqlite: place 'p2' is recorded to keep image, which is not true"]
 
 
