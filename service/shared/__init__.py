@@ -24,7 +24,7 @@ def open_database(settings: Settings) -> SharedDatabase | None:
     Raises:
         MissingExtra: the client of PostgreSQL is not installed.
     """
-    if settings.postgres is None:
+    if settings.database is None:
         return None
     try:
         from service.shared.database import SharedDatabase
@@ -32,7 +32,7 @@ def open_database(settings: Settings) -> SharedDatabase | None:
         if error.name not in ("psycopg", "psycopg_pool"):
             raise
         raise MissingExtra(
-            f"State in PostgreSQL needs {error.name}, which others do not: pip install 'placerec[milvus]', or in a"
-            " checkout .venv/bin/pip install --editable '.[milvus]'."
+            f"State in PostgreSQL needs {error.name}, which others do not: pip install 'placerec[cluster]', or in a"
+            " checkout .venv/bin/pip install --editable '.[cluster]'."
         ) from error
-    return SharedDatabase(settings.postgres.get_secret_value())
+    return SharedDatabase(settings.database.get_secret_value())

@@ -58,22 +58,28 @@ STRICT: dict[str, object] = {
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--store",
-        choices=("embedded", "milvus"),
-        default="embedded",
-        help="where the server of most tests keeps its maps; milvus starts a PostgreSQL and a Milvus",
+        choices=("files", "postgres", "milvus"),
+        default="files",
+        help="what keeps the vectors of the server of most tests; postgres and milvus start what they need",
     )
 
 
 @contextmanager
 def store_settings(kind: str) -> Iterator[dict[str, object]]:
     """The settings of a store, whose servers run as long as the block."""
-    if kind == "embedded":
+    if kind == "files":
         yield {}
+        return
+    if kind == "postgres":
+        from tests.service.shared.postgres import running_postgres
+
+        with running_postgres() as postgres:
+            yield {"database": postgres.address}
         return
     from tests.core.milvus.servers import running_servers  # needs what speaks to them
 
     with running_servers() as servers:
-        yield {"store": kind, "milvus": servers.milvus_address, "postgres": servers.postgres_address}
+        yield {"vectors": kind, "milvus": servers.milvus_address, "database": servers.postgres_address}
 
 
 @pytest.fixture(scope="session")
@@ -162,7 +168,6 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
-
 
 
 @pytest.fixture(scope="session")
