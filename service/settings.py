@@ -63,8 +63,9 @@ class Settings(BaseSettings):
     )
     vectors: Literal["auto", "files", "postgres", "milvus"] = Field(
         default="auto",
-        description="What keeps the maps' descriptors and searches them: files in the data directory, PostgreSQL with an "
-        "index in the memory of each service, or PostgreSQL with Milvus; auto: files without a database, else postgres.",
+        description="What keeps the maps' descriptors and searches them: files in the data directory, PostgreSQL with "
+        "an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a database, else "
+        "postgres.",
     )
     row_cache_bytes: int = Field(
         default=256 << 20,
@@ -91,8 +92,8 @@ class Settings(BaseSettings):
     objects: str | None = Field(
         default=None,
         pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?$",
-        description="Bucket of an S3-compatible object store, and prefix in it, to which new "
-        "pictures and thumbnails of maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
+        description="Bucket of an S3-compatible object store, and prefix in it, to which new pictures and thumbnails of "
+        "maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
     )
     objects_endpoint: str | None = Field(
         default=None,
