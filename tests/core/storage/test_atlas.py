@@ -271,6 +271,10 @@ def with_a_senseless_record(folder: Path) -> None:
     written_anew(folder, keep="everything")
 
 
+def with_another_layout(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE layout SET rows_per_segment = 5")
+
+
 def without_a_table(folder: Path) -> None:
     edit(folder.parents[1], "DROP TABLE pictures")
 
@@ -294,6 +298,7 @@ def somebody_elses(folder: Path) -> None:
         with_a_changed_record,
         with_a_changed_name,
         with_a_senseless_record,
+        with_another_layout,
         without_a_table,
         of_another_name,
         somebody_elses,

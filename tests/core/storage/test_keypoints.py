@@ -143,9 +143,9 @@ def test_damaged_ones_are_not_used_but_reported_and_found_again(
 
 def test_those_of_no_place_are_reported(lab: Map) -> None:
     lab.enrol([frame("a"), frame("b")])
-    with lab._reading() as connection:
-        driver_of(connection).execute("DELETE FROM places WHERE id = 'b'")
-        driver_of(connection).execute("DELETE FROM pictures WHERE row = 1")
+    with lab._writing() as write:
+        driver_of(write.connection).execute("DELETE FROM places WHERE id = 'b'")
+        driver_of(write.connection).execute("DELETE FROM pictures WHERE row = 1")
     assert any("pictures or keypoints of 1 rows belong to no place" in problem for problem in lab.verify().problems)
 
 

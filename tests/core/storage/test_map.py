@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,10 +24,12 @@ from core.errors import (
 )
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import Calibration
+from core.ledger.maps import frames, places
 from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
+from core.storage.database import connections
 from core.storage.database.schema import driver_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
@@ -461,3 +464,54 @@ def test_a_sequence_of_an_older_map_keeps_its_name(directory: Path, name: str) -
             lab.patch("p1", {"sequence": name})
         assert lab.forget_all(PlaceFilter(None, name), 10) == ["p0", "p2"]
         assert [one.name for one in lab.sequences(None, 10)[0]] == ["monday"]
+
+
+def statements_of(lab: Map, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[str]]:
+    """The statements that SQLite receives from now on, through the connection that writes and through all others."""
+    opened = lab._opened
+    assert opened is not None
+    written: list[str] = []
+    read: list[str] = []
+    opened.database._writer.set_trace_callback(written.append)
+    connect = connections.connect
+
+    def traced(path: Path) -> sqlite3.Connection:
+        connection = connect(path)
+        connection.set_trace_callback(read.append)
+        return connection
+
+    monkeypatch.setattr(connections, "connect", traced)
+    for reader in opened.database._idle:
+        reader.set_trace_callback(read.append)
+    return written, read
+
+
+def test_an_enrolment_is_one_transaction_that_is_synced(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.enrol([frame("p0", sequence="s", metadata={"floor": 1})])
+    written, read = statements_of(lab, monkeypatch)
+    lab.enrol([frame("p1", sequence="s", metadata={"floor": 1})])
+    assert (written[0], written[-1]) == ("BEGIN IMMEDIATE", "COMMIT")
+    words = [statement.split()[0] for statement in written]
+    assert words.count("BEGIN") == words.count("COMMIT") == 1 and set(words) <= {*SQL, "BEGIN", "COMMIT"}
+    assert read == []
+    opened = lab._opened
+    assert opened is not None
+    assert opened.database._writer.execute("PRAGMA synchronous").fetchone() == (2,)
+    assert opened.database._writer.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    written.clear()
+    lab.enrol([frame("p1", sequence="s", metadata={"floor": 1})])
+    assert not [one for one in written if one.split()[0] in SQL - {"SELECT"}], "nothing changes"
+    assert read == []
+
+
+SQL = {"SELECT", "INSERT", "UPDATE", "DELETE"}
+
+
+def test_a_reading_is_of_one_moment(lab: Map) -> None:
+    lab.enrol([frame("p0")])
+    with lab._reading() as connection:
+        stored = places.expect(connection, "p0")
+        lab.enrol([frame("p0", "another picture"), frame("p1")])
+        assert places.expect(connection, "p0") == stored and places.count(connection) == 1
+        assert frames.pictures_at(connection, [stored.row]) == {stored.row: b"thumbnail of p0"}
+    assert lab.count_places() == 2 and lab.picture("p0") == b"thumbnail of another picture"

@@ -141,12 +141,32 @@ def test_disagreement_of_store_and_snapshot(hall: Map, statement: str, problem: 
     assert any(problem in found for found in report.problems), report.problems
 
 
-def test_a_row_of_a_table_that_belongs_to_nothing(hall: Map) -> None:
-    opened = hall._opened
-    assert opened is not None
-    opened.database._writer.execute("PRAGMA foreign_keys = OFF")
-    execute(hall, "DELETE FROM sequences WHERE name = 's'")
-    assert any("belongs to nothing in sequences" in problem for problem in hall.verify().problems)
+@pytest.mark.parametrize(
+    ("statement", "problem"),
+    [
+        ("DELETE FROM sequences WHERE name = 's'", "place 'p0' is of a sequence that is missing"),
+        ("UPDATE sequences SET next_ordinal = 9 WHERE name = 's'", "sequence 's' is empty, or ends before its last"),
+        ("INSERT INTO sequences VALUES (1, 77, 't', 3)", "sequence 't' is empty, or ends before its last place"),
+        ("UPDATE maps SET places = 8", "its record counts 8 places in 10 rows, but there are 9 in 10"),
+        ("UPDATE maps SET rows = 11", "its record counts 9 places in 11 rows, but there are 9 in 10"),
+        ("UPDATE maps SET numbers = 10", "the next number of a place, 10, is not above those there are"),
+        ("UPDATE maps SET codes = 0", "the next code of a sequence, 0, is not above those there are"),
+        ("UPDATE maps SET revision = 0", "the revision, 0, is below those of places"),
+        ("UPDATE maps SET record = replace(record, 'image', 'none')", "it does not match its checksum"),
+        ("UPDATE layout SET seal = seal + 1", "it does not say how many rows a segment has"),
+        ("INSERT INTO cameras VALUES (1, 'front', NULL, NULL, '', 0)", "camera 'front' does not match its checksum"),
+        ("DELETE FROM tokens", "row 9 is not indexed correctly by its metadata"),
+        ("INSERT INTO tokens VALUES (1, 'feed', 3)", "row 3 is not indexed correctly by its metadata"),
+        ("DELETE FROM keypoints WHERE row = 3; UPDATE keypoints SET row = 3 WHERE row = 4", "keypoints of place 'p3'"),
+        ("UPDATE pictures SET row = 6 WHERE row = 5", "the pictures or keypoints of 1 rows belong to no place"),
+    ],
+)
+def test_rows_that_contradict_one_another(hall: Map, statement: str, problem: str) -> None:
+    hall.patch("p9", {"metadata": {"floor": 1}})
+    assert hall.verify().ok
+    for one in statement.split("; "):
+        execute(hall, one)
+    assert any(problem in found for found in hall.verify().problems)
 
 
 def test_places_enrolled_meanwhile_are_not_in_the_report(hall: Map, monkeypatch: pytest.MonkeyPatch) -> None:

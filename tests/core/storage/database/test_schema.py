@@ -76,13 +76,19 @@ def test_what_is_not_ours_is_refused(connection: sqlite3.Connection) -> None:
         prepare(connection)
 
 
-def test_a_missing_table_or_column_is_found(connection: sqlite3.Connection) -> None:
+@pytest.mark.parametrize(
+    ("statement", "missing"),
+    [
+        ("ALTER TABLE places DROP COLUMN regions", "lacks regions of its table 'places'"),
+        ("ALTER TABLE maps DROP COLUMN codes", "lacks codes of its table 'maps'"),
+        ("DROP TABLE segments", "of its table 'segments'"),
+        ("DROP TABLE tokens", "of its table 'tokens'"),
+    ],
+)
+def test_a_missing_table_or_column_is_found(connection: sqlite3.Connection, statement: str, missing: str) -> None:
     prepare(connection, create=True)
-    connection.execute("ALTER TABLE places DROP COLUMN regions")
-    with pytest.raises(Damage, match="regions of its table 'places'"):
-        check_schema(connection)
-    connection.execute("DROP TABLE segments")
-    with pytest.raises(Damage, match="segments"):
+    connection.execute(statement)
+    with pytest.raises(Damage, match=missing):
         check_schema(connection)
 
 
