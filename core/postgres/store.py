@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from core.errors import MapExists, StorageFailure, UnknownMap
+from core.ledger import Lock
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -130,7 +131,7 @@ class PostgresStore(ABC, Generic[MapT]):
             updated_at=now,
             **(settings or MapSettings()).model_dump(),
         )
-        with self.database.transaction(f"create map {map_id!r}") as connection:
+        with self.database.transaction(f"create map {map_id!r}", Lock.MAPS) as connection:
             number = record.create(connection, made, listed=not unlisted)
         return self._map(map_id, number)
 
@@ -157,7 +158,7 @@ class PostgresStore(ABC, Generic[MapT]):
             layout = layout_of(archive.manifest)
             Importing(archive, layout, advance, check_picture, most_picture_bytes, writing).fill()
             before_listing()
-            with self.database.transaction(f"import map {map_id!r}") as connection:
+            with self.database.transaction(f"import map {map_id!r}", Lock.MAPS) as connection:
                 record.publish(connection, number, map_id)
         except BaseException:
             with suppress(StorageFailure, UnknownMap):  # the next sweep removes it
@@ -213,7 +214,7 @@ class PostgresStore(ABC, Generic[MapT]):
         return []
 
     def publish(self, map_id: str) -> MapT:
-        with self.database.transaction(f"publish map {map_id!r}") as connection:
+        with self.database.transaction(f"publish map {map_id!r}", Lock.MAPS) as connection:
             number = record.unlisted(connection).get(map_id)
             if number is None:
                 raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
@@ -294,7 +295,7 @@ class PostgresStore(ABC, Generic[MapT]):
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
         wanted = one_more(limit)
         listing: Listing = ["maps"]
-        after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
+        after = decode_name(listing, cursor)
         self._expect_open()
         with self.database.reading() as connection:
             found = record.records_after(connection, after, wanted)

@@ -72,6 +72,8 @@ _MORE = [
     "ALTER TABLE descriptors ALTER COLUMN code SET STORAGE EXTERNAL",
     # Keys of entities and of objects are never used twice, also if their transaction fails.
     "CREATE SEQUENCE drawn_keys",
+    # A sweep looks them up by name.
+    *(f"CREATE UNIQUE INDEX {table}_by_object ON {table} (object)" for table in ("pictures", "review_frames")),
     "INSERT INTO object_store (single, folder) VALUES (1, gen_random_uuid()::text)",
     "CREATE FUNCTION note_dead_object() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN"
     " INSERT INTO dead_objects (name) VALUES (OLD.object) ON CONFLICT DO NOTHING; RETURN NULL; END $$",

@@ -47,6 +47,7 @@ _NUMBERED = Statement(select(_FRUIT.c.name).where(among(_FRUIT.c.number, "number
 _TOUCH = Statement(update(_FRUIT).where(_FRUIT.c.name == bindparam("which")).values(at=seconds_now()))
 _MOMENT = Statement(select(seconds_now() - _FRUIT.c.at, seconds_now()).where(_FRUIT.c.name == bindparam("name")))
 _DELETE = Statement(delete(_FRUIT).where(_FRUIT.c.weight < bindparam("weight")))
+_DELETE_NAMED = Statement(delete(_FRUIT).where(_FRUIT.c.name == bindparam("name")))
 
 
 def _put(ledger: Ledger, name: str, weight: float, picture: bytes | None = None) -> int:
@@ -65,6 +66,19 @@ def test_rows_are_put_replaced_found_and_deleted(open_ledger: OpenLedger) -> Non
     assert ledger.change("delete", _DELETE, weight=1.0) == 0
     third = _put(ledger, "plum", 1.0)
     assert third > second  # a number is never used twice
+
+
+@pytest.mark.parametrize("name", ["pe\0ar", "\ud800", "pear\udfff"])
+def test_a_text_that_cannot_be_stored_is_not_found(open_ledger: OpenLedger, name: str) -> None:
+    ledger = open_ledger(TABLES)
+    _put(ledger, "pear", 1.0)
+    for found in (ledger.execute("look", _MOMENT, name=name), ledger.execute("list", _NAMED, names=[name])):
+        assert found == []
+    assert ledger.execute("list", _NAMED, names=[name, "pear"]) == [("pear",)]
+    assert ledger.change("delete", _DELETE_NAMED, name=name) == 0
+    with pytest.raises((StorageFailure, UnicodeEncodeError)):
+        _put(ledger, "\ud800", 1.0)  # but it is not stored as another one
+    assert ledger.execute("list", _ALL) == [("pear", 1.0)]
 
 
 def test_the_clock_is_that_of_the_database(open_ledger: OpenLedger) -> None:

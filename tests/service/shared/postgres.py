@@ -12,7 +12,7 @@ from pathlib import Path
 import psycopg
 
 from service.shared.database import SharedDatabase
-from tests.core.milvus.servers import fixed_ports, postgres_server
+from tests.core.postgres.servers import fixed_ports, postgres_server
 
 
 class Postgres:

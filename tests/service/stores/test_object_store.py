@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.milvus.object_server import SECRET
+from tests.core.postgres.object_server import SECRET
 from tests.core.milvus.servers import Servers
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg

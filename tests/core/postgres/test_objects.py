@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -14,64 +13,61 @@ import obstore
 import pytest
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
+from core.ledger.maps import frames, places, record
 from core.ledger.maps.frames import StoredObject
 from core.maps import MapSettings, ReviewSetting
-from core.milvus import Bucket, ledger, open_store
-from core.milvus.map import MilvusMap
-from core.milvus.store import MilvusStore
+from core.postgres import rows
+from core.postgres.map import PostgresMap
+from core.postgres.pictures.bucket import Bucket
 from core.postgres.pictures.objects import Objects
-from core.storage import Atlas
+from core.postgres.search.store import CodedStore
+from core.storage.files.row_formats import COMPRESSED
+from tests.core.maps.moves import check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
-from tests.core.milvus.object_server import PORTS, object_store, reading_only
-from tests.core.milvus.servers import Server, Servers, fixed_ports
-from tests.core.milvus.test_moves import ID, imported
-from tests.core.storage.archives.conftest import filled
+from tests.core.postgres.object_server import reading_only
+from tests.core.postgres.servers import running_object_store
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.service.shared.postgres import Postgres
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
 
-def connected(servers: Servers, bucket: Bucket | None) -> MilvusStore:
-    return open_store(servers.milvus_address, servers.postgres_address, bucket=bucket)
-
-
 @pytest.fixture
-def store(servers: Servers) -> Iterator[MilvusStore]:
-    store = connected(servers, servers.bucket)
+def store(postgres: Postgres, bucket: Bucket) -> Iterator[CodedStore]:
+    store = CodedStore(postgres.address, bucket)
     yield store
-    for record in store.records(None, 100)[0]:
-        store.delete(record.id)
+    for one in store.records(None, 100)[0]:
+        store.delete(one.id)
     store.close()
 
 
 @pytest.fixture
-def lab(store: MilvusStore) -> MilvusMap:
+def lab(store: CodedStore) -> PostgresMap:
     return store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
 
 
 @pytest.fixture
-def objects(servers: Servers) -> Iterator[Objects]:
-    objects = Objects(servers.bucket)
+def objects(bucket: Bucket) -> Iterator[Objects]:
+    objects = Objects(bucket)
     yield objects
     objects.close()
 
 
-def where(lab: MilvusMap, place_id: str) -> StoredObject:
+def where(lab: PostgresMap, place_id: str) -> StoredObject:
     """Where the picture of a place is."""
     with lab.viewing() as (connection, _):
-        entry = ledger.find(connection, lab.number, place_id)
-        assert entry is not None
-        kept = ledger.pictures_of(connection, lab.number, [entry.row])[entry.row]
-    assert isinstance(kept, StoredObject)
-    return kept
+        row = places.expect(connection, place_id).row
+        stored = frames.pictures_at(connection, [row])[row]
+    assert isinstance(stored, StoredObject)
+    return stored
 
 
-def folder_of(store: MilvusStore) -> str:
-    with store._database.reading() as connection:
-        return ledger.objects_folder(connection)
+def folder_of(store: CodedStore) -> str:
+    with store.database.reading() as connection:
+        return rows.objects_folder(connection)
 
 
-def names_in(objects: Objects, store: MilvusStore) -> set[str]:
+def names_in(objects: Objects, store: CodedStore) -> set[str]:
     """All objects."""
     folder = folder_of(store)
     return {name for page in objects.names_after(folder, folder) for name in page}
@@ -81,29 +77,20 @@ def image_of(name: str) -> bytes:
     return f"image of {name}".encode()
 
 
-def test_a_map_with_objects_is_the_same_map(store: MilvusStore, servers: Servers, tmp_path: Path) -> None:
-    here, back = Atlas(tmp_path / "here"), Atlas(tmp_path / "back")
-    files = [tmp_path / f"{number}.tar" for number in range(3)]
-    first = filled(here.create(ID, ENCODER, DIMENSION, MapSettings(), LOCAL_SHAPE))
-    first.exporter.write(files[0])
-    second = imported(store, files[0])
-    second.exporter.write(files[1])
-    imported(back, files[1]).exporter.write(files[2])
-    assert files[0].read_bytes() == files[1].read_bytes() == files[2].read_bytes()
-    places = second.places(None, 100)[0]
-    assert {place.picture for place in places} >= {"image", "thumbnail"}
-    for place in places:
-        assert second.picture(place.id) == first.picture(place.id)
-    assert store.verify(ID).ok
-    room = second.storage_status()
-    kept = sum(len(first.picture(place.id) or b"") for place in places)
-    assert room.keypoints is not None and room.database == kept + room.keypoints.bytes
-    here.close()
-    back.close()
+@pytest.mark.parametrize("precision", ["half", COMPRESSED])
+def test_a_map_with_objects_is_the_same_map(store: CodedStore, tmp_path: Path, precision: str) -> None:
+    check_moves(store, tmp_path, precision)
 
 
-def test_old_pictures_stay_where_they_are(store: MilvusStore, lab: MilvusMap, servers: Servers) -> None:
-    without = connected(servers, None)
+def test_the_room_of_objects_counts(lab: PostgresMap) -> None:
+    lab.enrol([frame("a"), frame("b")])
+    room = lab.storage_status()
+    assert room.keypoints is not None
+    assert room.database == len(image_of("a")) + len(image_of("b")) + room.keypoints.bytes
+
+
+def test_old_pictures_stay_where_they_are(store: CodedStore, lab: PostgresMap, postgres: Postgres) -> None:
+    without = CodedStore(postgres.address)
     before = without.get("lab")
     before.enrol([frame("old"), frame("replaced")])
     assert lab.picture("old") == image_of("old")
@@ -116,7 +103,7 @@ def test_old_pictures_stay_where_they_are(store: MilvusStore, lab: MilvusMap, se
     without.close()
 
 
-def test_frames_for_review(store: MilvusStore, lab: MilvusMap, objects: Objects, servers: Servers) -> None:
+def test_frames_for_review(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
     setting = ReviewSetting(most_frames=2)
     store.sweep_objects()
     before = names_in(objects, store)
@@ -131,11 +118,11 @@ def test_frames_for_review(store: MilvusStore, lab: MilvusMap, objects: Objects,
         lab.review.picture(kept[1].number)
 
 
-def test_a_page_for_review_is_of_one_moment(store: MilvusStore, lab: MilvusMap) -> None:
+def test_a_page_for_review_is_of_one_moment(store: CodedStore, lab: PostgresMap) -> None:
     check_pages_are_of_one_moment(lab.review, store.get("lab").review)
 
 
-def test_lost_and_damaged_objects_are_reported(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
+def test_lost_and_damaged_objects_are_reported(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
     lab.enrol([frame(name) for name in ("whole", "lost", "damaged")])
     objects.delete([where(lab, "lost").name])
     objects.put({where(lab, "damaged").name: b"image of daMaged"})
@@ -147,14 +134,14 @@ def test_lost_and_damaged_objects_are_reported(store: MilvusStore, lab: MilvusMa
     assert lab.picture("whole") == image_of("whole")
 
 
-def test_pictures_go_after_their_rows(store: MilvusStore, lab: MilvusMap, objects: Objects) -> None:
+def test_pictures_go_after_their_rows(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
     """Those of deleted places and maps, and those of writes that died, but none that is being written or exported."""
     lab.enrol([frame("stays"), frame("goes")])
     other = store.create("other", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     other.enrol([frame("goes-too")])
     stays, goes, too = where(lab, "stays").name, where(lab, "goes").name, where(other, "goes-too").name
     with lab.viewing() as (connection, _):
-        last = ledger.last_key(connection)
+        last = rows.last_key(connection.whole)
     folder = folder_of(store)
     litter, later = f"{folder}/{last:016x}-dead", f"{folder}/{last + 1000:016x}-alive"
     objects.put({litter: b"?", later: b"?"})
@@ -167,7 +154,7 @@ def test_pictures_go_after_their_rows(store: MilvusStore, lab: MilvusMap, object
     assert store.sweep_objects() == 1 and too not in names_in(objects, store)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("core.milvus.ledger.LEFT_SECONDS", 0)
+        patched.setattr("core.postgres.rows.LEFT_SECONDS", 0)
         lab.forget("goes")
     assert goes in names_in(objects, store)
     store.sweep_objects()
@@ -176,16 +163,16 @@ def test_pictures_go_after_their_rows(store: MilvusStore, lab: MilvusMap, object
 
 
 def test_what_is_being_written_stays(
-    store: MilvusStore, lab: MilvusMap, objects: Objects, monkeypatch: pytest.MonkeyPatch
+    store: CodedStore, lab: PostgresMap, objects: Objects, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    update, written, go_on = ledger.update, threading.Event(), threading.Event()
+    put_counters, written, go_on = record.put_counters, threading.Event(), threading.Event()
 
     def slow(*args: object) -> None:
         written.set()
         assert go_on.wait(60)
-        update(*args)  # type: ignore[arg-type]
+        put_counters(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(ledger, "update", slow)
+    monkeypatch.setattr(record, "put_counters", slow)
     threads = [threading.Thread(target=work) for work in (lambda: lab.enrol([frame("a")]), store.sweep_objects)]
     threads[0].start()
     assert written.wait(60)
@@ -197,8 +184,7 @@ def test_what_is_being_written_stays(
     assert lab.picture("a") == image_of("a")
 
 
-def refusing(servers: Servers) -> dict[str, tuple[Bucket, str]]:
-    bucket = servers.bucket
+def refusing(bucket: Bucket) -> dict[str, tuple[Bucket, str]]:
     return {
         "nobody there": (
             replace(bucket, endpoint="http://127.0.0.1:9"),
@@ -212,11 +198,11 @@ def refusing(servers: Servers) -> dict[str, tuple[Bucket, str]]:
     }
 
 
-def test_a_store_that_refuses(store: MilvusStore, lab: MilvusMap, servers: Servers) -> None:
+def test_a_store_that_refuses(lab: PostgresMap, postgres: Postgres, bucket: Bucket) -> None:
     """Each refusal says why; nothing is changed, nothing stays behind, and queries are answered."""
     lab.enrol([frame("a")])
-    for name, (bucket, why) in refusing(servers).items():
-        other = connected(servers, bucket)
+    for name, (refused, why) in refusing(bucket).items():
+        other = CodedStore(postgres.address, refused)
         there = other.get("lab")
         with pytest.raises(StoreUnavailable, match=why):
             other.check_pictures()
@@ -224,8 +210,8 @@ def test_a_store_that_refuses(store: MilvusStore, lab: MilvusMap, servers: Serve
         with pytest.raises(StoreUnavailable, match=why):
             there.enrol([frame("b"), frame("c")])
         other.check_writable()
-        ((rows, _),) = there.scope().search(descriptor_of("a")[np.newaxis])
-        assert [place.id for place in there.places_at(rows.tolist()) if place] == ["a"], name
+        ((found, _),) = there.scope().search(descriptor_of("a")[np.newaxis])
+        assert [place.id for place in there.places_at(found.tolist()) if place] == ["a"], name
         if name == "only readable":
             assert there.picture("a") == image_of("a")
         else:
@@ -239,29 +225,23 @@ def test_a_store_that_refuses(store: MilvusStore, lab: MilvusMap, servers: Serve
     assert lab.count_places() == 1 and lab.picture("a") == image_of("a")
 
 
-def test_a_full_store(store: MilvusStore, lab: MilvusMap, servers: Servers, tmp_path: Path) -> None:
+def test_a_full_store(lab: PostgresMap, postgres: Postgres, tmp_path: Path) -> None:
     lab.enrol([frame("a")])
-    command, bucket, answers = object_store(
-        tmp_path, fixed_ports(PORTS), "-volume.max=1", "-master.volumeSizeLimitMB=1"
-    )
-    server = Server(command, tmp_path, answers)
-    server.start()
-    try:
-        other = connected(servers, bucket)
+    little_room = "-volume.max=1", "-master.volumeSizeLimitMB=1"
+    with running_object_store(tmp_path, *little_room) as bucket:
+        other = CodedStore(postgres.address, bucket)
         there = other.get("lab")
         large = np.random.default_rng(0).bytes(400_000)
-        kept = []
+        stored = []
         with pytest.raises((StorageFull, StoreUnavailable), match="takes no pictures: 500 Internal Server Error"):
             for number in range(10):
                 there.enrol([replace(frame(f"b{number}"), image=large)])
-                kept.append(f"b{number}")
-        assert kept and [place.id for place in there.places(None, 100)[0]] == ["a", *kept]
-        assert all(there.picture(name) == large for name in kept)
+                stored.append(f"b{number}")
+        assert stored and [place.id for place in there.places(None, 100)[0]] == ["a", *stored]
+        assert all(there.picture(name) == large for name in stored)
         with pytest.raises(StorageFailure, match="takes no pictures"):
             other.check_pictures()
         other.close()
-    finally:
-        server.end(signal.SIGKILL)  # it would take its time
 
 
 @pytest.mark.parametrize(
