@@ -92,8 +92,8 @@ class Settings(BaseSettings):
     objects: str | None = Field(
         default=None,
         pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?$",
-        description="Bucket of an S3-compatible object store, and prefix in it, to which new pictures and thumbnails of "
-        "maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
+        description="Bucket of an S3-compatible object store, and prefix in it, to which new pictures and thumbnails "
+        "of maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
     )
     objects_endpoint: str | None = Field(
         default=None,

@@ -48,6 +48,14 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
     return statistics.median(taken[3:])
 
 
+def _renew(table: SessionTable, session: SessionRecord, number: int) -> None:
+    table.renew(replace(session, revision=number))
+
+
+def _look(table: SessionTable, _number: int) -> None:
+    table.head("s-1")
+
+
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A frame of a session: the look before it and the write after it."""
     file = session_file(folder)
@@ -59,8 +67,8 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     for ledger in (file, database):
         table = SessionTable(ledger)
         table.add(session, 100)
-        saved.append(median(rounds, lambda number, table=table: table.renew(replace(session, revision=number))))
-        read.append(median(rounds, lambda _, table=table: table.head("s-1")))
+        saved.append(median(rounds, partial(_renew, table, session)))
+        read.append(median(rounds, partial(_look, table)))
     print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
     file.close()
