@@ -21,12 +21,12 @@ from service.access.keys import Keys
 from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
 from service.peers.replica import ServiceReplica
+from service.queries.count_tables import statistics_file
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.shared.database import SharedDatabase
-from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
 
 BELIEF_BYTES = 8 << 10
@@ -48,6 +48,14 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
     return statistics.median(taken[3:])
 
 
+def _renew(table: SessionTable, session: SessionRecord, number: int) -> None:
+    table.renew(replace(session, revision=number))
+
+
+def _head(table: SessionTable, _number: int) -> None:
+    table.head("s-1")
+
+
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A frame of a session: the look before it and the write after it."""
     file = session_file(folder)
@@ -59,8 +67,8 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
     for ledger in (file, database):
         table = SessionTable(ledger)
         table.add(session, 100)
-        saved.append(median(rounds, lambda number, table=table: table.renew(replace(session, revision=number))))  # type: ignore[misc]
-        read.append(median(rounds, lambda _, table=table: table.head("s-1")))  # type: ignore[misc]
+        saved.append(median(rounds, partial(_renew, table, session)))
+        read.append(median(rounds, partial(_head, table)))
     print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
     file.close()
@@ -130,9 +138,8 @@ def of_keys(folder: Path, database: SharedDatabase, rounds: int) -> None:
 def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """Adding the counts of some answers, and the answers themselves."""
     sizes, present = {KEY: ANSWERS}, {f"p{n}" for n in range(ANSWERS)}
-    embedded = QueryStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared = SharedStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared.share(database)
+    embedded = QueryStatistics(statistics_file(folder), 3600, lambda: sizes, lambda _: present)
+    shared = QueryStatistics(database, 3600, lambda: sizes, lambda _: present, shared=True)
     found = []
     for counted in (embedded, shared):
 

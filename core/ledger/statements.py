@@ -100,7 +100,7 @@ class Statement:
         expression = given if isinstance(given, ClauseElement) else given(INSERTS[name])
         made = expression.compile(dialect=DIALECTS[name])
         assert isinstance(made, SQLCompiler)
-        constants = {key: value for key, value in made.params.items() if value is not None}
+        constants = {key: made.params[key] for bind, key in made.bind_names.items() if not bind.required}
         names = None if made.positiontup is None else tuple(made.positiontup)
         return Compiled(str(made), names, constants, finds=not (made.isinsert or made.isupdate))
 
@@ -181,6 +181,44 @@ def _joined_in_sqlite(element: joined, compiler: SQLCompiler, **_: Any) -> str:
 @compiles(joined, "postgresql")
 def _joined_in_postgresql(element: joined, compiler: SQLCompiler, **_: Any) -> str:
     return f"string_agg(({compiler.process(element.clauses)})::text, ',')"
+
+
+class rounded(FunctionElement[float]):  # noqa: N801
+    """A number, rounded to some decimal digits."""
+
+    inherit_cache = True
+    name = "rounded"
+    type = Float(53)
+
+
+@compiles(rounded, "sqlite")
+def _rounded_in_sqlite(element: rounded, compiler: SQLCompiler, **_: Any) -> str:
+    return f"round({compiler.process(element.clauses)})"
+
+
+@compiles(rounded, "postgresql")
+def _rounded_in_postgresql(element: rounded, compiler: SQLCompiler, **_: Any) -> str:
+    number, digits = element.clauses
+    return f"round(({compiler.process(number)})::numeric, {compiler.process(digits)})"
+
+
+class json_list(FunctionElement[str]):  # noqa: N801
+    """The values of a column of all rows, in their order, as a list in JSON: text, numbers and NULL."""
+
+    inherit_cache = True
+    name = "json_list"
+    type = String()
+
+
+@compiles(json_list, "sqlite")
+def _list_in_sqlite(element: json_list, compiler: SQLCompiler, **_: Any) -> str:
+    return f"json_group_array({compiler.process(element.clauses)})"
+
+
+@compiles(json_list, "postgresql")
+def _list_in_postgresql(element: json_list, compiler: SQLCompiler, **_: Any) -> str:
+    value = f"coalesce(to_json({compiler.process(element.clauses)})::text, 'null')"
+    return f"'[' || coalesce(string_agg({value}, ','), '') || ']'"
 
 
 def text() -> TypeEngine[str]:

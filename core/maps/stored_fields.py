@@ -52,7 +52,9 @@ def field_columns(fields: PlaceFields) -> dict[str, Any]:
     Raises:
         InvalidField: the metadata cannot be written as JSON.
     """
-    columns: dict[str, Any] = {name: getattr(fields.pose, name) if fields.pose else None for name in POSE_VALUES}
+    pose: dict[str, float | None] = {name: getattr(fields.pose, name, None) for name in POSE_VALUES}
+    # SQLite stores -0.0 as 0.0, which the checksum of a row would distinguish.
+    columns: dict[str, Any] = {name: None if value is None else value + 0.0 for name, value in pose.items()}
     columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
     columns["camera"] = fields.camera
     columns["metadata"] = metadata_text(fields.metadata)

@@ -47,13 +47,12 @@ ABANDONED_SECONDS = 3600
 SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 """Between two sweeps, and after one that the servers refused."""
 
+MapT = TypeVar("MapT", bound=PostgresMap)
+
 log = logging.getLogger(__name__)
 
-Made = TypeVar("Made", bound=PostgresMap)
-"""The map of an engine."""
 
-
-class PostgresStore(ABC, Generic[Made]):
+class PostgresStore(ABC, Generic[MapT]):
     """Maps by id (:class:`core.maps.store.Store`).
 
     Any thread may call any method, and any number of processes may use the same maps.
@@ -68,7 +67,7 @@ class PostgresStore(ABC, Generic[Made]):
             address: such as ``postgresql://placerec@localhost/placerec``.
             bucket: where new pictures are put; None: in PostgreSQL.
         """
-        self._maps: OrderedDict[int, Made] = OrderedDict()
+        self._maps: OrderedDict[int, MapT] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
         self._sweeper: threading.Thread | None = None
@@ -78,11 +77,11 @@ class PostgresStore(ABC, Generic[Made]):
     # An engine
 
     @abstractmethod
-    def _map_of(self, state: MapState) -> Made:
+    def _map_of(self, state: MapState) -> MapT:
         """The map that was found in this state."""
 
     @abstractmethod
-    def _deleting(self, map_: Made) -> AbstractContextManager[None]:
+    def _deleting(self, map_: MapT) -> AbstractContextManager[None]:
         """What an engine does about a map that is deleted in the block."""
 
     @abstractmethod
@@ -104,7 +103,7 @@ class PostgresStore(ABC, Generic[Made]):
         local_shape: tuple[int, int] = (0, 0),
         unlisted: bool = False,
         precision: Precision = "half",
-    ) -> Made:
+    ) -> MapT:
         """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
@@ -166,7 +165,7 @@ class PostgresStore(ABC, Generic[Made]):
                 self._remove(map_id, number)
             raise
 
-    def get(self, map_id: str) -> Made:
+    def get(self, map_id: str) -> MapT:
         """A map, ready for use; the same object as long as the map is the same.
 
         Raises:
@@ -174,15 +173,15 @@ class PostgresStore(ABC, Generic[Made]):
         """
         return self._map(map_id, None)
 
-    def find(self, map_id: str) -> Made:
+    def find(self, map_id: str) -> MapT:
         """The same as :meth:`get`."""
         return self.get(map_id)
 
-    def opened(self, map_id: str) -> Made | None:
+    def opened(self, map_id: str) -> MapT | None:
         """None: only PostgreSQL knows whether a map is still there."""
         return None
 
-    def _map(self, map_id: str, number: int | None) -> Made:
+    def _map(self, map_id: str, number: int | None) -> MapT:
         self._expect_open()
         with self.database.reading() as whole:
             if number is None:
@@ -199,7 +198,7 @@ class PostgresStore(ABC, Generic[Made]):
         found.note(state)
         return found
 
-    def unlisted(self) -> dict[str, Made]:
+    def unlisted(self) -> dict[str, MapT]:
         self._expect_open()
         with self.database.reading() as connection:
             found = record.unlisted(connection)
@@ -214,7 +213,7 @@ class PostgresStore(ABC, Generic[Made]):
         """None: another service may build them; a sweep removes those that nobody has written to for a while."""
         return []
 
-    def publish(self, map_id: str) -> Made:
+    def publish(self, map_id: str) -> MapT:
         with self.database.transaction(f"publish map {map_id!r}", Lock.MAPS) as connection:
             number = record.unlisted(connection).get(map_id)
             if number is None:

@@ -22,7 +22,7 @@ from core.maps.selection import Selection
 from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
 from core.places import Place
 from core.storage.archives.exporter import Exporter
-from core.storage.database.connections import DatabaseClosed, begin_reading
+from core.storage.database.connections import DatabaseClosed, at_one_moment, read_now
 from core.storage.database.segments import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, named_damage, open_map
 from core.storage.review import FILE as REVIEW_FILE
@@ -266,7 +266,7 @@ class Map(LedgerMap):
     def _reading(self) -> Iterator[MapConnection]:
         with self._guarded("read"):
             try:
-                with self._expect_open().database.reading() as connection:
+                with self._expect_open().database.reading() as connection, at_one_moment(connection):
                     yield connection
                 return
             except DatabaseClosed:
@@ -349,5 +349,5 @@ class Map(LedgerMap):
             with self._lock:
                 snapshot = self.snapshot()
                 connection = stack.enter_context(self._reading())
-                begin_reading(connection)
+                read_now(connection)
             return inspect(self._folder, connection, snapshot, progress)

@@ -37,7 +37,7 @@ from core.storage.database.schema import (
     driver_of,
     prepare,
     rebuild_metadata_index,
-    wrong_sequences,
+    wrong_references,
 )
 from core.storage.database.segments import SegmentEntry, put_rows_per_segment, rows_per_segment, segment_entries
 from core.storage.database.write_ahead_log import check_log
@@ -194,7 +194,7 @@ def _check_rows(folder: Path, connection: MapConnection) -> None:
             raise Damage(f"{FILE}: {line}")
     if broken := places.unsound(connection):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := wrong_sequences(connection):
+    if found := wrong_references(connection):
         raise Damage(f"{FILE}: {found[0]}")
     if found := places.stale_tokens(connection):  # it can be made again from the places, which are sound
         log.warning("The index of the metadata of map %s is rebuilt: %s.", folder.name, found[0])

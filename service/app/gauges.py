@@ -41,7 +41,7 @@ class RuntimeCollector(Collector):
         yield _gauge("placerec_storage_threads_busy", "Storage threads that are busy.", busy)
         yield _gauge("placerec_storage_threads_waited_for", "Requests that wait for a storage thread.", waiting)
         yield _gauge("placerec_sessions", "Open sessions.", runtime.sessions.count())
-        yield _gauge("placerec_job_watchers", "Clients that follow jobs.", runtime.jobs.watchers)
+        yield _gauge("placerec_job_watchers", "Clients that follow jobs.", len(runtime.jobs.watchers))
         listeners = runtime.engine.events.listeners
         yield _gauge("placerec_event_listeners", "Clients that listen to the events of maps.", listeners)
         dropped = runtime.engine.review_keeper.dropped

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -16,6 +14,7 @@ from starlette.datastructures import State
 
 from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
+from service.app.probe import Probe
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
@@ -36,15 +35,13 @@ from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
 from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.upkeep.similarity import Matrices
-from service.worker_threads import in_thread
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
     from service.shared.state import SharedState
 
-DISK_CHECK_SECONDS = 1.0
-PICTURES_CHECK_SECONDS = 5.0
-"""The disk and the object store are checked at most this often; a probe that comes sooner gets the last result."""
+CHECK_SECONDS, PICTURES_CHECK_SECONDS = 1.0, 5.0
+"""The disk, the database and the object store are checked at most this often."""
 
 log = logging.getLogger("placerec.runtime")
 
@@ -85,10 +82,13 @@ class Runtime:
         self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
-        self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
         self._not_ready = ""
-        self._pictures_check: asyncio.Task[str] | None = None
-        self._pictures_checked = 0.0
+        maps, folder = self.engine.maps, partial(check_writable, settings.data_dir)
+        own = settings.engine == "files"
+        self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
+        self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
+        silent = "The object store does not answer."
+        self._pictures = Probe(maps.check_pictures, PICTURES_CHECK_SECONDS, silent)
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -165,13 +165,10 @@ class Runtime:
         Raises:
             NotReady: at least one is not "ok".
         """
-        now = time.monotonic()
-        if now - self._disk_checked > DISK_CHECK_SECONDS:
-            self._disk_checked = now
-            self._maps_state, self._disk_state = await in_thread(self._check_store)
         encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
-        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": self._maps_state}
-        checks["disk"] = self._disk_state
+        checks = {"encoder": encoder if encoder != "ok" else encoders}
+        checks["maps"] = "ok" if self._database is None else await self._database.outcome()
+        checks["disk"] = await self._disk.outcome()
         if self.shared is not None:
             checks["replica"] = self.shared.replica.state
         if self.stopping:
@@ -179,7 +176,7 @@ class Runtime:
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
         self._note_readiness("; ".join(bad))
         if self.settings.objects is not None:
-            checks["pictures"] = await self._check_pictures()
+            checks["pictures"] = await self._pictures.outcome()
         if self.shared is not None:
             checks["others"] = self.shared.differences.state
         if bad:
@@ -196,31 +193,6 @@ class Runtime:
         elif before and not bad:
             log.info("the service is ready")
 
-    async def _check_pictures(self) -> str:
-        """The state of the object store; queries do without it, so nobody waits long for it here."""
-        check = self._pictures_check
-        sound = check is not None and check.done() and check.result() == "ok"
-        wait = PICTURES_CHECK_SECONDS if sound else DISK_CHECK_SECONDS
-        if check is None or (check.done() and time.monotonic() - self._pictures_checked > wait):
-            self._pictures_checked = time.monotonic()
-            check = self._pictures_check = asyncio.create_task(in_thread(_outcome, self.engine.maps.check_pictures))
-        await asyncio.wait({check}, timeout=1.0)
-        return check.result() if check.done() else "The object store does not answer."
-
-    def _check_store(self) -> tuple[str, str]:
-        """The states of the servers that have the maps, if there are such, and of the disk."""
-        if self.settings.store == "embedded":
-            return "ok", _outcome(self.engine.maps.check_writable)
-        return _outcome(self.engine.maps.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
-
-
-def _outcome(check: Callable[[], None]) -> str:
-    try:
-        check()
-    except PlacerecError as error:
-        return str(error)
-    return "ok"
-
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
     return Jobs.of_directory(
@@ -236,4 +208,4 @@ def _jobs(settings: Settings, engine: Engine) -> Jobs:
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database, shared_maps=settings.store != "embedded")
+    return SharedState(settings, database, shared_maps=settings.engine != "files")

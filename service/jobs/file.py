@@ -12,7 +12,7 @@ from core.disk.sqlite_file import DURABLE
 from core.ledger.sqlite import SqliteLedger, file_of
 from service.jobs.job import Job
 from service.jobs.rows import DAMAGED, READ, TABLES, job_of, values_of
-from service.jobs.table import PUT
+from service.jobs.statements import PUT
 
 FILE = "jobs.sqlite"
 

@@ -7,15 +7,14 @@ the points where it calls :meth:`JobContext.check_cancelled`.
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
 import secrets
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,15 +24,15 @@ from core.disk.files import Damage
 from core.errors import PlacerecError, StorageFailure, StorageFull, StoreUnavailable
 from core.ledger import Ledger
 from service.access.audit import ASKER, asker_of_fields, note_job, now_asking
-from service.errors.faults import JobLost, TooManyWatchers, UnknownJob
+from service.errors.faults import JobLost, UnknownJob
 from service.errors.problems import problem_of
 from service.events.events import Events
-from service.events.schemas import JobEvent
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
 from service.jobs.file import open_file
 from service.jobs.job import Job, JobState
 from service.jobs.rows import DAMAGED
 from service.jobs.table import JobTable
+from service.jobs.watchers import Watchers
 from service.peers.alone import Alone
 from service.peers.peers import Peers
 
@@ -41,9 +40,6 @@ __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jo
 
 MOST_RESULT_BYTES = 4 << 20
 """The longest result, as JSON, that a job may have."""
-
-TELLING_SECONDS = 1.0
-"""The shortest time between two events of a job's progress."""
 
 REFUSALS = (StorageFull, StorageFailure, Damage)
 """The errors of a database that refuses, and may do so no longer after a while."""
@@ -97,9 +93,9 @@ class Jobs:
         events: Events | None = None,
     ) -> None:
         self._peers, self._shared_maps, self._workers = peers, shared_maps, workers
-        self._longest_queue, self._most_watchers, self._events = longest_queue, most_watchers, events
+        self._longest_queue = longest_queue
+        self.watchers = Watchers(most_watchers, events)
         self._table = JobTable(ledger, peers, longest_queue, history)
-        self._published: dict[str, tuple[str, float]] = {}  # of running jobs: the state published last, and when
         self.stopping = False
         self._changed = threading.Condition()  # held while a job is changed in memory
         self._kinds: dict[str, Work] = {}
@@ -111,7 +107,6 @@ class Jobs:
         self._resumed = False  # whether the jobs of the last run wait again, or have ended
         self._news = 0  # grows whenever there may be a job to take
         self._counts: Counter[JobState] = Counter()  # over all services, some seconds ago
-        self._watchers: list[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = []
         self._threads: list[threading.Thread] = []
         self._put_aside: str | None = None  # the name of a damaged file
         self._close_ledger: Callable[[], None] = lambda: None
@@ -163,7 +158,7 @@ class Jobs:
         with self._changed:
             self.stopping = True
             self._changed.notify_all()
-        self._wake(None)
+        self.watchers.wake(None)
 
     def close(self, timeout: float = 10.0) -> None:
         """Stop, and wait at most ``timeout`` seconds for running jobs; those that go on count as killed."""
@@ -217,11 +212,11 @@ class Jobs:
         elif self._discards and (job := self._table.get(job_id)) is not None and job.ended:
             self._discard(job)
         self._rouse()
-        self._wake(job_id or None)
+        self.watchers.wake(job_id or None)
 
     def _announce(self, job: Job) -> None:
         """Notify everybody who follows a job, and the other services."""
-        self._notify(job)
+        self.watchers.notify(job)
         if job.state != "running":
             self._rouse()
         with suppress(PlacerecError):  # others look by themselves after a while
@@ -287,11 +282,6 @@ class Jobs:
         """How many of the jobs that are remembered are in each state; never waits."""
         return self._table.counts() if self._peers.alone else self._counts
 
-    @property
-    def watchers(self) -> int:
-        """The number of clients that follow jobs now."""
-        return len(self._watchers)
-
     def get(self, job_id: str) -> Job:
         """The present state of a job.
 
@@ -335,22 +325,6 @@ class Jobs:
             self._mirror([job], {(job_id, job.attempt): job.cancelling})
         self._announce(job)
         return job
-
-    @contextmanager
-    def watching(self, job_id: str) -> Iterator[asyncio.Event]:
-        """An event of the running loop that is set whenever the job changes, or when the service stops.
-
-        Raises:
-            TooManyWatchers: too many clients follow jobs already.
-        """
-        if len(self._watchers) >= self._most_watchers:
-            raise TooManyWatchers("Too many clients follow jobs already; read the job instead, or try again later.")
-        watcher = (job_id, asyncio.get_running_loop(), asyncio.Event())
-        self._watchers.append(watcher)
-        try:
-            yield watcher[2]
-        finally:
-            self._watchers.remove(watcher)
 
     # The workers
 
@@ -476,7 +450,7 @@ class Jobs:
                     return None
                 if self._peers.alone and not refused:  # nobody else can do it meanwhile
                     self._jobs[job.id] = job
-                    self._notify(job)
+                    self.watchers.notify(job)
                 refused = True
                 time.sleep(RETRY_SECONDS)
 
@@ -509,7 +483,7 @@ class Jobs:
             self._write(job)
             self._announce(job)
         elif noticing:
-            self._notify(job)
+            self.watchers.notify(job)
 
     def _write(self, job: Job) -> None:
         try:
@@ -532,47 +506,6 @@ class Jobs:
         if self._persist(noted, self._table.note, (StoreUnavailable,)) is None:
             self._lost.add(job_id)
             raise JobInterrupted
-
-    def _wake(self, job_id: str | None) -> None:
-        """Wake those who follow a job here; all for None."""
-        for watched, loop, event in self._watchers.copy():
-            if job_id in (None, watched):
-                with suppress(RuntimeError):  # its loop has ended
-                    loop.call_soon_threadsafe(event.set)
-
-    def _notify(self, job: Job) -> None:
-        """Publish the state of a job, and wake those who follow it here."""
-        self._tell(job)
-        self._wake(job.id)
-
-    def _tell(self, job: Job) -> None:
-        """Publish the state of a job to the listeners of its maps; mere progress at most once in a while."""
-        used, events = job.used_maps(), self._events
-        if events is None or not any(events.heard(name) for name in used if name is not None):
-            self._published.pop(job.id, None)
-            return
-        state, now = f"{job.state} {job.cancelling}", time.monotonic()
-        published, moment = self._published.get(job.id, ("", 0.0))
-        if published == state and now - moment < TELLING_SECONDS:
-            return
-        self._published[job.id] = (state, now)
-        if job.ended:
-            self._published.pop(job.id, None)
-        for name in used - {None}:
-            events.publish(_event(str(name), job), maps=frozenset(used))
-
-
-def _event(map_id: str, job: Job) -> JobEvent:
-    return JobEvent.now(
-        map_id,
-        asker_of_fields(job.asker),
-        job=job.id,
-        job_kind=job.kind,
-        state=job.state,
-        progress={"done": job.done, "total": job.total, "message": job.message},
-        cancelling=job.cancelling,
-        problem=job.problem,
-    )
 
 
 def problem_of_job(error: Exception) -> dict[str, Any]:

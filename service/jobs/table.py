@@ -11,199 +11,12 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import (
-    and_,
-    bindparam,
-    case,
-    delete,
-    exists,
-    func,
-    not_,
-    null,
-    or_,
-    select,
-    update,
-)  # fmt: skip
-
 from core.ledger import Connection, Ledger, Lock, Statement
-from core.ledger.statements import among
 from service.errors.faults import JobEnded, JobQueueFull
+from service.jobs import statements
 from service.jobs.job import Job, JobState
-from service.jobs.rows import DAMAGED, JOBS, READ, job_of, values_of
+from service.jobs.rows import DAMAGED, job_of, values_of
 from service.peers.peers import Peers
-
-_ALL = Statement(select(*READ).order_by(JOBS.c.number))
-_GET = Statement(select(*READ).where(JOBS.c.id == bindparam("id")))
-_COUNTS = Statement(select(JOBS.c.state, func.count()).group_by(JOBS.c.state))
-_QUEUED = Statement(select(func.count()).where(JOBS.c.state == "queued"))
-_HELD = Statement(
-    select(JOBS.c.id, JOBS.c.attempt, JOBS.c.cancelling).where(
-        JOBS.c.owner == bindparam("service"), JOBS.c.state == "running"
-    )
-)
-_GIVEN: dict[str, Any] = {column.name: bindparam(column.name) for column in READ}
-_ADD = Statement(
-    lambda insert: (
-        insert(JOBS)
-        .values({name: given for name, given in _GIVEN.items() if name != "number"} | {"yielded": 0})
-        .returning(JOBS.c.number)
-    )
-)
-PUT = Statement(
-    lambda insert: (
-        insert(JOBS)
-        .values(_GIVEN | {"yielded": 0})
-        .on_conflict_do_update(index_elements=["number"], set_={name: _GIVEN[name] for name in _GIVEN})
-    )
-)
-"""Write a whole job, in place of one that cannot be read."""
-
-# The next job
-
-_WAITING, _OTHER = JOBS.alias("waiting"), JOBS.alias("other")
-_ONE_OF_OURS = and_(
-    or_(_WAITING.c.home.is_(None), _WAITING.c.home == bindparam("service")),
-    or_(and_(_WAITING.c.resumable == 1, among(_WAITING.c.kind, "kinds")), among(_WAITING.c.id, "own")),
-)
-_COMES_FIRST = and_(
-    _OTHER.c.state == "queued",
-    _OTHER.c.number < _WAITING.c.number,
-    or_(_OTHER.c.home.is_(None), among(_OTHER.c.home, "living")),
-)
-_MAP_IS_FREE = or_(
-    _WAITING.c.map.is_(None),
-    not_(
-        exists().where(
-            _OTHER.c.map == _WAITING.c.map,
-            _OTHER.c.number != _WAITING.c.number,
-            _OTHER.c.ended_at.is_(None),
-            or_(_OTHER.c.state == "running", _COMES_FIRST),
-        )
-    ),
-)
-_READY = and_(_WAITING.c.ended_at.is_(None), _WAITING.c.state == "queued", _ONE_OF_OURS, _MAP_IS_FREE)
-_NEXT = (
-    select(_WAITING.c.number)
-    .where(_READY)
-    .order_by(func.coalesce(_WAITING.c.behind, _WAITING.c.number), _WAITING.c.yielded, _WAITING.c.number)
-    .limit(1)
-)
-_TAKE = Statement(
-    update(JOBS)
-    .where(JOBS.c.number == _NEXT.scalar_subquery())
-    .values(
-        state="running",
-        owner=bindparam("service"),
-        attempt=JOBS.c.attempt + 1,
-        change=0,
-        started_at=bindparam("now"),
-    )
-    .returning(*READ, JOBS.c.yielded)
-)
-_OTHERS_WAIT = Statement(
-    select(_WAITING.c.number)
-    .where(_READY, or_(_WAITING.c.map.is_(None), _WAITING.c.map.is_distinct_from(bindparam("of_map"))))
-    .limit(1)
-)
-
-# Writes of the service that does a job, in the attempt in which it took it
-
-
-def _of_owner(**values: Any) -> Statement:
-    owned = and_(
-        JOBS.c.number == bindparam("number"),
-        JOBS.c.owner == bindparam("service"),
-        JOBS.c.attempt == bindparam("attempt"),
-        JOBS.c.state == "running",
-    )
-    given: dict[str, Any] = {name: bindparam(name) for name in ("change", "done", "total", "message")}
-    return Statement(update(JOBS).where(owned).values(given | values).returning(JOBS.c.cancelling))
-
-
-_BACK = {"state": "queued", "owner": null(), "behind": null(), "yielded": 0}
-_PROGRESS = _of_owner()
-_NOTE = _of_owner(notes=bindparam("notes"))
-_END = _of_owner(**{name: bindparam(name) for name in ("state", "ended_at", "notes", "result", "problem")})
-_PUT_OFF = _of_owner(**_BACK)
-_GIVE_WAY = _of_owner(
-    **_BACK
-    | {
-        "behind": select(func.max(_OTHER.c.number)).scalar_subquery(),
-        "yielded": select(func.max(_OTHER.c.yielded) + 1).scalar_subquery(),
-    }
-)
-
-# Ends without an owner
-
-_LATER = {"change": JOBS.c.change + 1}
-_CLEAN = or_(
-    JOBS.c.attempt == 0, JOBS.c.yielded > 0, and_(JOBS.c.home.is_not(None), not_(among(JOBS.c.home, "living")))
-)
-_CANCEL_WAITING = Statement(
-    update(JOBS)
-    .where(JOBS.c.id == bindparam("id"), JOBS.c.state == "queued", _CLEAN)
-    .values(_LATER | {"state": "cancelled", "ended_at": bindparam("now"), "notes": "{}"})
-)
-_CANCEL = Statement(
-    update(JOBS)
-    .where(JOBS.c.id == bindparam("id"), JOBS.c.ended_at.is_(None), JOBS.c.cancelling == 0)
-    .values(_LATER | {"cancelling": 1})
-)
-_GONE_HOME = not_(among(JOBS.c.home, "living"))
-_LOST = Statement(
-    select(*READ).where(
-        JOBS.c.ended_at.is_(None),
-        or_(
-            and_(
-                JOBS.c.home == bindparam("service"),
-                not_(among(JOBS.c.id, "own")),
-                or_(JOBS.c.resumable == 0, not_(among(JOBS.c.kind, "kinds"))),
-            ),
-            and_(JOBS.c.resumable == 0, _GONE_HOME),
-        ),
-    )
-)
-_FAIL = Statement(
-    update(JOBS)
-    .where(JOBS.c.number == bindparam("number"), JOBS.c.ended_at.is_(None))
-    .values(_LATER | {"state": "failed", "ended_at": bindparam("now"), "notes": "{}", "problem": bindparam("problem")})
-    .returning(*READ)
-)
-_LET_GO = Statement(
-    update(JOBS)
-    .where(
-        JOBS.c.state == "running",
-        JOBS.c.resumable == 1,
-        or_(
-            and_(JOBS.c.owner == bindparam("service"), not_(among(JOBS.c.id, "held"))),
-            not_(among(JOBS.c.owner, "living")),
-        ),
-    )
-    .values(
-        _LATER
-        | _BACK
-        | {
-            "message": case(
-                (JOBS.c.owner == bindparam("service"), "waits to be resumed after a restart of the service"),
-                (JOBS.c.home.is_(None), "waits to be resumed after a service has ended"),
-                else_="waits for the service that has its files",
-            )
-        }
-    )
-    .returning(*READ)
-)
-_ENDED_BEFORE = (
-    select(_OTHER.c.number)
-    .where(_OTHER.c.ended_at.is_not(None))
-    .order_by(_OTHER.c.number.desc())
-    .limit(1)
-    .offset(bindparam("history"))
-)
-_TRIM = Statement(
-    delete(JOBS)
-    .where(JOBS.c.ended_at.is_not(None), JOBS.c.number <= _ENDED_BEFORE.scalar_subquery())
-    .returning(JOBS.c.id)
-)
 
 
 class JobTable:
@@ -225,10 +38,10 @@ class JobTable:
         self._known: dict[str, Job] | None = None
         if peers.alone:
             self._order, self._known = threading.RLock(), {}
-            for job in self._learn(ledger.execute("read the jobs", _ALL)):
+            for job in self._learn(ledger.execute("read the jobs", statements.ALL)):
                 if job.message == DAMAGED and not job.ended:  # its row may say something else
                     repaired = self._learned(replace(job, home=peers.id))
-                    ledger.execute("repair a job", PUT, **values_of(repaired))
+                    ledger.execute("repair a job", statements.PUT, **values_of(repaired))
 
     # Reading
 
@@ -236,31 +49,31 @@ class JobTable:
         """A job; None if there is none."""
         if self._known is not None:
             return self._known.get(job_id)
-        found = self._ledger.execute("read a job", _GET, id=job_id)
+        found = self._ledger.execute("read a job", statements.GET, id=job_id)
         return job_of(found[0]) if found else None
 
     def all(self) -> list[Job]:
         """All jobs, the oldest first."""
         if self._known is not None:
             return list(self._known.copy().values())
-        return [job_of(row) for row in self._ledger.execute("read the jobs", _ALL)]
+        return [job_of(row) for row in self._ledger.execute("read the jobs", statements.ALL)]
 
     def counts(self) -> Counter[JobState]:
         """How many jobs are in each state."""
         if self._known is not None:
             return Counter(job.state for job in self._known.copy().values())
-        return Counter(dict(self._ledger.execute("count the jobs", _COUNTS)))
+        return Counter(dict(self._ledger.execute("count the jobs", statements.COUNTS)))
 
     def held(self) -> dict[tuple[str, int], bool]:
         """The ids and attempts of the jobs that this service owns, each with whether it was cancelled."""
-        rows = self._ledger.execute("read the jobs", _HELD, service=self._peers.id)
+        rows = self._ledger.execute("read the jobs", statements.HELD, service=self._peers.id)
         return {(job_id, attempt): bool(cancelling) for job_id, attempt, cancelling in rows}
 
     def others_wait(self, map_id: str | None, kinds: Iterable[str], own: Iterable[str]) -> bool:
         """Whether jobs of other maps wait that this service could do; ``kinds`` and ``own`` as for :meth:`take`."""
         with self._ledger.transaction("look for jobs") as connection:
             given = self._given(connection, kinds=list(kinds), own=list(own))
-            return bool(connection.execute(_OTHERS_WAIT, of_map=map_id, **given))
+            return bool(connection.execute(statements.OTHERS_WAIT, of_map=map_id, **given))
 
     # Writing
 
@@ -272,9 +85,9 @@ class JobTable:
         """
         with self._order:
             with self._ledger.transaction("add a job", Lock.JOBS) as connection:
-                if connection.execute(_QUEUED)[0][0] >= self._longest_queue:
+                if connection.execute(statements.QUEUED)[0][0] >= self._longest_queue:
                     raise self.queue_full()
-                ((number,),) = connection.execute(_ADD, **values_of(job))
+                ((number,),) = connection.execute(statements.ADD, **values_of(job))
             return self._learned(replace(job, number=number))
 
     def queue_full(self) -> JobQueueFull:
@@ -297,7 +110,7 @@ class JobTable:
         with self._order:
             with self._ledger.transaction("take a job", Lock.JOBS) as connection:
                 given = self._given(connection, kinds=list(kinds), own=list(own))
-                found = connection.execute(_TAKE, now=_now(), **given)
+                found = connection.execute(statements.TAKE, now=_now(), **given)
             return (self._learned(job_of(found[0][:-1])), found[0][-1] > 0) if found else None
 
     def progress(self, job: Job) -> Job | None:
@@ -305,25 +118,25 @@ class JobTable:
 
         The same holds for the methods that follow.
         """
-        return self._write("write down a job", _PROGRESS, job)
+        return self._write("write down a job", statements.PROGRESS, job)
 
     def note(self, job: Job) -> Job | None:
         """Write its notes."""
-        return self._write("write down a job", _NOTE, job)
+        return self._write("write down a job", statements.NOTE, job)
 
     def put_off(self, job: Job) -> Job | None:
         """Let it wait."""
-        return self._write("put a job off", _PUT_OFF, job)
+        return self._write("put a job off", statements.PUT_OFF, job)
 
     def give_way(self, job: Job) -> Job | None:
         """Let it wait behind all jobs that there are now."""
-        return self._write("put a job off", _GIVE_WAY, job)
+        return self._write("put a job off", statements.GIVE_WAY, job)
 
     def end(self, job: Job) -> Job | None:
         """Write its end, and forget the oldest ended jobs."""
         with self._order:
             with self._ledger.transaction("write down a job") as connection:
-                rows = connection.execute(_END, service=self._peers.id, **values_of(job))
+                rows = connection.execute(statements.END, service=self._peers.id, **values_of(job))
                 trimmed = self._trim(connection)
             learned = self._learned(job) if rows else None
             self._forget(trimmed)
@@ -341,10 +154,10 @@ class JobTable:
         with self._order:
             with self._ledger.transaction("cancel a job", Lock.JOBS) as connection:
                 given = self._given(connection, id=job_id, now=_now())
-                ended = connection.change(_CANCEL_WAITING, **given) > 0
+                ended = connection.change(statements.CANCEL_WAITING, **given) > 0
                 if not ended:
-                    connection.change(_CANCEL, id=job_id)
-                found = connection.execute(_GET, id=job_id)
+                    connection.change(statements.CANCEL, id=job_id)
+                found = connection.execute(statements.GET, id=job_id)
                 trimmed = self._trim(connection) if ended else []
             jobs = self._learn(found)
             self._forget(trimmed)
@@ -376,11 +189,11 @@ class JobTable:
             with self._ledger.transaction("resume jobs") as connection:
                 given = self._given(connection, kinds=list(kinds), own=list(own), held=list(held))
                 rows = []
-                for row in connection.execute(_LOST, **given):
+                for row in connection.execute(statements.LOST, **given):
                     lost = job_of(row)
                     problem = json.dumps(dict(problem_of(lost)))
-                    rows += connection.execute(_FAIL, number=lost.number, problem=problem, now=_now())
-                rows += connection.execute(_LET_GO, **given)
+                    rows += connection.execute(statements.FAIL, number=lost.number, problem=problem, now=_now())
+                rows += connection.execute(statements.LET_GO, **given)
                 trimmed = self._trim(connection) if rows else []
             jobs = self._learn(rows)
             self._forget(trimmed)
@@ -395,7 +208,7 @@ class JobTable:
             return self._learned(replace(job, cancelling=bool(rows[0][0]))) if rows else None
 
     def _trim(self, connection: Connection) -> list[str]:
-        return [job_id for (job_id,) in connection.execute(_TRIM, history=self._history)]
+        return [job_id for (job_id,) in connection.execute(statements.TRIM, history=self._history)]
 
     # What is known without reading
 

@@ -26,7 +26,7 @@ from service.settings import Settings
 COMMON = (
     "encoder",
     "precision",
-    "store",
+    "engine",
     "milvus_database",
     "rate_per_key",
     "rate_burst",

@@ -10,7 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Column, ColumnElement, Index, MetaData, Table, and_, bindparam, delete, func, null, select, update
+from sqlalchemy import (
+    Column,
+    ColumnElement,
+    Index,
+    MetaData,
+    Table,
+    and_,
+    bindparam,
+    delete,
+    func,
+    null,
+    select,
+    update,
+)
 from sqlalchemy.sql.selectable import Select
 
 from core.disk.sqlite_file import DURABLE
@@ -109,7 +122,7 @@ TABLES = Tables("sessions", 2, _METADATA, 0x504C5253, more={"postgresql": [UNCOM
 _NAMED = _C.id == bindparam("session")
 _OF_MAP = and_(_C.map == bindparam("map"), _C.map_created_at == bindparam("map_created_at"))
 _EXPIRES = _C.used + _C.expires_after
-_IN_TIME = and_(_LIVES, _EXPIRES > seconds_now())
+_IN_TIME = and_(_LIVES, seconds_now() < _EXPIRES)
 _HEAD = [
     (seconds_now() - _C.used).label("idle") if name == "idle" else _C[name]
     for name in SessionRecord.__dataclass_fields__
@@ -165,7 +178,7 @@ _RENEW = Statement(
 )
 _END = Statement(update(_TABLE).where(_NAMED, _LIVES).values(_ENDING))
 _END_EXPIRED = Statement(
-    update(_TABLE).where(_LIVES, _EXPIRES < seconds_now() - LATE_SECONDS).values(_ENDING).returning(*_HEAD)
+    update(_TABLE).where(_LIVES, seconds_now() - LATE_SECONDS > _EXPIRES).values(_ENDING).returning(*_HEAD)
 )
 _FORGET = Statement(delete(_TABLE).where(_NAMED))
 _FORGET_ENDED = Statement(
@@ -222,7 +235,7 @@ class SessionTable:
         return SessionRecord(*found[0]) if found else None
 
     def read(self, session_id: str, known: int = -1) -> SessionRecord | None:
-        """A living session with its state and answer; None if there is none, or if it has the revision that is known."""
+        """A living session with state and answer; None if there is none, or if it has the revision that is known."""
         found = self._ledger.execute("read a session", _NEWER, session=session_id, known=known)
         return SessionRecord(*found[0]) if found else None
 

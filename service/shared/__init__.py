@@ -1,8 +1,8 @@
-"""State that any number of services share in PostgreSQL: sessions, jobs, statistics and events.
+"""State that any number of services share in PostgreSQL.
 
-Each part has its embedded twin, which keeps the same in the data directory and is the default; nothing here is imported
-unless PLACEREC_POSTGRES is set.  Keys, rates and the audit trail are one class each for both (``service.access``,
-``service.administration``).  docs/explanation/replicas.md says what holds over all services, and at what cost.
+Each part is one class for both databases, in its own room; this puts those together that share their state.  Nothing
+here is imported unless a PostgreSQL is set.  docs/explanation/replicas.md says what holds over all services, and at
+what cost.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def open_database(settings: Settings) -> SharedDatabase | None:
     Raises:
         MissingExtra: the client of PostgreSQL is not installed.
     """
-    if settings.postgres is None:
+    if settings.database is None:
         return None
     try:
         from service.shared.database import SharedDatabase
@@ -32,7 +32,7 @@ def open_database(settings: Settings) -> SharedDatabase | None:
         if error.name not in ("psycopg", "psycopg_pool"):
             raise
         raise MissingExtra(
-            f"State in PostgreSQL needs {error.name}, which others do not: pip install 'placerec[milvus]', or in a"
-            " checkout .venv/bin/pip install --editable '.[milvus]'."
+            f"State in PostgreSQL needs {error.name}, which others do not: pip install 'placerec[cluster]', or in a"
+            " checkout .venv/bin/pip install --editable '.[cluster]'."
         ) from error
-    return SharedDatabase(settings.postgres.get_secret_value())
+    return SharedDatabase(settings.database.get_secret_value())

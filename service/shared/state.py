@@ -5,6 +5,7 @@ from __future__ import annotations
 from service.administration.audit_trail import AuditTable, detach
 from service.engine.engine import Engine
 from service.events.events import Events
+from service.events.relay import EventRelay
 from service.jobs.jobs import Jobs
 from service.peers.differences import ReplicaDifferences
 from service.peers.replica import ServiceReplica
@@ -12,8 +13,6 @@ from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings
 from service.shared.database import SharedDatabase
-from service.shared.events import SharedEvents
-from service.shared.statistics import SharedStatistics
 
 
 class SharedState:
@@ -30,11 +29,12 @@ class SharedState:
         self.differences = ReplicaDifferences(settings, database, self.replica.id)
         self.replica.every(self.differences.compare)
         self.audit = AuditTable(database, self.replica.id)
-        self.events = SharedEvents(self.replica, database, settings.event_listeners)
+        self._relay = EventRelay(self.replica, database)
+        self.events = Events(settings.event_listeners, relay=self._relay)
 
     def statistics(self, engine: Engine) -> QueryStatistics:
         """The statistics of all services."""
-        return SharedStatistics.of_services(engine, self._database)
+        return QueryStatistics.of_engine(engine, self._database)
 
     def jobs(self, events: Events) -> Jobs:
         """All jobs of all services."""
@@ -50,12 +50,12 @@ class SharedState:
 
     def start(self) -> None:
         """Begin to take part; all parts must be made before."""
-        self.events.start()
+        self._relay.start()
         self.replica.start()
         self.audit.start()
 
     def close(self) -> None:
         """Leave the others; blocks."""
-        self.events.close()
+        self._relay.close()
         detach(self.audit)
         self.replica.close()

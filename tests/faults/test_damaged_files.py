@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, StorageFailure
-from core.maps import MapSettings
+from core.maps import MapSettings, PlaceFilter
 from core.storage import Atlas, Map
 from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
@@ -117,7 +117,7 @@ def answers(map_: Map) -> State:
     for name in ("lab2", "again", "coded7", "nobody"):
         rows, products = map_.snapshot().search(descriptor_of(name))
         found.append((rows.tolist()[:8], Scores(products[:8])))
-    by_metadata = map_.attributes.rows_with({"floor": 2}).tolist()
+    by_metadata = map_.ids_of(PlaceFilter(metadata={"floor": 2}), 1000)
     whereabouts = vars(map_.snapshot().whereabouts.take(map_.snapshot().alive.nonzero()[0]))
     spots = zlib.crc32(b"".join(column.tobytes() for column in whereabouts.values()))
     ends = map_.transfer.sequence_ends()

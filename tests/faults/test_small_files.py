@@ -24,7 +24,9 @@ from service.jobs.file import open_file
 from service.jobs.job import Job
 from service.jobs.table import JobTable
 from service.peers.alone import Alone
-from service.queries.statistics import QueryStatistics, Statistics
+from service.queries.count_tables import statistics_file
+from service.queries.counts import Statistics
+from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
@@ -67,7 +69,7 @@ def use_sessions(folder: Path) -> object:
 
 def use_statistics(folder: Path) -> object:
     """Read the statistics of a map, then count one more answer."""
-    statistics = QueryStatistics(folder, 3600, lambda: {KEY: 5}, lambda _: set())
+    statistics = QueryStatistics(statistics_file(folder), 3600, lambda: {KEY: 5}, lambda _: set())
     try:
         found: Statistics = statistics.read(KEY)
         statistics.observe(KEY, "recognized", "p0", 0.5, 0.5)

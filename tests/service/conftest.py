@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import httpx
@@ -57,22 +58,28 @@ STRICT: dict[str, object] = {
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--store",
-        choices=("embedded", "milvus"),
-        default="embedded",
-        help="where the server of most tests keeps its maps; milvus starts a PostgreSQL and a Milvus",
+        choices=("files", "postgres", "milvus"),
+        default="files",
+        help="what keeps the vectors of the server of most tests; postgres and milvus start what they need",
     )
 
 
 @contextmanager
 def store_settings(kind: str) -> Iterator[dict[str, object]]:
     """The settings of a store, whose servers run as long as the block."""
-    if kind == "embedded":
+    if kind == "files":
         yield {}
+        return
+    if kind == "postgres":
+        from tests.service.shared.postgres import running_postgres
+
+        with running_postgres() as postgres:
+            yield {"database": postgres.address}
         return
     from tests.core.milvus.servers import running_servers  # needs what speaks to them
 
     with running_servers() as servers:
-        yield {"store": kind, "milvus": servers.milvus_address, "postgres": servers.postgres_address}
+        yield {"vectors": kind, "milvus": servers.milvus_address, "database": servers.postgres_address}
 
 
 @pytest.fixture(scope="session")
@@ -164,20 +171,10 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    """A real PostgreSQL."""
-    from tests.service.shared.postgres import running_postgres
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the data of a service that has one map."""
+    from tests.service.shared.services import prepare
 
-    with running_postgres() as postgres:
-        yield postgres
-
-
-@pytest.fixture
-def database(postgres: Postgres) -> Iterator[SharedDatabase]:
-    """The database that services share, with nothing in it."""
-    from service.shared.database import SharedDatabase
-
-    postgres.empty()
-    database = SharedDatabase(postgres.address)
-    yield database
-    database.close()
+    folder = tmp_path_factory.mktemp("prepared")
+    prepare(folder)
+    return folder

@@ -4,27 +4,43 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from sqlalchemy import and_, bindparam, func, select
+from sqlalchemy import bindparam, case, func, select
 
 from core.ledger.maps.connection import Reading
 from core.ledger.maps.schema import PLACES, SEQUENCES
-from core.ledger.statements import Statement
+from core.ledger.statements import Statement, json_list, rounded
 from core.maps.store import HANDED_OVER, HAS_PICTURE
 
 _P, _S = PLACES.c, SEQUENCES.c
 _DIGITS = {"x": 3, "y": 3, "z": 3, "latitude": 7, "longitude": 7, "heading": 2}
 """Metres to the millimetre, degrees of position to a centimetre on the ground."""
 
-_PLACES = Statement(
-    select(_P.id, _S.name, *(_P[name] for name in _DIGITS), func.substr(_P.timestamp, 1, 26), _P.pose_of, _P.picture)
-    .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
+_NAMES = Statement(select(_S.code, _S.name).where(_S.map == bindparam("map"), _S.name.is_not(None)).order_by(_S.name))
+_LISTED = (
+    select(
+        _P.id,
+        _P.sequence,
+        *(rounded(_P[name], digits).label(name) for name, digits in _DIGITS.items()),
+        func.substr(_P.timestamp, 1, 26).label("timestamp"),
+        (
+            case((_P.pose_of.is_not(None), HANDED_OVER), else_=0) + case((_P.picture != "none", HAS_PICTURE), else_=0)
+        ).label("flags"),
+    )
     .where(_P.map == bindparam("map"), (_P.number - 1) % bindparam("step") == 0)
     .order_by(_P.number)
+    .subquery()
+    .c
 )
-_NAMES = Statement(select(_S.name).where(_S.map == bindparam("map"), _S.name.is_not(None)).order_by(_S.name))
+_OPTIONAL = (*_DIGITS, "timestamp")
+# As JSON of the database: an object for each value of each place takes far longer.
+_PLACES = Statement(
+    select(
+        json_list(_LISTED.id), json_list(_LISTED.sequence), json_list(_LISTED.flags),
+        *(func.count(_LISTED[name]) for name in _OPTIONAL), *(json_list(_LISTED[name]) for name in _OPTIONAL),
+    )
+)  # fmt: skip
 
 
 class Plan:
@@ -40,27 +56,30 @@ class Plan:
     def columns(self, step: int = 1) -> str:
         """The places in the order of their enrolment as the members of a JSON object, without its braces."""
         with self._reading() as connection:
-            names = [name for (name,) in connection.execute(_NAMES)]
-            found = connection.execute(_PLACES, step=step)
-        ids, sequences, *poses, moments, sources, pictures = zip(*found, strict=True) if found else ((),) * 11
-        position = {name: at for at, name in enumerate(names)}
-        columns: dict[str, Any] = {
-            "sequences": names,
+            names = dict(connection.execute(_NAMES))
+            ((ids, sequence, flags, *optional),) = connection.execute(_PLACES, step=step)
+        counts, values = optional[: len(_OPTIONAL)], optional[len(_OPTIONAL) :]
+        position = {code: at for at, code in enumerate(names)}
+        columns = {
+            "sequences": _text(list(names.values())),
             "ids": ids,
-            "sequence": [position.get(name, -1) for name in sequences],
+            "sequence": _text([position.get(code, -1) for code in json.loads(sequence)]),
         }
-        for (name, digits), values in zip(_DIGITS.items(), poses, strict=True):
-            columns[name] = _or_none([None if value is None else round(value, digits) for value in values])
-        milliseconds = (np.array(moments, "datetime64[us]").astype(np.int64) / 1000).round().astype(np.int64).tolist()
-        columns["timestamp"] = _or_none(
-            [None if text is None else at for text, at in zip(moments, milliseconds, strict=True)]
-        )
-        columns["flags"] = [
-            (source is not None) * HANDED_OVER + (picture != "none") * HAS_PICTURE
-            for source, picture in zip(sources, pictures, strict=True)
-        ]
-        return ",".join(f'"{name}":{json.dumps(values, separators=(",", ":"))}' for name, values in columns.items())
+        columns |= {
+            name: column if count else "null" for name, count, column in zip(_OPTIONAL, counts, values, strict=True)
+        }
+        columns |= {"timestamp": _milliseconds(columns["timestamp"]), "flags": flags}
+        return ",".join(f'"{name}":{column}' for name, column in columns.items())
 
 
-def _or_none(values: Sequence[float | None]) -> Sequence[float | None] | None:
-    return None if all(value is None for value in values) else values
+def _milliseconds(moments: str) -> str:
+    """A list of moments, or null, in JSON as milliseconds since 1970 UTC."""
+    texts = json.loads(moments)
+    if texts is None:
+        return moments
+    found = (np.array(texts, "datetime64[us]").astype(np.int64) / 1000).round().astype(np.int64).tolist()
+    return _text([None if text is None else moment for text, moment in zip(texts, found, strict=True)])
+
+
+def _text(values: Sequence[str | int | None]) -> str:
+    return json.dumps(values, separators=(",", ":"))

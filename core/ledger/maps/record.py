@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import bindparam, delete, select, update
+from sqlalchemy import bindparam, delete, func, select, update
 
 from core.errors import MapExists, UnknownMap
 from core.ledger.database import Connection
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.schema import MAPS, SEQUENCES
+from core.ledger.maps.schema import MAPS, PLACES, SEQUENCES
 from core.ledger.statements import Statement, seconds_now
 from core.maps.records import MapRecord, validation_message
 from core.places import NO_SEQUENCE
@@ -43,7 +43,7 @@ class MapState:
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
 _COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "inserted", "collection")
-_STATE = (MAPS.c.number, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
+_STATE = (MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
 
 _CREATE = Statement(
     lambda insert: (
@@ -85,6 +85,15 @@ _COUNT = Statement(
     .where(MAPS.c.number == bindparam("map"))
     .values({name: bindparam(f"new_{name}") for name in _COUNTERS} | {"touched": seconds_now()})
 )
+_HIGHEST = Statement(
+    select(
+        MAPS.c.numbers, MAPS.c.codes, MAPS.c.revision,
+        *(
+            select(func.coalesce(func.max(column), -1)).where(column.table.c.map == bindparam("map")).scalar_subquery()
+            for column in (PLACES.c.number, SEQUENCES.c.code, PLACES.c.track, PLACES.c.revision)
+        ),
+    ).where(MAPS.c.number == bindparam("map"))
+)  # fmt: skip
 _DELETE = Statement(delete(MAPS).where(MAPS.c.number == bindparam("map")))
 
 
@@ -172,13 +181,16 @@ def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
 
 
 def _state(values: tuple[Any, ...]) -> MapState:
-    number, text, seal, *counters = values
+    number, map_id, listed, text, seal, *counters = values
     if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
-        return MapState(number, MapRecord.model_validate_json(text), *counters)
+        record = MapRecord.model_validate_json(text)
     except ValueError as error:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
+    if listed and map_id != record.id:
+        raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
+    return MapState(number, record, *counters)
 
 
 def records_after(connection: Connection, after: str, limit: int) -> list[MapRecord]:
@@ -189,6 +201,20 @@ def records_after(connection: Connection, after: str, limit: int) -> list[MapRec
 def put_counters(connection: MapConnection, state: MapState) -> None:
     """Store the counters of a map, as every write to it does."""
     connection.change(_COUNT, **{f"new_{one}": getattr(state, one) for one in _COUNTERS})
+
+
+def wrong_counters(connection: MapConnection) -> list[str]:
+    """What a counter of a map would give out a second time."""
+    found = connection.one(_HIGHEST)
+    if found is None:
+        return []
+    numbers, codes, revision, number, code, track, changed = found
+    wrong = {
+        f"the next number of a place, {numbers}, is not above those there are": numbers <= number,
+        f"the next code of a sequence, {codes}, is not above those there are": codes <= max(code, track),
+        f"the revision, {revision}, is below those of places": revision < changed,
+    }
+    return [problem for problem, is_wrong in wrong.items() if is_wrong]
 
 
 def put_record(connection: MapConnection, record: MapRecord) -> None:

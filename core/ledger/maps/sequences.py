@@ -63,6 +63,15 @@ _WRONG = Statement(
     )
     .limit(bindparam("most"))
 )
+_LOST = Statement(
+    select(_P.id)
+    .where(
+        _P.map == bindparam("map"),
+        ~exists(literal_column("1")).where(_S.map == _P.map, _S.code == _P.sequence),
+    )
+    .order_by(_P.number)
+    .limit(bindparam("most"))
+)
 _END = Statement(select(_S.code, _S.next_ordinal).where(_OF_MAP, _S.name == bindparam("name")))
 _LAST = Statement(select(_P.ordinal, _P.row).where(_OF_SEQUENCE).order_by(_P.number.desc()).limit(1))
 _FIRST_AT = Statement(select(_P.row).where(_AT, _P.number < bindparam("before")).order_by(_P.number).limit(1))
@@ -137,6 +146,11 @@ def summaries_after(connection: MapConnection, after: str, limit: int) -> list[S
 def wrong(connection: MapConnection, limit: int = 10) -> list[str | None]:
     """The names of some sequences that are empty, or whose next place would not come behind their last."""
     return [name for (name,) in connection.execute(_WRONG, most=limit)]
+
+
+def lost(connection: MapConnection, limit: int = 10) -> list[str]:
+    """The ids of some places whose sequence is missing."""
+    return [place_id for (place_id,) in connection.execute(_LOST, most=limit)]
 
 
 def rows_of(connection: MapConnection, name: str) -> list[int]:

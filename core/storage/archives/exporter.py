@@ -18,8 +18,7 @@ from core.ledger.maps.archiving import LedgerSource, pieces
 from core.ledger.maps.connection import MapConnection, Reading
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.maps.records import MapRecord
-from core.storage.database.connections import FILE, begin_reading
-from core.storage.database.schema import driver_of
+from core.storage.database.connections import FILE, read_now
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, read_layout
@@ -33,7 +32,7 @@ class Exporter:
 
     Args:
         folder: of the map.
-        reading: opens a connection to its database.
+        reading: begins a transaction that reads it.
         opened: returns the open map, or None.
         guarded: turns errors of the disk in its block into ours, and quarantines the map if it is damaged.
     """
@@ -65,18 +64,13 @@ class Exporter:
         """
         # Deleting the map waits for its readers, so this ends as soon as the map is closed.
         with self._guarded("export"), self._reading() as connection, self._files_retained():
-            begin_reading(connection)
-            try:
-                state, layout = read_layout(connection, self._folder.name)
-                for table, names in (("places", places.unsound(connection)), ("cameras", cameras.unsound(connection))):
-                    if names:
-                        raise Damage(f"{FILE}: {names[0]!r} of {table} does not match its checksum")
-                source = _Source(connection, state.record, self._folder, layout, self._expect_there)
-                return write_archive(source, path, advance, expect)
-            finally:
-                driver = driver_of(connection)
-                if driver.in_transaction:  # SQLite may have ended it itself; that error is the one to report
-                    driver.execute("ROLLBACK")
+            read_now(connection)
+            state, layout = read_layout(connection, self._folder.name)
+            for table, names in (("places", places.unsound(connection)), ("cameras", cameras.unsound(connection))):
+                if names:
+                    raise Damage(f"{FILE}: {names[0]!r} of {table} does not match its checksum")
+            source = _Source(connection, state.record, self._folder, layout, self._expect_there)
+            return write_archive(source, path, advance, expect)
 
     def _files_retained(self) -> AbstractContextManager[None]:
         """No segment file is deleted during the block."""

@@ -24,11 +24,21 @@ _IDLE_READERS = 8
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 
 
-def begin_reading(connection: MapConnection) -> None:
-    """Begin a transaction that sees this moment."""
+@contextmanager
+def at_one_moment(connection: MapConnection) -> Iterator[None]:
+    """All statements of the block see the moment of the first one that reads."""
     driver = driver_of(connection)
     driver.execute("BEGIN")
-    driver.execute("SELECT number FROM maps").fetchall()  # a transaction sees the moment of its first read
+    try:
+        yield
+    finally:
+        if driver.in_transaction:  # SQLite ends some transactions itself, when the disk fails
+            driver.execute("ROLLBACK")
+
+
+def read_now(connection: MapConnection) -> None:
+    """Have a transaction see this moment."""
+    driver_of(connection).execute("SELECT number FROM maps").fetchall()
 
 
 class DatabaseClosed(Exception):

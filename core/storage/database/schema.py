@@ -9,7 +9,7 @@ from typing import TypeVar
 from core.disk.files import Damage
 from core.disk.sqlite_file import NotOurs, Schema, UnreadVersion, transaction
 from core.ledger import Tables
-from core.ledger.maps import places, schema, sequences
+from core.ledger.maps import places, record, schema, sequences
 from core.ledger.maps.connection import MapConnection
 from core.ledger.sqlite import SqliteConnection
 from core.storage.database.segments import METADATA
@@ -95,13 +95,15 @@ def driver_of(connection: MapConnection) -> sqlite3.Connection:
 
 
 def contradictions(connection: MapConnection) -> list[str]:
-    """Where the index of metadata and the ends of sequences contradict the places, some of each kind."""
-    return places.stale_tokens(connection) + wrong_sequences(connection)
+    """Where the index of metadata, the sequences and the counters contradict the places, some of each kind."""
+    return places.stale_tokens(connection) + wrong_references(connection)
 
 
-def wrong_sequences(connection: MapConnection) -> list[str]:
-    """The sequences that are empty, or whose next place would not come after their last."""
-    return [f"sequence {name!r} is empty, or ends before its last place" for name in sequences.wrong(connection)]
+def wrong_references(connection: MapConnection) -> list[str]:
+    """Where sequences and counters contradict the places."""
+    wrong = [f"sequence {name!r} is empty, or ends before its last place" for name in sequences.wrong(connection)]
+    lost = [f"place {place_id!r} is of a sequence that is missing" for place_id in sequences.lost(connection)]
+    return wrong + lost + record.wrong_counters(connection)
 
 
 def rebuild_metadata_index(connection: MapConnection) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import threading
 from dataclasses import replace
@@ -13,6 +14,7 @@ from sqlalchemy import Column, Index, MetaData, Table, bindparam, delete, select
 from core.disk.sqlite_file import DURABLE
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, StorageFull, StoreOfAnotherVersion
 from core.ledger import Ledger, Statement, Tables
+from core.ledger.rows import given_rows
 from core.ledger.sqlite import SqliteLedger, file_of
 from core.ledger.statements import among, binary, greatest, integer, real, seconds_now, text
 from tests.core.ledger.conftest import OpenLedger
@@ -179,3 +181,20 @@ def test_a_parameter_without_a_value_is_a_defect(open_ledger: OpenLedger) -> Non
     ledger = open_ledger(TABLES)
     with pytest.raises((KeyError, StorageFailure, sqlite3.ProgrammingError)):
         ledger.execute("put", _PUT, name="pear")
+
+
+def test_many_rows_are_one_parameter(open_ledger: OpenLedger) -> None:
+    columns = [_FRUIT.c.name, _FRUIT.c.weight, _FRUIT.c.at]
+    put = Statement(
+        lambda insert: (
+            (many := insert(_FRUIT).from_select([column.name for column in columns], given_rows("fruit", columns)))
+            .on_conflict_do_update(index_elements=["name"], set_={"weight": _FRUIT.c.weight + many.excluded.weight})
+        )
+    )  # fmt: skip
+    read = Statement(select(*columns).order_by(_FRUIT.c.name))
+    ledger = open_ledger(TABLES)
+    basket = [('Äpfel; "rot" \'', 0.1, 3.5), ("pear", 2, None)]
+    ledger.execute("put", put, fruit=json.dumps(basket))
+    ledger.execute("put", put, fruit=json.dumps([]))
+    ledger.execute("put", put, fruit=json.dumps([("pear", 0.5, 9.0)]))
+    assert sorted(ledger.execute("list", read)) == sorted([basket[0], ("pear", 2.5, None)])

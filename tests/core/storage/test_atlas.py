@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sqlite3
@@ -21,6 +22,7 @@ from core.errors import (
     StorageFailure,
     UnknownMap,
 )
+from core.ledger.maps.checksums import checksum_of
 from core.maps import MapSettings
 from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
@@ -201,8 +203,8 @@ def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: 
     for name in ("hall", "lab"):
         atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
-    edit(directory, "ALTER TABLE map DROP COLUMN review")
-    edit(directory, "PRAGMA user_version = 8")
+    edit(directory, "ALTER TABLE maps DROP COLUMN collection")
+    edit(directory, "PRAGMA user_version = 9")
     before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
     with pytest.raises(DataDirectoryTooOld) as error:
         Atlas(directory)
@@ -244,11 +246,33 @@ def cut(folder: Path) -> None:
 
 
 def without_a_record(folder: Path) -> None:
-    edit(folder.parents[1], "DELETE FROM map")
+    edit(folder.parents[1], "DELETE FROM maps")
+
+
+def with_a_changed_record(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE maps SET record = replace(record, 'thumbnail', 'image')")
+
+
+def with_a_changed_name(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE maps SET id = 'kitchen'")
+
+
+def written_anew(folder: Path, **changes: object) -> None:
+    """Change the record of a map, and its checksum with it."""
+    connection = sqlite3.connect(folder / "map.sqlite", isolation_level=None)
+    ((text,),) = connection.execute("SELECT record FROM maps").fetchall()
+    record = {**json.loads(text), **changes}
+    values = (record["id"], json.dumps(record))
+    connection.execute("UPDATE maps SET id = ?, record = ?, seal = ?", (*values, checksum_of(values)))
+    connection.close()
 
 
 def with_a_senseless_record(folder: Path) -> None:
-    edit(folder.parents[1], "UPDATE map SET keep = 'everything'")
+    written_anew(folder, keep="everything")
+
+
+def with_another_layout(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE layout SET rows_per_segment = 5")
 
 
 def without_a_table(folder: Path) -> None:
@@ -256,7 +280,7 @@ def without_a_table(folder: Path) -> None:
 
 
 def of_another_name(folder: Path) -> None:
-    edit(folder.parents[1], "UPDATE map SET id = 'kitchen'")
+    written_anew(folder, id="kitchen")
 
 
 def somebody_elses(folder: Path) -> None:
@@ -271,7 +295,10 @@ def somebody_elses(folder: Path) -> None:
         missing,
         cut,
         without_a_record,
+        with_a_changed_record,
+        with_a_changed_name,
         with_a_senseless_record,
+        with_another_layout,
         without_a_table,
         of_another_name,
         somebody_elses,

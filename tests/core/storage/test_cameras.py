@@ -6,15 +6,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from sqlite3 import Connection
 
 import pytest
 
 from core.errors import UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.writing import Write
 from core.storage import Atlas, Map
-from core.storage.writing import Write
 
 MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
 INTRINSICS = Intrinsics(width=64, height=48, fx=50.1, fy=50.2, cx=31.5, cy=23.5)
@@ -74,7 +74,7 @@ def test_a_reading_before_a_change_is_not_cached(lab: Map, monkeypatch: pytest.M
     reading = lab.cameras._reading
 
     @contextmanager
-    def slow() -> Iterator[Connection]:
+    def slow() -> Iterator[MapConnection]:
         """The mask is changed between the reading and what is made of it."""
         with reading() as connection:
             yield connection

@@ -9,9 +9,11 @@ from dataclasses import replace
 import pytest
 
 from core.geometry.keypoints import Keypoints
+from core.ledger.maps import frames
 from core.maps import Enrolment, SameFrame
 from core.places import PlaceFields
 from core.storage import Atlas, Map
+from core.storage.database.schema import driver_of
 from tests.core.storage.conftest import ROWS
 from tests.core.storage.frames import frame, keypoints_of
 
@@ -34,7 +36,7 @@ def bare(place_id: str, picture: str | None = None) -> Enrolment:
 
 def records(map_: Map) -> int:
     with map_._reading() as connection:
-        return int(connection.execute("SELECT count(*) FROM keypoints").fetchone()[0])
+        return frames.room(connection)[0]
 
 
 def test_they_are_read_in_the_order_of_the_rows_also_after_a_restart(atlas: Atlas, lab: Map) -> None:
@@ -117,7 +119,7 @@ DAMAGES = {
     "an empty record": "UPDATE keypoints SET record = x''",
     "the checksum": "UPDATE keypoints SET checksum = checksum + 1",
     "the record of another frame": "UPDATE keypoints SET (checksum, record) ="
-    " (SELECT checksum, record FROM keypoints WHERE place = 2) WHERE place = 1",
+    " (SELECT checksum, record FROM keypoints WHERE row = 1) WHERE row = 0",
 }
 
 
@@ -127,7 +129,7 @@ def test_damaged_ones_are_not_used_but_reported_and_found_again(
 ) -> None:
     lab.enrol([frame("a"), frame("b")])
     with lab._writing() as write:
-        write.connection.execute(damage.replace("WHERE place = 1", "") + " WHERE place = 1")
+        driver_of(write.connection).execute(damage.replace("WHERE row = 0", "") + " WHERE row = 0")
     with caplog.at_level(logging.ERROR):
         assert kept(lab, "a") is None
     assert "stored keypoints of place 'a'" in caplog.text
@@ -141,11 +143,10 @@ def test_damaged_ones_are_not_used_but_reported_and_found_again(
 
 def test_those_of_no_place_are_reported(lab: Map) -> None:
     lab.enrol([frame("a"), frame("b")])
-    with lab._reading() as connection:
-        connection.execute("PRAGMA foreign_keys = OFF")
-        connection.execute("DELETE FROM places WHERE id = 'b'")
-        connection.execute("PRAGMA foreign_keys = ON")
-    assert any("row 2 of keypoints belongs to nothing in places" in problem for problem in lab.verify().problems)
+    with lab._writing() as write:
+        driver_of(write.connection).execute("DELETE FROM places WHERE id = 'b'")
+        driver_of(write.connection).execute("DELETE FROM pictures WHERE row = 1")
+    assert any("pictures or keypoints of 1 rows belong to no place" in problem for problem in lab.verify().problems)
 
 
 def test_the_status_of_a_map_counts_them(atlas: Atlas, lab: Map) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,17 +24,20 @@ from core.errors import (
 )
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import Calibration
+from core.ledger.maps import frames, places
 from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
+from core.storage.database import connections
+from core.storage.database.schema import driver_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
 
 
 def changes(lab: Map, *items: object) -> list[str]:
-    return [change for _, change in lab.enrol(items)]  # type: ignore[arg-type]
+    return [change for _, change in lab.enrol(items)]
 
 
 def best(lab: Map, shown: str) -> str | None:
@@ -142,7 +146,7 @@ def test_a_batch_over_several_segments_is_searched(lab: Map) -> None:
 def test_one_wrong_item_refuses_them_all(lab: Map, wrong: object, error: type[Exception]) -> None:
     lab.enrol([frame("before")])
     with pytest.raises(error):
-        lab.enrol([frame("p"), wrong])  # type: ignore[list-item]
+        lab.enrol([frame("p"), wrong])
     assert lab.count_places() == 1
     with pytest.raises(UnknownPlace):
         lab.place("p")
@@ -417,12 +421,13 @@ def test_a_deleted_map_answers_no_more(lab: Map, atlas: Atlas) -> None:
 def test_a_damaged_picture_is_not_handed_out(lab: Map, value: str) -> None:
     lab.enrol([frame("p")])
     with lab._writing() as write:
+        driver = driver_of(write.connection)
         if value == "x'00'":
-            write.connection.execute(f"UPDATE pictures SET bytes = {value}")
+            driver.execute(f"UPDATE pictures SET bytes = {value}")
         else:  # a flipped bit may change the type of a value, which the table itself does not allow
-            write.connection.execute("DROP TABLE pictures")
-            write.connection.execute("CREATE TABLE pictures (place, bytes, digest)")
-            write.connection.execute(f"INSERT INTO pictures SELECT number, {value}, x'00' FROM places")
+            driver.execute("DROP TABLE pictures")
+            driver.execute("CREATE TABLE pictures (map, row, digest, size, bytes, object)")
+            driver.execute(f"INSERT INTO pictures SELECT map, row, x'00', 1, {value}, NULL FROM places")
     for read in (lab.thumbnail, lab.picture):
         with pytest.raises(StorageFailure, match="damaged"):
             read("p")
@@ -459,3 +464,54 @@ def test_a_sequence_of_an_older_map_keeps_its_name(directory: Path, name: str) -
             lab.patch("p1", {"sequence": name})
         assert lab.forget_all(PlaceFilter(None, name), 10) == ["p0", "p2"]
         assert [one.name for one in lab.sequences(None, 10)[0]] == ["monday"]
+
+
+def statements_of(lab: Map, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[str]]:
+    """The statements that SQLite receives from now on, through the connection that writes and through all others."""
+    opened = lab._opened
+    assert opened is not None
+    written: list[str] = []
+    read: list[str] = []
+    opened.database._writer.set_trace_callback(written.append)
+    connect = connections.connect
+
+    def traced(path: Path) -> sqlite3.Connection:
+        connection = connect(path)
+        connection.set_trace_callback(read.append)
+        return connection
+
+    monkeypatch.setattr(connections, "connect", traced)
+    for reader in opened.database._idle:
+        reader.set_trace_callback(read.append)
+    return written, read
+
+
+def test_an_enrolment_is_one_transaction_that_is_synced(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.enrol([frame("p0", sequence="s", metadata={"floor": 1})])
+    written, read = statements_of(lab, monkeypatch)
+    lab.enrol([frame("p1", sequence="s", metadata={"floor": 1})])
+    assert (written[0], written[-1]) == ("BEGIN IMMEDIATE", "COMMIT")
+    words = [statement.split()[0] for statement in written]
+    assert words.count("BEGIN") == words.count("COMMIT") == 1 and set(words) <= {*SQL, "BEGIN", "COMMIT"}
+    assert read == []
+    opened = lab._opened
+    assert opened is not None
+    assert opened.database._writer.execute("PRAGMA synchronous").fetchone() == (2,)
+    assert opened.database._writer.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    written.clear()
+    lab.enrol([frame("p1", sequence="s", metadata={"floor": 1})])
+    assert not [one for one in written if one.split()[0] in SQL - {"SELECT"}], "nothing changes"
+    assert read == []
+
+
+SQL = {"SELECT", "INSERT", "UPDATE", "DELETE"}
+
+
+def test_a_reading_is_of_one_moment(lab: Map) -> None:
+    lab.enrol([frame("p0")])
+    with lab._reading() as connection:
+        stored = places.expect(connection, "p0")
+        lab.enrol([frame("p0", "another picture"), frame("p1")])
+        assert places.expect(connection, "p0") == stored and places.count(connection) == 1
+        assert frames.pictures_at(connection, [stored.row]) == {stored.row: b"thumbnail of p0"}
+    assert lab.count_places() == 2 and lab.picture("p0") == b"thumbnail of another picture"

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined
+from core.ledger.maps import places
+from core.ledger.maps.places import token_of
 from core.storage import Atlas
 from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import (
@@ -32,7 +34,9 @@ def folder(directory: Path) -> Path:
     """Of a map of ten places, closed; beside it a map that must always serve."""
     atlas = Atlas(directory, rows_per_segment=4)
     atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("h")])
-    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(PLACES)])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
+        [frame(f"p{i}", sequence="s" if i == PLACES - 1 else None) for i in range(PLACES)]
+    )
     atlas.close()
     return directory / "maps" / "lab"
 
@@ -157,6 +161,26 @@ def lose_a_segment(folder: Path) -> None:
     run(folder, "DELETE FROM segments WHERE number = 1")
 
 
+def count_another_place(folder: Path) -> None:
+    run(folder, "UPDATE maps SET places = places + 1")
+
+
+def count_a_row_less(folder: Path) -> None:
+    run(folder, "UPDATE maps SET rows = rows - 1")
+
+
+def count_numbers_again(folder: Path) -> None:
+    run(folder, "UPDATE maps SET numbers = 10")
+
+
+def count_codes_again(folder: Path) -> None:
+    run(folder, "UPDATE maps SET codes = 0")
+
+
+def lose_a_sequence(folder: Path) -> None:
+    run(folder, "DELETE FROM sequences WHERE name = 's'")
+
+
 def spoil_a_pose(folder: Path) -> None:
     run(folder, "UPDATE places SET x = 1 WHERE id = 'p3'")
 
@@ -175,6 +199,11 @@ def spoil_a_pose(folder: Path) -> None:
         (name_a_row_there_is_not, r"map\.sqlite: a place has row 4711, but there are 10"),
         (name_another_checksum, r"descriptors-000003\.seg: row 9 is of another frame"),
         (lose_a_segment, r"map\.sqlite: segment 2 is not as long"),
+        (count_another_place, r"map\.sqlite: its record counts 11 places in 10 rows, but there are 10 in 10"),
+        (count_a_row_less, r"map\.sqlite: its record counts 10 places in 9 rows, but there are 10 in 10"),
+        (count_numbers_again, r"map\.sqlite: the next number of a place, 10, is not above those there are"),
+        (count_codes_again, r"map\.sqlite: the next code of a sequence, 0, is not above those there are"),
+        (lose_a_sequence, r"map\.sqlite: place 'p9' is of a sequence that is missing"),
         (spoil_a_pose, r"map\.sqlite: .*a pose in metres needs x and y"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -207,14 +236,15 @@ def test_an_index_of_metadata_that_is_wrong_is_rebuilt(directory: Path, caplog: 
     lab.enrol([frame(f"p{i}", metadata={"floor": i, "note": "a"}) for i in range(3)])
     atlas.close()
     folder = directory / "maps" / "lab"
-    run(folder, "UPDATE place_values SET value = 7 WHERE key = 'floor' AND row = 1")
-    run(folder, "DELETE FROM place_values WHERE key = 'note' AND row = 2")
+    run(folder, f"UPDATE tokens SET token = '{token_of('floor', 7)}' WHERE token = '{token_of('floor', 1)}'")
+    run(folder, f"DELETE FROM tokens WHERE token = '{token_of('note', 'a')}' AND row = 2")
     atlas = Atlas(directory)
     lab = atlas.get("lab")
     assert "is rebuilt" in caplog.text and "map lab" in caplog.text.lower()
-    assert lab.attributes.rows_with({"floor": 1}).tolist() == [1]
-    assert lab.attributes.rows_with({"floor": 7}).tolist() == []
-    assert lab.attributes.rows_with({"note": "a"}).tolist() == [0, 1, 2]
+    with lab._reading() as connection:
+        assert places.rows_with(connection, {"floor": 1}).tolist() == [1]
+        assert places.rows_with(connection, {"floor": 7}).tolist() == []
+        assert places.rows_with(connection, {"note": "a"}).tolist() == [0, 1, 2]
     assert lab.verify().ok
     atlas.close()
     caplog.clear()

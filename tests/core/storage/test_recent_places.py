@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
 
-from core.places import Place, PlaceFields, Pose
+from core.ledger.maps import places
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.places import StoredPlace
+from core.places import PlaceFields, Pose
 from core.storage import Map
-from core.storage.database import ledger
 from core.storage.map import LONGEST_METADATA, MOST_RECENT, RecentPlaces
 from tests.core.storage.frames import frame
 
@@ -20,14 +21,14 @@ from tests.core.storage.frames import frame
 def reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[list[int]]]:
     """The rows that are looked up in SQLite meanwhile."""
     asked: list[list[int]] = []
-    read = ledger.places_of_rows
+    read = places.at_rows
 
-    def watched(connection: sqlite3.Connection, rows: list[int]) -> dict[int, Place]:
+    def watched(connection: MapConnection, rows: list[int]) -> dict[int, StoredPlace]:
         asked.append(rows)
         return read(connection, rows)
 
     with monkeypatch.context() as patched:
-        patched.setattr(ledger, "places_of_rows", watched)
+        patched.setattr(places, "at_rows", watched)
         yield asked
 
 
@@ -71,7 +72,7 @@ def test_a_write_that_fails_changes_nothing(lab: Map) -> None:
     lab.enrol([frame("p0"), frame("p1")])
     before = lab.places_at([0, 1])
     with pytest.raises(RuntimeError), lab._writing() as write:
-        write.forget(ledger.expect(write.connection, "p0"))
+        write.forget(places.expect(write.connection, "p0"))
         assert lab.places_at([0, 1]) == before
         raise RuntimeError
     assert lab.places_at([0, 1]) == before

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import httpx
 import pytest
+from sqlalchemy import column, select, table
 
 from core.errors import StorageFailure
+from core.ledger import Statement
 from service.access.keys import Keys
 from service.access.rates import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
 from service.app.application import create_app
@@ -20,6 +22,8 @@ from tests.service.wire import eventually
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
+
+_NAMES = Statement(select(column("name")).select_from(table("rates")).order_by(column("name")))
 
 SLOW = 0.01
 """A rate at which no test gets another token."""
@@ -99,9 +103,8 @@ def test_services_exchange_both_limits_by_themselves(database: SharedDatabase) -
             one.admit("ann")
         assert eventually(lambda: other.wait("ann") > 1.5 / SLOW), "more than what it let through itself"
         one.admit_failure("10.0.0.1")
-        names = "SELECT name FROM rates ORDER BY name"
         found = [("failure 10.0.0.1",), ("request ann",)]
-        assert eventually(lambda: database.query("list the buckets", names) == found)
+        assert eventually(lambda: database.execute("list the buckets", _NAMES) == found)
 
 
 @pytest.mark.cluster

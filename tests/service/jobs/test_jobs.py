@@ -211,12 +211,12 @@ async def test_watchers_are_bounded(running: Running, tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path, most_watchers=1) as jobs:
         job = jobs.submit("gate", None, gate)
-        with jobs.watching(job.id) as changed:
-            with pytest.raises(TooManyWatchers), jobs.watching(job.id):
+        with jobs.watchers.watching(job.id) as changed:
+            with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
                 pass
             gate.open.set()
             await changed.wait()
-        with jobs.watching(job.id):
+        with jobs.watchers.watching(job.id):
             pass
 
 

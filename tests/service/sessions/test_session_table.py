@@ -117,7 +117,7 @@ def test_a_request_finds_the_session_that_it_began(ledger: Ledger, table: Sessio
     assert table.begun("robot, request 7", NEW) == "s-1"
     assert table.begun("robot, request 8", NEW) is None
     for other in ({"map": "hall"}, {"map_created_at": "2025"}, {"options": "{}"}, {"expires_after": 60.0}):
-        assert table.begun("robot, request 7", replace(NEW, **other)) is None  # type: ignore[arg-type]
+        assert table.begun("robot, request 7", replace(NEW, **other)) is None
     pass_by(ledger, "s-1", REPEATED_SECONDS)
     assert table.begun("robot, request 7", NEW) is None
     pass_by(ledger, "s-1", -REPEATED_SECONDS)
@@ -151,7 +151,9 @@ def test_any_order_of_writes(table: SessionTable, steps: list[tuple[str, str, in
             model[name] = replace(NEW, id=name, state=state)
             table.add(model[name], MOST)
         elif kind == "renew":
-            frame = replace(known or replace(NEW, id=name), number=number, moment=number / 7, frames=number, state=state)
+            frame = replace(
+                known or replace(NEW, id=name), number=number, moment=number / 7, frames=number, state=state
+            )
             lives = known is not None and known.ended is None
             assert table.renew(frame) == lives
             if lives:

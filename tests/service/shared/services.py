@@ -40,7 +40,7 @@ def two_services(
         shutil.copytree(prepared / "data", folder / name / "data")
         (folder / name / "data" / FILE).unlink(missing_ok=True)
         shutil.copytree(prepared / "models", folder / name / "models")
-        given = {"encoder": COARSE, "postgres": address, **settings}
+        given = {"encoder": COARSE, "database": address, **settings}
         servers.append(Server(folder / name, settings=given, key=key))
     try:
         for server in servers:

@@ -61,7 +61,7 @@ def test_a_clock_that_is_five_minutes_slow(postgres: Postgres, prepared: Path, t
         for part in ("data", "models"):
             shutil.copytree(prepared / part, tmp_path / name / part)
         (tmp_path / name / "data" / FILE).unlink(missing_ok=True)
-        servers.append(Server(tmp_path / name, {"encoder": COARSE, "postgres": postgres.address}, wrapper=wrapper))
+        servers.append(Server(tmp_path / name, {"encoder": COARSE, "database": postgres.address}, wrapper=wrapper))
     right, slow = (server.wait() for server in servers)
     until = time.monotonic() + 60
     while "PostgreSQL" not in (said := slow.client.get("/readyz").json()["checks"]["others"]):

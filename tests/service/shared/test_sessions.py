@@ -106,7 +106,7 @@ def test_a_killed_service_and_a_database_that_is_away(
             assert time.monotonic() < until
             time.sleep(0.2)
         assert "PostgreSQL" in other.client.get("/readyz").json()["checks"]["replica"]
-        late = Server(tmp_path / "one", settings={"encoder": COARSE, "postgres": postgres.address}).wait("/livez")
+        late = Server(tmp_path / "one", settings={"encoder": COARSE, "database": postgres.address}).wait("/livez")
     finally:
         postgres.server.start()
     other.wait()  # it is ready again by itself, and so is one that was started in the meantime

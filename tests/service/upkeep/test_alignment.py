@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.ledger.maps.counterparts import Counterparts
 from core.maps import Enrolment, Map, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage.counterparts import Counterparts
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
 from service.jobs.job import Job

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import sqlite3
 import threading
 from pathlib import Path
 
@@ -13,12 +12,14 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.ledger.maps.connection import MapConnection
 from core.maps import MapSettings
 from core.maps.archives import writing
 from core.places import Neighborhood
 from core.storage import Atlas, Map
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
+from core.storage.database.schema import driver_of
 from core.storage.files.row_formats import COMPRESSED, HALF
 from tests.core.storage.archives.files import exported, imported, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
@@ -76,7 +77,7 @@ def test_what_comes_back_is_what_was_there(
 
 def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
     with full._writing() as write:
-        write.connection.execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE place = 1")
+        driver_of(write.connection).execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE row = 0")
     with pytest.raises(StorageFailure, match="The stored keypoints of place 'p0' do not match their checksum"):
         full.exporter.write(tmp_path / "kept.tar")
     assert not (tmp_path / "kept.tar").exists()
@@ -248,8 +249,8 @@ def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, a
 def test_the_first_error_is_reported(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite ends some transactions by itself, when the disk fails."""
 
-    def ended(connection: sqlite3.Connection) -> None:
-        connection.execute("ROLLBACK")
+    def ended(connection: MapConnection, map_id: str) -> None:
+        driver_of(connection).execute("ROLLBACK")
         raise RuntimeError("the first of it")
 
     monkeypatch.setattr(exporter, "read_layout", ended)
