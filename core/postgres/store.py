@@ -82,7 +82,7 @@ class PostgresStore(ABC, Generic[MapT]):
 
     @abstractmethod
     def _deleting(self, map_: MapT) -> AbstractContextManager[None]:
-        """What an engine does about a map that is deleted in the block."""
+        """A block in which a map is deleted, around which an engine deletes its own data of it."""
 
     @abstractmethod
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:

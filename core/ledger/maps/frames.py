@@ -1,4 +1,4 @@
-"""What is stored of a frame beside its descriptors, by its row: its picture and its keypoints.
+"""The data of a frame beside its descriptors, by its row: its picture and its keypoints.
 
 The checksum of keypoints covers the digest of the frame, so that keypoints of another frame do not match it.
 """
