@@ -1,4 +1,4 @@
-"""What a ledger offers to whoever keeps records in it, whatever database it is."""
+"""The interface of a ledger to those who keep records in it, whatever database it is."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ import pytest
 from core.maps import MapSettings
 from core.maps.store import HANDED_OVER, HAS_PICTURE
 from core.storage import Atlas
+from core.storage.database.schema import driver_of
 from service.errors.faults import PlanTooLarge
 from service.http.headers import accepts_gzip
 from service.places import plans
@@ -122,7 +123,7 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame("p0"), frame("p1")])
     with lab._writing() as write:
-        write.connection.execute("UPDATE places SET pose_of = 'p0' WHERE id = 'p1'")
+        driver_of(write.connection).execute("UPDATE places SET pose_of = 'p0' WHERE id = 'p1'")
     assert f'"flags":[{0},{HANDED_OVER}]' in lab.plan.columns().replace("2", "0").replace("3", "1")
     atlas.close()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.maps import Enrolment, Map, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage.counterparts import Counterparts
+from core.ledger.maps.counterparts import Counterparts
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
 from service.jobs.records import Job

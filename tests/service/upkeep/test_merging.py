@@ -18,7 +18,7 @@ from core.errors import StorageFull
 from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields
 from core.storage import Atlas
-from core.storage.transfer import Transfer
+from core.ledger.maps.transfer import Transfer
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.context import creation_time
