@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from benchmarks.report import report
 from service.access.gate import Access, endpoints_of
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.app.application import create_app
 from service.settings import Settings
 
@@ -86,7 +86,7 @@ async def measure(folder: Path) -> dict[str, float]:
         data_dir = folder / name
         headers = list(HEADERS)
         if with_key:
-            _, token = KeyStore(data_dir).create("robot", "query", None if path == last[1] else ["lab", "yard"])
+            _, token = Keys.of(data_dir).create("robot", "query", None if path == last[1] else ["lab", "yard"])
             headers.append((b"authorization", f"Bearer {token}".encode()))
         app = create_app(Settings(host="127.0.0.1", data_dir=data_dir, rate_per_key=1e6, rate_burst=1_000_000))
         layer = Access(_nothing, app.state.gate, endpoints_of(app.routes), app.state.metrics)

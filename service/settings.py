@@ -55,16 +55,23 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default=Path("data"), description="Directory of the maps; only one process at a time can use it."
     )
-    postgres: SecretStr | None = Field(
+    database: SecretStr | None = Field(
         default=None,
-        description="Address of the PostgreSQL in which services share their state (sessions, keys, jobs, rates, "
-        "statistics, events) and, with the store milvus, their maps, such as "
-        "postgresql://placerec:password@db/placerec; default: in the data directory.",
+        description="Address of the PostgreSQL that keeps maps, sessions, keys, jobs, rates, statistics and events for "
+        "any number of services, such as postgresql://placerec:password@db/placerec; default: they are in the data "
+        "directory of this one.",
     )
-    store: Literal["embedded", "milvus"] = Field(
-        default="embedded",
-        description="Where the maps are: in the data directory (embedded), or in a PostgreSQL and a Milvus (milvus), "
-        "which several services may use.",
+    vectors: Literal["auto", "files", "postgres", "milvus"] = Field(
+        default="auto",
+        description="What keeps the maps' descriptors and searches them: files in the data directory, PostgreSQL with "
+        "an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a database, else "
+        "postgres.",
+    )
+    row_cache_bytes: int = Field(
+        default=256 << 20,
+        ge=1 << 20,
+        description="With vectors in PostgreSQL: most bytes of descriptors, local descriptors and keypoints that were "
+        "read and are kept in memory.",
     )
     milvus: str | None = Field(
         default=None,
@@ -85,8 +92,8 @@ class Settings(BaseSettings):
     objects: str | None = Field(
         default=None,
         pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?$",
-        description="Bucket of an S3-compatible object store, and prefix in it, to which the store milvus puts new "
-        "pictures and thumbnails, such as s3://pictures/placerec; default: they are in PostgreSQL.",
+        description="Bucket of an S3-compatible object store, and prefix in it, to which new pictures and thumbnails "
+        "of maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
     )
     objects_endpoint: str | None = Field(
         default=None,
@@ -338,16 +345,23 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _store_has_addresses(self) -> Settings:
-        if self.store == "milvus":
-            for name in ("milvus", "postgres"):
-                if getattr(self, name) is None:
-                    raise ValueError(f"{PREFIX}STORE is milvus, which needs {PREFIX}{name.upper()}")
-        elif self.objects is not None:
-            raise ValueError(f"{PREFIX}OBJECTS is for {PREFIX}STORE=milvus alone")
+    def _vectors_have_addresses(self) -> Settings:
+        if self.vectors in ("postgres", "milvus") and self.database is None:
+            raise ValueError(f"{PREFIX}VECTORS is {self.vectors}, which needs {PREFIX}DATABASE")
+        if self.vectors == "milvus" and self.milvus is None:
+            raise ValueError(f"{PREFIX}VECTORS is milvus, which needs {PREFIX}MILVUS")
+        if self.objects is not None and self.engine == "files":
+            raise ValueError(f"{PREFIX}OBJECTS is for maps in a database: it needs {PREFIX}DATABASE")
         if bool(self.objects_access_key) != bool(self.objects_secret_key.get_secret_value()):
             raise ValueError(f"{PREFIX}OBJECTS_ACCESS_KEY and {PREFIX}OBJECTS_SECRET_KEY need each other")
         return self
+
+    @property
+    def engine(self) -> Literal["files", "postgres", "milvus"]:
+        """What keeps the maps' descriptors and searches them."""
+        if self.vectors != "auto":
+            return self.vectors
+        return "files" if self.database is None else "postgres"
 
     @property
     def models_directory(self) -> Path:

@@ -16,11 +16,12 @@ from dataclasses import replace
 import numpy as np
 import typer
 
+from core.ledger.maps.frames import StoredObject
 from core.maps import MapSettings
 from core.milvus import ledger, open_store
 from core.milvus.map import MilvusMap
-from core.milvus.pictures.objects import Objects
-from core.milvus.pictures.stored import StoredObject, new_object
+from core.postgres.pictures.objects import Objects
+from core.postgres.pictures.stored import new_object
 from tests.core.milvus.servers import running_servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 

@@ -13,22 +13,20 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from service.access.gate import Buckets
+from service.access.keys import Keys
+from service.access.rates import Buckets
 from service.jobs.jobs import Jobs
+from service.peers.replica import ServiceReplica
+from service.queries.count_tables import statistics_file
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
-from service.sessions.store import SessionStore, StoredSession
+from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.shared.database import SharedDatabase
-from service.shared.jobs import SharedJobs
-from service.shared.keys import SharedKeys
-from service.shared.rates import SharedBuckets
-from service.shared.replica import ServiceReplica
-from service.shared.sessions import SessionTable
-from service.shared.statistics import SharedStatistics
 from tests.service.shared.postgres import running_postgres
 
 BELIEF_BYTES = 8 << 10
@@ -50,28 +48,38 @@ def median(rounds: int, work: Callable[[int], object]) -> float:
     return statistics.median(taken[3:])
 
 
+def _renew(table: SessionTable, session: SessionRecord, number: int) -> None:
+    table.renew(replace(session, revision=number))
+
+
+def _look(table: SessionTable, _number: int) -> None:
+    table.head("s-1")
+
+
 def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
-    """A frame of a session: the reads before it and the writes after it."""
-    session = StoredSession(
-        "s-1", "lab", "2026", '{"expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
-        bytes(BELIEF_BYTES), '{"frame": 7}' + " " * 4000,
+    """A frame of a session: the look before it and the write after it."""
+    file = session_file(folder)
+    session = SessionRecord(
+        "s-1", "lab", "2026", "{}", 900.0, number=7, moment=3.5, request="robot", lost=0, state=bytes(BELIEF_BYTES),
+        answer='{"frame": 7}' + " " * 4000,
     )  # fmt: skip
-    store, table = SessionStore(folder), SessionTable(database)
-    store.write(session)
-    table.write(session)
-    read = median(rounds, lambda _: (table.head("s-1"), table.newer("s-1", 0)))
-    print(f"session, read before a frame     {'':>8}  {read:8.2f}")
-    saved = median(rounds, lambda _: store.renew(session)), median(rounds, lambda n: table.renew(session, n))
+    read, saved = [], []
+    for ledger in (file, database):
+        table = SessionTable(ledger)
+        table.add(session, 100)
+        saved.append(median(rounds, partial(_renew, table, session)))
+        read.append(median(rounds, partial(_look, table)))
+    print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
-    store.close()
+    file.close()
 
 
 def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """A job that does nothing, from its submission to its end."""
     replica = ServiceReplica(database, folder)
-    shared = SharedJobs(replica, shared_maps=True)
+    shared = Jobs(database, replica, shared_maps=True)
     found = []
-    for jobs in (Jobs(folder), shared):
+    for jobs in (Jobs.of_directory(folder), shared):
         jobs.register("nothing", lambda _: {})
         if jobs is shared:
             replica.start()
@@ -94,24 +102,44 @@ def _token(buckets: Buckets, number: int) -> None:
 
 def of_rates(database: SharedDatabase, rounds: int) -> None:
     """A token, and an exchange for a hundred keys."""
-    alone, shared = Buckets(1e6, 1000), SharedBuckets(database, "request", 1e6, 1000)
+    alone, shared = Buckets(1e6, 1000), Buckets(1e6, 1000, kind="request")
     taken = [median(rounds, partial(_token, buckets)) for buckets in (alone, shared)]
     print(f"rate, a token                    {taken[0]:8.4f}  {taken[1]:8.4f}")
 
     def exchange(_: int) -> None:
         for number in range(100):
             shared.take(f"k{number}")
-        shared.exchange()
+        shared.exchange(database)
 
     print(f"rate, an exchange of 100 keys    {'':>8}  {median(rounds, exchange):8.2f}")
+
+
+def _look(keys: Keys, _: int) -> None:
+    keys.place.version(expected=True)
+
+
+def _read(keys: Keys, _: int) -> None:
+    keys.all()
+
+
+def of_keys(folder: Path, database: SharedDatabase, rounds: int) -> None:
+    """Looking whether a key has changed, and reading all keys."""
+    both = Keys.of(folder), Keys.of(folder, database)
+    for keys in both:
+        for number in range(100):
+            keys.create(f"robot-{number}", "query")
+    looks = [median(rounds, partial(_look, keys)) for keys in both]
+    reads = [median(rounds, partial(_read, keys)) for keys in both]
+    print(f"keys, whether they changed       {looks[0]:8.2f}  {looks[1]:8.2f}")
+    print(f"keys, reading 100 of them        {reads[0]:8.2f}  {reads[1]:8.2f}")
+    both[0].place.close()
 
 
 def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
     """Adding the counts of some answers, and the answers themselves."""
     sizes, present = {KEY: ANSWERS}, {f"p{n}" for n in range(ANSWERS)}
-    embedded = QueryStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared = SharedStatistics(folder, 3600, lambda: sizes, lambda _: present)
-    shared.share(database)
+    embedded = QueryStatistics(statistics_file(folder), 3600, lambda: sizes, lambda _: present)
+    shared = QueryStatistics(database, 3600, lambda: sizes, lambda _: present, shared=True)
     found = []
     for counted in (embedded, shared):
 
@@ -162,9 +190,7 @@ def main() -> None:
         of_jobs(folders[1], database, rounds)
         of_rates(database, rounds)
         of_statistics(folders[0], database, rounds)
-        print(
-            f"keys, asking for their version   {'':>8}  {median(rounds, lambda _: SharedKeys(database).version()):8.2f}"
-        )
+        of_keys(folders[0], database, rounds)
         of_notices(folders[2:], postgres.address, rounds)
         database.close()
 

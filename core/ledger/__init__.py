@@ -3,7 +3,8 @@
 Tables and statements are SQLAlchemy's; each statement is compiled once for each dialect, and its text is then executed
 by the driver alone, so that a hot statement costs what it cost when it was text (:mod:`core.ledger.statements`).
 Transactions are explicit: ``BEGIN IMMEDIATE`` and ``synchronous=FULL`` in SQLite (:mod:`core.ledger.sqlite`),
-``synchronous_commit`` in PostgreSQL (:mod:`core.ledger.postgres`).
+``synchronous_commit`` in PostgreSQL (:mod:`core.ledger.postgres`).  Many rows are put by one statement
+(:mod:`core.ledger.rows`); a file that may be lost is made anew when it is damaged (:mod:`core.ledger.disposable`).
 """
 
 from core.ledger.database import Connection, Ledger, Lock

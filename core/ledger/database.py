@@ -13,7 +13,7 @@ from core.ledger.statements import DialectName, Statement
 class Lock(IntEnum):
     """The numbers by which transactions of several services wait for one another; nothing else may use them."""
 
-    MAPS_TABLES = 7_061_636_572
+    MAPS = 7_061_636_572
     TABLES = 7_061_636_573
     SESSIONS = 7_061_636_574
     JOBS = 7_061_636_575

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Literal
 
 import psycopg
-from psycopg import Connection
+from psycopg import Connection, IsolationLevel
 from psycopg.conninfo import conninfo_to_dict
 from psycopg_pool import ConnectionPool, PoolTimeout
 
@@ -34,9 +34,42 @@ SETTINGS: Mapping[str, Any] = {
     "tcp_user_timeout": 10_000,
 }
 
+ANSWER_SECONDS = 10.0
+"""How long a statement may take before PostgreSQL counts as silent, and the connection is given up.
+
+This is the client's own deadline: a server whose processes stand still, or a network that swallows packets, ends no
+connection by itself for minutes."""
+
+PROBE_SECONDS = 2
+"""How long it may take to answer to a connection that has not been used for a while, or after an outage."""
+
+LONG_SECONDS = 600.0
+"""The same for statements that may rightly take long: those that wait for a lock, or delete a map."""
+
 # The pool waits twice as long between two attempts each time, up to minutes; after this time it gives up, and the
 # next request begins anew.
 _RECONNECTING_SECONDS = 1.0
+
+
+class TimedConnection(Connection[Any]):
+    """A connection that is given up when a statement gets no answer in time.
+
+    seconds: how long each statement may take.
+    """
+
+    seconds = ANSWER_SECONDS
+
+    def wait(self, gen: Any, interval: float = 0.1, timeout: float | None = None) -> Any:
+        """Wait for the answer to a statement; psycopg calls this for each.
+
+        Raises:
+            psycopg.OperationalError: there is none in time; the connection is closed.
+        """
+        try:
+            return super().wait(gen, interval=interval, timeout=self.seconds if timeout is None else timeout)
+        except psycopg.errors._WaitTimeout as error:
+            self.pgconn.finish()
+            raise psycopg.OperationalError(f"it does not answer within {self.seconds:.0f} s") from error
 
 
 @contextmanager
@@ -115,44 +148,61 @@ class Postgres:
     ) -> None:
         self.address, self._make_tables, self._most = address, make_tables, most_connections
         self._settings, self._configure = {**SETTINGS, **settings}, configure
-        self._outage = Outage("PostgreSQL")
+        self._outage = Outage("PostgreSQL", probe=self._probe)
         self._opening = threading.Lock()
-        self._pool: ConnectionPool[Connection[Any]] | None = None
+        self._pool: ConnectionPool[TimedConnection] | None = None
 
-    def _opened(self) -> ConnectionPool[Connection[Any]]:
+    def _opened(self) -> ConnectionPool[TimedConnection]:
         """The pool of connections to a database whose tables are there."""
         if (pool := self._pool) is not None:
             return pool
         with self._opening:
             if self._pool is None:
-                with self.alone("make its tables") as connection, connection.transaction():
+                with self.alone("make its tables", LONG_SECONDS) as connection, connection.transaction():
                     self._make_tables(connection)
                 self._pool = ConnectionPool(
-                    self.address, min_size=1, max_size=self._most, timeout=PATIENCE_SECONDS, kwargs=self._settings,
-                    configure=self._configure, check=ConnectionPool.check_connection, open=True,
+                    self.address, connection_class=TimedConnection, min_size=1, max_size=self._most,
+                    timeout=PATIENCE_SECONDS, kwargs=self._settings,
+                    configure=self._configure, check=_check, open=True,
                     reconnect_timeout=_RECONNECTING_SECONDS,
                 )  # fmt: skip
             return self._pool
 
     @contextmanager
-    def alone(self, action: str) -> Iterator[Connection[Any]]:
-        """A connection outside the pool, which says why there is none."""
+    def alone(self, action: str, seconds: float = ANSWER_SECONDS) -> Iterator[TimedConnection]:
+        """A connection outside the pool, which says why there is none.
+
+        Args:
+            seconds: how long each statement may take.
+        """
         check_address(self.address)
-        with postgres_errors(action), psycopg.connect(self.address, **self._settings) as connection:
+        with postgres_errors(action), TimedConnection.connect(self.address, **self._settings) as connection:
+            connection.seconds = seconds
             yield connection
 
+    def _probe(self) -> None:
+        """Raise Unreachable unless PostgreSQL answers soon."""
+        settings = {**self._settings, "connect_timeout": PROBE_SECONDS}
+        with postgres_errors("answer"), TimedConnection.connect(self.address, **settings) as connection:
+            _check(connection)
+
     @contextmanager
-    def connection(self, action: str) -> Iterator[Connection[Any]]:
+    def connection(self, action: str, seconds: float = ANSWER_SECONDS) -> Iterator[TimedConnection]:
         """A connection of the pool; uncommitted changes of the block are undone if it raises, else committed.
 
         Args:
             action: the work of the block, for the message of an error.
+            seconds: how long each statement may take.
         """
         with self._outage.noticed():
             pool = self._opened()
             try:
                 with postgres_errors(action), pool.connection() as connection:
-                    yield connection
+                    connection.seconds = seconds
+                    try:
+                        yield connection
+                    finally:
+                        connection.seconds = ANSWER_SECONDS
             except PoolTimeout as error:
                 with self.alone("answer"):  # raises if it cannot be reached
                     pass
@@ -164,6 +214,13 @@ class Postgres:
             pool, self._pool = self._pool, None
         if pool is not None:
             pool.close()
+
+
+def _check(connection: TimedConnection) -> None:
+    """Raise unless a connection answers soon."""
+    connection.seconds = PROBE_SECONDS
+    ConnectionPool.check_connection(connection)
+    connection.seconds = ANSWER_SECONDS
 
 
 class PostgresConnection:
@@ -234,7 +291,7 @@ class PostgresLedger(Postgres):
 
     Args:
         tables: of the parts that are kept in it.
-        statement_seconds: how long a statement may take.
+        statement_seconds: how long a statement may take; 0: as long as it takes.
     """
 
     def __init__(
@@ -259,13 +316,77 @@ class PostgresLedger(Postgres):
             return PostgresConnection(connection).change(statement, **values)
 
     @contextmanager
-    def transaction(self, action: str, lock: Lock | None = None) -> Iterator[PostgresConnection]:
+    def transaction(
+        self, action: str, lock: Lock | None = None, seconds: float = 2 * ANSWER_SECONDS
+    ) -> Iterator[PostgresConnection]:
         """A transaction that is committed at the end of the block, and undone if it raises.
 
         Args:
             lock: only one transaction with it runs at a time, over all services.
+            seconds: how long each statement may take, waiting for others' locks included.
         """
-        with self.connection(action) as connection, connection.transaction():
+        with self.connection(action, seconds) as connection, connection.transaction():
             if lock is not None:
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (lock,))
             yield PostgresConnection(connection)
+
+    @contextmanager
+    def reading(self, action: str = "read") -> Iterator[PostgresConnection]:
+        """A transaction that sees the moment of its first statement, and writes nothing."""
+        with self.connection(action) as connection:
+            connection.isolation_level, connection.read_only = IsolationLevel.REPEATABLE_READ, True
+            try:
+                with connection.transaction():
+                    yield PostgresConnection(connection)
+            finally:
+                with suppress(psycopg.Error):  # a lost connection is thrown away
+                    connection.isolation_level, connection.read_only = None, None
+
+    @contextmanager
+    def locked(
+        self, action: str, kind: int, number: int, wait: bool = True, shared: bool = False
+    ) -> Iterator[PostgresConnection | None]:
+        """Hold a lock of the database on a connection of its own; None if another has it and ``wait`` is not set.
+
+        Others may hold a ``shared`` one as well, if theirs is shared too.  The lock is gone when the connection is
+        lost, and then the connection takes no further statement.
+        """
+        key, how = (kind, number % 2**31), "_shared" if shared else ""
+        with self.connection(action, LONG_SECONDS) as connection:
+            if wait:
+                connection.execute(f"SELECT pg_advisory_lock{how}(%s::int, %s::int)", key)
+            elif connection.execute(f"SELECT pg_try_advisory_lock{how}(%s::int, %s::int)", key).fetchone() != (True,):
+                yield None
+                return
+            try:
+                yield PostgresConnection(connection)
+            finally:
+                with suppress(psycopg.Error):  # a lost connection has no lock
+                    connection.execute(f"SELECT pg_advisory_unlock{how}(%s::int, %s::int)", key)
+
+    def check(self) -> None:
+        """Ask it whether it takes writes.
+
+        Raises:
+            StoreUnavailable, StoreOfAnotherVersion, StorageFailure: it does not.
+        """
+        with self.connection("answer") as connection:
+            found = connection.execute("SELECT pg_is_in_recovery()").fetchone()
+        if found != (False,):
+            raise Unreachable("PostgreSQL", "takes no writes: it is a standby.")
+
+    def notify(self, action: str, channel: str, text: str) -> None:
+        """Send a text, of at most 7999 bytes, to those who listen to a channel now."""
+        with self.connection(action) as connection:
+            connection.execute("SELECT pg_notify(%s, %s)", (channel, text))
+
+    @contextmanager
+    def listening(self, channel: str) -> Iterator[Callable[[float], Iterator[str]]]:
+        """Listen to a channel in the block, by a connection outside the pool.
+
+        Yields:
+            A function that waits for some seconds, and gives the texts that arrive meanwhile.
+        """
+        with self.alone("listen") as connection:
+            connection.execute(f"LISTEN {channel}")
+            yield lambda seconds: (notice.payload for notice in connection.notifies(timeout=seconds))

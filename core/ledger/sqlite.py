@@ -22,11 +22,12 @@ def file_of(
     settings: Mapping[str, str | int] = DURABLE,
     checks: Sequence[str] = (),
     check_whole: bool = True,
+    timeout: float = 30,
 ) -> SqliteFile:
     """The SQLite file that has some tables (:class:`core.disk.sqlite_file.SqliteFile`)."""
     create = tables.create("sqlite")
     schema = Schema(tables.application_id, tables.version, create, lambda version: tables.migrate("sqlite", version))
-    return SqliteFile(path, schema, settings, checks, check_whole)
+    return SqliteFile(path, schema, settings, checks, check_whole, timeout)
 
 
 class SqliteConnection:

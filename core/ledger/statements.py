@@ -6,6 +6,7 @@ Parameters are bound by name (``bindparam("id")``).  A parameter of :func:`among
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -29,6 +30,12 @@ Insert = Callable[..., Any]
 
 INSERTS: Mapping[str, Insert] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 
+UNFINDABLE = "\x1a"
+"""A text that is never stored: no name has a control character."""
+
+_NEVER_STORED = re.compile("[\\x00\\ud800-\\udfff]")
+"""A zero character, which PostgreSQL refuses, or half of a surrogate pair, which both refuse."""
+
 
 @dataclass(frozen=True)
 class Compiled:
@@ -36,11 +43,13 @@ class Compiled:
 
     names: of its parameters in the order of their marks; None where they are bound by name.
     constants: values of parameters that the statement itself gives.
+    finds: whether it stores no parameter, so that a text that is never stored is one that it does not find.
     """
 
     text: str
     names: tuple[str, ...] | None
     constants: Mapping[str, Any]
+    finds: bool
 
     def values(self, given: Mapping[str, Any]) -> Any:
         """The parameters as the driver takes them.
@@ -49,7 +58,18 @@ class Compiled:
             KeyError: a parameter has no value.
         """
         whole = {**self.constants, **given} if self.constants else given
+        if self.finds:
+            whole = {name: _findable(value) for name, value in whole.items()}
         return whole if self.names is None else tuple([_plain(whole[name]) for name in self.names])
+
+
+def _findable(value: Any) -> Any:
+    """A value that a database takes: a text that is never stored is replaced, or left out of a list."""
+    if isinstance(value, str):
+        return UNFINDABLE if _NEVER_STORED.search(value) else value
+    if isinstance(value, list) and value and isinstance(value[0], str):
+        return [one for one in value if not _NEVER_STORED.search(one)]
+    return value
 
 
 def _plain(value: Any) -> Any:
@@ -82,7 +102,7 @@ class Statement:
         assert isinstance(made, SQLCompiler)
         constants = {key: value for key, value in made.params.items() if value is not None}
         names = None if made.positiontup is None else tuple(made.positiontup)
-        return Compiled(str(made), names, constants)
+        return Compiled(str(made), names, constants, finds=not (made.isinsert or made.isupdate))
 
 
 class among(ColumnElement[bool]):  # noqa: N801 – an expression, as SQLAlchemy names its own

@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING
 
 from core.errors import MissingExtra
-from core.milvus.pictures.bucket import Bucket
+from core.postgres.pictures.bucket import Bucket
 
 if TYPE_CHECKING:
     from core.milvus.store import MilvusStore
@@ -45,6 +45,6 @@ def open_store(
         if error.name not in ("obstore", "psycopg", "psycopg_pool", "pymilvus"):
             raise
         raise MissingExtra(
-            f"Maps in PostgreSQL and Milvus need {error.name}, which others do not: pip install 'placerec[milvus]', or"
-            " in a checkout .venv/bin/pip install --editable '.[milvus]'."
+            f"Maps in PostgreSQL and Milvus need {error.name}, which others do not: pip install"
+            " 'placerec[cluster,milvus]', or in a checkout .venv/bin/pip install --editable '.[cluster,milvus]'."
         ) from error

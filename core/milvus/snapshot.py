@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from psycopg import Connection
 
 from core.errors import UnknownPlace
 from core.judgement.priors import LARGEST_TRUST, Constraint, InSequences, NotLately, Values, holding, log_weights
-from core.maps.place_filter import EVERY_PLACE
+from core.ledger.maps import places, sequences
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.places import StoredPlace, tokens_of, wanted_tokens, whereabouts_of
+from core.ledger.maps.record import MapState
+from core.ledger.postgres import PostgresLedger
 from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions, Selection
 from core.maps.store import Ranking, Rows, merged
-from core.milvus import ledger
 from core.milvus.collection import MOST_FOUND, Collection
-from core.milvus.database import Database
 from core.milvus.expressions import all_of, any_row, bounds_of, with_tokens
-from core.milvus.forms import Form
-from core.milvus.ledger import MapState, PlaceEntry, whereabouts_of
-from core.milvus.tokens import tokens_of
 from core.places import NO_POSE, Neighborhood, Whereabouts
+from core.postgres import rows as stored_rows
+from core.postgres.forms import Form
 
 SHORTLIST = 100
 """Places of a large map that a search finds, as in a data directory; below ``COMPACT_FROM`` places it finds all."""
@@ -35,7 +34,7 @@ MOST_KNOWN = 10_000
 _SPARE = 1.25  # the factor of entities requested, for some are no place's any more or beyond an edge
 _MORE = 4  # by this factor, if these were too few
 
-Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
+Keep = Callable[[list[StoredPlace]], NDArray[np.bool_]]
 """Which of some places fulfil conditions; bool [n]."""
 
 
@@ -50,11 +49,11 @@ class MilvusSnapshot:
     orphans: the keys of entities that were no place's any more.
     """
 
-    database: Database
+    database: PostgresLedger
     collection: Collection
     state: MapState
     orphans: tuple[int, ...] = ()
-    _known: dict[int, PlaceEntry] = field(default_factory=dict)
+    _known: dict[int, StoredPlace] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.state.places
@@ -63,7 +62,7 @@ class MilvusSnapshot:
     def rows(self) -> int:
         return self.state.rows
 
-    def entries_at(self, rows: Rows) -> list[PlaceEntry]:
+    def entries_at(self, rows: Rows) -> list[StoredPlace]:
         """The places of rows that a search found, as it found them, and else as they are now.
 
         Raises:
@@ -71,16 +70,16 @@ class MilvusSnapshot:
         """
         found = {row: entry for row in rows.tolist() if (entry := self._known.get(row)) is not None}
         if missing := [row for row in rows.tolist() if row not in found]:
-            with self.database.reading() as connection:
-                read = ledger.entries_by(connection, self.state.number, "row", missing)
-            self.note(read)
-            found |= {entry.row: entry for entry in read}
+            with self.database.reading() as whole:
+                read = places.at_rows(MapConnection(whole, self.state.number), missing)
+            self.note(list(read.values()))
+            found |= read
         try:
             return [found[row] for row in rows.tolist()]
         except KeyError:
             raise UnknownPlace("A place was deleted while it was read.") from None
 
-    def note(self, entries: Sequence[PlaceEntry]) -> None:
+    def note(self, entries: Sequence[StoredPlace]) -> None:
         """Remember places that were read, as long as there are not too many."""
         if len(self._known) + len(entries) > MOST_KNOWN:
             return
@@ -92,25 +91,25 @@ class MilvusSnapshot:
 
     def descriptors_at(self, rows: Rows) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D]."""
-        return Form(self.state.record).descriptors(self._of_frames("descriptor", rows))
+        return Form(self.state.record).descriptors(self._stored(stored_rows.descriptors_at, rows))
 
     def locals_at(self, rows: Rows) -> NDArray[np.int8]:
         """The local descriptors of rows: int8 [k, C, L]."""
-        return Form(self.state.record).locals(self._of_frames("local", rows))
+        return Form(self.state.record).locals(self._stored(stored_rows.locals_at, rows))
 
-    def _of_frames(self, column: str, rows: Rows) -> list[bytes]:
-        with self.database.reading() as connection:
-            found = ledger.of_frames(connection, self.state.number, column, np.unique(rows).tolist())
+    def _stored(self, read: Callable[[MapConnection, Sequence[int]], dict[int, bytes]], rows: Rows) -> list[bytes]:
+        with self.database.reading() as whole:
+            found = read(MapConnection(whole, self.state.number), np.unique(rows).tolist())
         try:
             return [found[row] for row in rows.tolist()]
         except KeyError:
             raise UnknownPlace("A place was deleted while it was read.") from None
 
     @cached_property
-    def all_entries(self) -> list[PlaceEntry]:
+    def all_entries(self) -> list[StoredPlace]:
         """All places of the rows of the snapshot."""
-        with self.database.reading() as connection:
-            entries = ledger.entries_after(connection, self.state.number, -1, None, EVERY_PLACE)
+        with self.database.reading() as whole:
+            entries = places.listed(MapConnection(whole, self.state.number), -1, 1 << 62)
         found = [entry for entry in entries if entry.row < self.rows]
         self.note(found)
         return found
@@ -152,7 +151,7 @@ class Prior:
     trust: float
 
 
-def everything(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+def everything(entries: list[StoredPlace]) -> NDArray[np.bool_]:
     """All of some places; bool [n]."""
     return np.ones(len(entries), np.bool_)
 
@@ -187,14 +186,14 @@ class MilvusScope:
         (there,) = self.snapshot.entries_at(np.array([best]))
         listed = set(ranking[0].tolist())
 
-        def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+        def keep(entries: list[StoredPlace]) -> NDArray[np.bool_]:
             matching = self.keep(entries) & np.array([entry.row not in listed for entry in entries], np.bool_)
             if neighborhood is None:
                 return matching
             return matching & ~whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
 
         expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
-        where = there.whereabouts()
+        where = whereabouts_of([there])
         if neighborhood is not None and where.kind[0] != NO_POSE:  # within the cube in the ball of its neighbours
             side = neighborhood.radius / 2
             inside = [
@@ -252,8 +251,8 @@ class MilvusScope:
         """The rows of the keys that are places' of the scope."""
         snapshot = self.snapshot
         keys = np.unique(np.concatenate([found for found, _ in hits])).tolist()
-        with snapshot.database.reading() as connection:
-            entries = ledger.entries_by(connection, snapshot.state.number, "key", keys)
+        with snapshot.database.reading() as whole:
+            entries = places.of_keys(MapConnection(whole, snapshot.state.number), keys)
         matching = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
         snapshot.note(matching)
         rows = {entry.key: entry.row for entry in matching}
@@ -266,28 +265,28 @@ class MilvusScope:
         return rankings
 
 
-def scope_of(connection: Connection[Any], snapshot: MilvusSnapshot, selection: Selection | None) -> MilvusScope:
+def scope_of(connection: MapConnection, snapshot: MilvusSnapshot, selection: Selection | None) -> MilvusScope:
     """The places of a snapshot that a query may find by what its caller knows."""
     whole = MilvusScope(snapshot)
     if not selection:
         return whole
-    filters, number = selection.filters, snapshot.state.number
-    constraints = _constraints(connection, number, filters)
+    filters = selection.filters
+    constraints = _constraints(connection, filters)
     recent = selection.recent
     if recent is not None:
-        code = ledger.sequence_codes(connection, number, [recent.sequence]).get(recent.sequence)
+        code = sequences.codes_of(connection, [recent.sequence]).get(recent.sequence)
         if code is not None:
-            oldest = ledger.oldest_of_last(connection, number, code, recent.frames) if recent.frames else None
+            oldest = sequences.oldest_of_last(connection, code, recent.frames) if recent.frames else None
             moment = recent.moment if recent.seconds else None
             constraints.append(NotLately(code, oldest, moment, round(1e6 * recent.seconds)))
     expressions = [bounds for constraint in constraints if (bounds := bounds_of(constraint)) is not None]
-    tokens = tokens_of(filters.metadata)
+    tokens = wanted_tokens(filters.metadata)
     expressions += with_tokens(tokens)
     if selection.excluded is not None:
-        entry = ledger.find(connection, number, selection.excluded)
-        expressions += [] if entry is None else [f"row != {entry.row}"]
+        row = places.rows_of(connection, [selection.excluded]).get(selection.excluded)
+        expressions += [] if row is None else [f"row != {row}"]
 
-    def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+    def keep(entries: list[StoredPlace]) -> NDArray[np.bool_]:
         wanted = set(tokens)
         has = [wanted <= set(tokens_of(entry.place.metadata)) for entry in entries]
         named = [entry.place.id != selection.excluded for entry in entries]
@@ -295,15 +294,15 @@ def scope_of(connection: Connection[Any], snapshot: MilvusSnapshot, selection: S
 
     prior = None
     if selection.prior:
-        known = tuple(_constraints(connection, number, selection.prior)), tuple(tokens_of(selection.prior.metadata))
+        known = tuple(_constraints(connection, selection.prior)), tuple(wanted_tokens(selection.prior.metadata))
         prior = Prior(*known, bool(selection.prior.metadata), selection.trust)
     return replace(whole, expressions=tuple(expressions), keep=keep, prior=prior)
 
 
-def _constraints(connection: Connection[Any], map_number: int, conditions: Conditions) -> list[Constraint]:
+def _constraints(connection: MapConnection, conditions: Conditions) -> list[Constraint]:
     """The conditions on pose, time and sequence."""
     found = list(conditions.geometry)
     if conditions.sequences is not None:
-        codes = ledger.sequence_codes(connection, map_number, conditions.sequences)
+        codes = sequences.codes_of(connection, conditions.sequences)
         found.insert(0, InSequences(tuple(codes.values())))
     return found

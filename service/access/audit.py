@@ -1,32 +1,24 @@
 """The audit trail: a line for each change of a map, with the name of the key that made it.
 
-The lines go to the logger ``placerec.audit``, whatever level the other logs have, and to a file of their own if one is
-configured.  No line contains a key, a frame, or metadata.
+The lines go to the logger ``placerec.audit``, whatever level the other logs have, and are stored by
+``service.administration.audit_trail``.  No line contains a key, a frame, or metadata.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections import OrderedDict
+from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass
-from logging.handlers import WatchedFileHandler
-from pathlib import Path
 from typing import Any
 
-from core.errors import StorageFailure
 from service.access.roles import Principal
-from service.telemetry.requests import JsonLines
 
 LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
 """A repeated refusal is logged once in this time, with the number of repetitions."""
-
-RECENT_LINES = 1000
-"""Lines that are held in memory while there is no file."""
 
 MOST_REFUSALS = 1024
 """Most kinds of refusals that are counted apart."""
@@ -119,59 +111,6 @@ def note_job(
 def now_asking() -> dict[str, Any]:
     """The fields of the caller of the present work, for a job to store."""
     return asker_fields(ASKER.get())
-
-
-class LatestLines(logging.Handler):
-    """Keeps the latest lines of the trail in memory, as they would be written to a file."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._lines: deque[str] = deque(maxlen=RECENT_LINES)
-        self._written = 0
-        self.setFormatter(JsonLines())
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._lines.append(self.format(record))
-        self._written += 1
-
-    def taken(self) -> tuple[list[str], int]:
-        """The lines, the oldest first, and how many were ever written."""
-        with self.lock or nullcontext():
-            return list(self._lines), self._written
-
-
-@contextmanager
-def audit_file(path: Path | None) -> Iterator[LatestLines | None]:
-    """Also append the trail to a file, one JSON object a line; if the file is moved away, a new one is created.
-
-    Without a file the latest lines are held in memory, and the context gives them.
-
-    Raises:
-        StorageFailure: the file cannot be opened.
-    """
-    if path is None:
-        latest = LatestLines()
-        with _handling(latest):
-            yield latest
-        return
-    try:
-        handler = WatchedFileHandler(path, encoding="utf-8")
-    except OSError as error:
-        raise StorageFailure(f"The audit file {path} cannot be opened: {error.strerror}.") from error
-    handler.setFormatter(JsonLines())
-    with _handling(handler):
-        yield None
-
-
-@contextmanager
-def _handling(handler: logging.Handler) -> Iterator[None]:
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        log.removeHandler(handler)
-        handler.close()
 
 
 class Refusals:

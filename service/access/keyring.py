@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from service.access.keys import Key, KeyRecords, digest_of
+from service.access.keys import Key, Keys, digest_of
 from service.access.roles import TOKEN, Principal
 from service.errors.faults import KeyNeeded, KeyRefused, KeysUnreadable
 
@@ -84,7 +84,7 @@ class Keyring:
 
     def __init__(
         self,
-        store: KeyRecords,
+        store: Keys,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = time.monotonic,
         may_open: bool = True,
@@ -92,7 +92,7 @@ class Keyring:
         self.store, self._wall, self._monotonic = store, wall, monotonic
         self._known = _Known()
         self._may_open, self._seen_keys = may_open, False
-        self._source = store.watch()
+        self._version: object = None
         self._read_at = self._looked_at = monotonic()
         self._used: dict[str, float] = {}
         self._written_at = monotonic()
@@ -116,7 +116,7 @@ class Keyring:
         try:
             self._read()
         except KeysUnreadable as error:
-            if not self.store.remote:
+            if not self.store.place.remote:
                 raise
             log.error("nobody is let in: %s", error)
             self._known = _Known(demanded=True, broken=str(error))
@@ -137,7 +137,7 @@ class Keyring:
             self._thread.join()
         with suppress(KeysUnreadable):
             self._write_uses()
-        self._source.close()
+        self.store.place.close()
 
     def principal(self, authorization: bytes | None) -> Principal:
         """The holder of the key in an ``Authorization`` header.
@@ -191,7 +191,7 @@ class Keyring:
     def _look(self) -> None:
         self._looked_at = self._monotonic()
         try:
-            if self._source.has_changed(self._known.demanded):
+            if self.store.place.version(expected=self._known.demanded) != self._version:
                 self._read()
             self._read_at = self._monotonic()
             if self._known.broken is not None:
@@ -201,13 +201,15 @@ class Keyring:
                 self._written_at = self._monotonic()
                 self._write_uses()
         except Exception as error:  # whatever the error is, the known keys must not hold for ever
-            self._source.close()
+            self.store.place.close()
             if self._known.broken is None and self._monotonic() - self._read_at >= GRACE_SECONDS:
                 log.error("nobody is let in: %s", error)
                 self._known = _Known(demanded=True, broken=str(error))
 
     def _read(self) -> None:
-        keys = self._source.read()
+        version = self.store.place.version(expected=False)  # before the keys: later changes are read again
+        keys = self.store.all() if self.store.exists() else None
+        self._version = version
         if keys is None:
             if self._known.broken is not None and not self._seen_keys:
                 self._known = _Known(demanded=not self._may_open)

@@ -1,33 +1,32 @@
-"""The stored keys: one small SQLite file in the data directory, apart from the maps and not under their lock.
+"""The stored keys, in a file of the data directory or in the PostgreSQL of all services.
 
 A key has the form ``placerec_<id>_<secret>``.  Only its SHA-256 is stored: a slow hash protects secrets that a person
 chose and others can guess, but 256 random bits cannot be guessed however fast a guess can be checked.
 
-The file fails closed.  If it exists, keys are needed, whatever it contains; each row has a checksum; and nobody is let
-in if the file is empty, damaged, of a later version, or writable by others.
+Each row has a checksum, and nobody is let in if one does not match.  What else fails closed is said by
+:mod:`service.access.key_file`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import secrets
-import sqlite3
-import stat
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, Literal
 
-from core.disk.files import Damage, sync_folder
-from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
+from sqlalchemy import bindparam, func, select, update
+
+from core.ledger import Connection, Ledger, Statement
+from core.ledger.statements import greatest
 from core.names import word
 from core.places import check_map_id
+from service.access.key_file import KeyFile
+from service.access.key_table import KEYS, KeyPlace, KeyTable
 from service.access.roles import LEVELS, Role
 from service.errors.faults import (
     InvalidRequest,
@@ -40,10 +39,6 @@ from service.errors.faults import (
     UnknownKey,
 )
 
-FILE = "keys.sqlite"
-MODE = 0o600
-BUSY_SECONDS = 5.0
-
 ID = re.compile(r"[0-9a-f]{12}")
 NAME = re.compile(word(64, more="@"))
 RESERVED = frozenset({"anonymous", "owner"})
@@ -54,20 +49,17 @@ KeyState = Literal["in force", "revoked", "expired"]
 MOST_KEYS = 10_000
 """Keys that a data directory may have, revoked ones included: a running service holds all of them in memory."""
 
-_TABLE = """CREATE TABLE keys (
-    id TEXT PRIMARY KEY,
-    name TEXT NOT NULL,
-    role TEXT NOT NULL,
-    maps TEXT,
-    digest BLOB NOT NULL,
-    created_at TEXT NOT NULL,
-    expires_at TEXT,
-    revoked_at TEXT,
-    seal BLOB NOT NULL,
-    last_used_at TEXT
-) STRICT"""
-_SCHEMA = Schema(application_id=0x706C6B79, version=1, create=[_TABLE])  # "plky"
-COLUMNS = ("id", "name", "role", "maps", "digest", "created_at", "expires_at", "revoked_at", "seal", "last_used_at")
+_ALL = Statement(select(KEYS).order_by(KEYS.c.created_at, KEYS.c.id))
+_PUT = Statement(
+    lambda insert: (put := insert(KEYS)).on_conflict_do_update(
+        index_elements=["id"], set_={one.name: one for one in put.excluded if one.name != "id"}
+    )
+)
+_USE = Statement(
+    update(KEYS)
+    .where(KEYS.c.id == bindparam("used"))
+    .values(last_used_at=greatest(func.coalesce(KEYS.c.last_used_at, ""), bindparam("moment")))
+)
 
 
 @dataclass(frozen=True)
@@ -120,64 +112,37 @@ def digest_of(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-class KeyNarrowing(Protocol):
-    """All keys, while nobody else changes them; changes are committed when the block ends without an error."""
-
-    def read(self) -> list[Key]: ...
-    def put(self, key: Key) -> None: ...
-
-
-class KeyWatch(Protocol):
-    """Tells a running service whether keys have changed.  Both reading methods may raise KeysUnreadable."""
-
-    def has_changed(self, demanded: bool) -> bool:
-        """Whether the keys have changed since they were read.
-
-        Args:
-            demanded: whether there were any.
-        """
-
-    def read(self) -> list[Key] | None:
-        """Every key; None if none was ever created."""
-
-    def close(self) -> None:
-        """Forget what was read."""
-
-
-class KeyRecords(ABC):
+class Keys:
     """The stored keys; any number of processes may use them.
 
     All methods may raise KeysUnreadable: the keys are damaged, of a later version or writable by others, or the disk or
     server failed.
 
-    remote: whether they are on a server, which may be away for a while.
+    place: the database that has their table.
     """
 
-    remote: ClassVar[bool] = False
+    def __init__(self, place: KeyPlace) -> None:
+        self.place = place
 
-    @abstractmethod
+    @classmethod
+    def of(cls, directory: Path, ledger: Ledger | None = None) -> Keys:
+        """The keys of a data directory; those that services share if they have a ledger."""
+        return cls(KeyFile(directory) if ledger is None else KeyTable(ledger))
+
     def exists(self) -> bool:
         """Whether keys are needed, because one was ever created."""
+        return self.place.exists()
 
-    @abstractmethod
     def all(self) -> list[Key]:
         """Every key that was ever created, the oldest first."""
+        return [key_of(row) for row in self.place.execute(_ALL)]
 
-    @abstractmethod
-    def note_uses(self, moments: dict[str, datetime]) -> None:
+    def note_uses(self, moments: Mapping[str, datetime]) -> None:
         """Store when keys were last used; an earlier time never replaces a later one."""
-
-    @abstractmethod
-    def watch(self) -> KeyWatch:
-        """The watch by which a running service learns of changes."""
-
-    @abstractmethod
-    def changing(self) -> AbstractContextManager[KeyNarrowing]:
-        """A change, which is durable when the context ends."""
-
-    @abstractmethod
-    def _prepare(self) -> None:
-        """Make room for the first key."""
+        with self.place.changing(announced=False) as connection:
+            connection.execute_many(
+                _USE, [{"used": identity, "moment": text_of(moment)} for identity, moment in sorted(moments.items())]
+            )
 
     def create(
         self,
@@ -214,16 +179,16 @@ class KeyRecords(ABC):
         if not self.exists():
             if keep_admin:
                 _check_admin([key], now)  # before there is a file, with which keys are needed
-            self._prepare()
-        with self.changing() as changes:
-            keys = changes.read()
+            self.place.prepare()
+        with self.place.changing() as connection:
+            keys = _read(connection)
             if any(other.name == name and in_force(other, now) for other in keys):
                 raise KeyExists(f"There is already a key {name!r}. Delete it first, or choose another name.")
             if len(keys) >= MOST_KEYS:
                 raise TooManyKeys(f"{MOST_KEYS} keys were created, which is the most that one data directory holds.")
             if keep_admin:
                 _check_admin([*keys, key], now)
-            changes.put(key)
+            connection.change(_PUT, **row_of(key))
         return key, token
 
     def find(self, key_id: str) -> Key:
@@ -250,8 +215,8 @@ class KeyRecords(ABC):
         now = datetime.now(UTC)
         if not self.exists():
             raise _unknown(key_id)
-        with self.changing() as changing:
-            keys = changing.read()
+        with self.place.changing() as connection:
+            keys = _read(connection)
             before = _of_id(keys, key_id)
             if not in_force(before, now):
                 raise KeyEnded(f"The key {before.name!r} is revoked or has expired; create another one.")
@@ -267,7 +232,7 @@ class KeyRecords(ABC):
                 raise InvalidRequest("The expiry of the key is in the past. Delete it instead.")
             if keep_admin and is_admin(before):
                 _check_admin([after if key is before else key for key in keys], now)
-            changing.put(after)
+            connection.change(_PUT, **row_of(after))
         return after
 
     def revoke(self, id_or_name: str, keep_admin: bool = False) -> Key:
@@ -284,8 +249,8 @@ class KeyRecords(ABC):
         now = datetime.now(UTC)
         if not self.exists():
             raise UnknownKey("No key was ever created.")
-        with self.changing() as changes:
-            keys = changes.read()
+        with self.place.changing() as connection:
+            keys = _read(connection)
             found = [key for key in keys if key.id == id_or_name]
             found = found or [key for key in keys if key.name == id_or_name and key.revoked_at is None]
             found = found or [key for key in keys if key.name == id_or_name]
@@ -299,170 +264,8 @@ class KeyRecords(ABC):
             if keep_admin and is_admin(before) and in_force(before, now):
                 _check_admin([key for key in keys if key is not before], now)
             key = replace(before, revoked_at=now)
-            changes.put(key)
+            connection.change(_PUT, **row_of(key))
         return key
-
-
-@dataclass(frozen=True)
-class _FileChanges:
-    """A change of a file of keys."""
-
-    connection: sqlite3.Connection
-
-    def read(self) -> list[Key]:
-        return read_keys(self.connection)
-
-    def put(self, key: Key) -> None:
-        marks = ", ".join("?" * len(COLUMNS))
-        self.connection.execute(f"INSERT OR REPLACE INTO keys ({', '.join(COLUMNS)}) VALUES ({marks})", row_of(key))
-
-
-class KeyStore(KeyRecords):
-    """The keys of a data directory.  Each method opens the file anew."""
-
-    def __init__(self, directory: Path) -> None:
-        self.path = directory / FILE
-
-    def exists(self) -> bool:
-        try:
-            self.path.lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        except OSError as error:
-            raise KeysUnreadable(f"{self.path} cannot be looked at: {error.strerror}.") from error
-        return True
-
-    def all(self) -> list[Key]:
-        if not self.exists():
-            return []
-        with closing(self.open()) as connection, _refusals(self.path):
-            return read_keys(connection)
-
-    def watch(self) -> KeyWatch:
-        return KeyFileWatch(self)
-
-    def note_uses(self, moments: dict[str, datetime]) -> None:
-        with self._transaction() as connection:
-            connection.executemany(
-                "UPDATE keys SET last_used_at = max(coalesce(last_used_at, ''), ?) WHERE id = ?",
-                [(text_of(moment), identity) for identity, moment in moments.items()],
-            )
-
-    def open(self) -> sqlite3.Connection:
-        """Open a connection to the file, after checking that it is intact and a file of keys."""
-        with _refusals(self.path):
-            status = self.path.stat()
-            if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-                raise KeysUnreadable(f"Others may write to {self.path}: chmod 600 it, then look whose keys it holds.")
-            try:
-                return SqliteFile(self.path, _SCHEMA, {}, timeout=BUSY_SECONDS).open(create=False)
-            except UnreadVersion as error:
-                raise KeysUnreadable(str(error.refusal(str(self.path)))) from error
-            except NotOurs as error:
-                raise KeysUnreadable(
-                    f"{self.path} is not a file of keys, or it is damaged; nobody is let in. Restore it."
-                ) from error
-            except Damage as error:
-                raise KeysUnreadable(f"{self.path} is damaged: {error}.") from error
-
-    @contextmanager
-    def changing(self) -> Iterator[KeyNarrowing]:
-        with self._transaction() as connection:
-            yield _FileChanges(connection)
-
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        """A connection in a transaction, which is on disk when the context ends."""
-        with closing(self.open()) as connection, _refusals(self.path):
-            # A rollback journal: the file is all there is of the keys.  EXTRA syncs the folder too, or a power
-            # cut could bring the journal back, and with it a key that was revoked.
-            connection.execute("PRAGMA synchronous = EXTRA")
-            with transaction(connection):
-                yield connection
-
-    def _prepare(self) -> None:
-        """Make the file whole or not at all: one without its tables would count as damaged."""
-        temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
-        with _refusals(self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
-                with closing(connect(temporary, "rw", {"synchronous": "EXTRA"})) as connection:
-                    _SCHEMA.prepare(connection, create=True)
-                with suppress(FileExistsError):  # another process was quicker
-                    os.link(temporary, self.path)
-                sync_folder(self.path.parent)
-            finally:
-                with suppress(FileNotFoundError):
-                    temporary.unlink()
-
-
-@dataclass(frozen=True)
-class _File:
-    """The file as it was last read: its connection, its attributes in the file system, SQLite's count of changes."""
-
-    connection: sqlite3.Connection
-    traits: tuple[int, ...]
-    changes: int
-
-
-class KeyFileWatch:
-    """Tells whether a file of keys has changed, without reading it."""
-
-    def __init__(self, store: KeyStore) -> None:
-        self._store = store
-        self._file: _File | None = None
-
-    def has_changed(self, demanded: bool) -> bool:
-        file, path = self._file, self._store.path
-        try:
-            status = os.stat(path)
-        except FileNotFoundError:
-            if demanded:
-                raise KeysUnreadable(f"{path} is gone.") from None
-            return False
-        except OSError as error:
-            raise KeysUnreadable(f"{path} cannot be looked at: {error.strerror}.") from error
-        if file is None or file.traits != _traits(status):
-            return True
-        try:
-            return _changes(file.connection) != file.changes
-        except sqlite3.Error as error:
-            raise KeysUnreadable(f"{path} cannot be read: {error}.") from error
-
-    def read(self) -> list[Key] | None:
-        if not self._store.exists():
-            return None
-        self.close()
-        connection = self._store.open()
-        try:
-            status = os.stat(self._store.path)
-            changes = _changes(connection)
-            keys = read_keys(connection)
-        except (OSError, sqlite3.Error) as error:
-            connection.close()
-            raise KeysUnreadable(f"{self._store.path} cannot be read: {error}.") from error
-        except BaseException:
-            connection.close()
-            raise
-        self._file = _File(connection, _traits(status), changes)
-        return keys
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.connection.close()
-            self._file = None
-
-
-def _traits(status: os.stat_result) -> tuple[int, ...]:
-    """Attributes that change when a file is replaced, or written to without SQLite."""
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_mode
-
-
-def _changes(connection: sqlite3.Connection) -> int:
-    """A number that changes when another connection changes the file."""
-    (found,) = connection.execute("PRAGMA data_version").fetchone()
-    return int(found)
 
 
 def state_of(key: Key, now: datetime) -> KeyState:
@@ -502,18 +305,17 @@ def _unknown(id_or_name: str) -> UnknownKey:
     return UnknownKey(f"There is no such key ({id_or_name[:80]!r}).")
 
 
-def read_keys(connection: sqlite3.Connection) -> list[Key]:
-    """Every key of an open file, the oldest first.
+def _read(connection: Connection) -> list[Key]:
+    """Every key, the oldest first.
 
     Raises:
         KeysUnreadable: a row is damaged.
     """
-    query = f"SELECT {', '.join(COLUMNS)} FROM keys ORDER BY created_at, id"
-    return [key_of(row) for row in connection.execute(query).fetchall()]
+    return [key_of(row) for row in connection.execute(_ALL)]
 
 
 def key_of(row: tuple[object, ...]) -> Key:
-    """The key of a stored row, whose columns are ``COLUMNS``.
+    """The key of a stored row.
 
     Raises:
         KeysUnreadable: the row is damaged.
@@ -527,20 +329,20 @@ def key_of(row: tuple[object, ...]) -> Key:
     return key
 
 
-def row_of(key: Key) -> tuple[object, ...]:
+def row_of(key: Key) -> dict[str, object]:
     """A key as it is stored."""
-    return (
-        key.id,
-        key.name,
-        key.role,
-        None if key.maps is None else json.dumps(sorted(key.maps)),
-        key.digest,
-        text_of(key.created_at),
-        text_of(key.expires_at),
-        text_of(key.revoked_at),
-        key.seal(),
-        text_of(key.last_used_at),
-    )
+    return {
+        "id": key.id,
+        "name": key.name,
+        "role": key.role,
+        "maps": None if key.maps is None else json.dumps(sorted(key.maps)),
+        "digest": key.digest,
+        "created_at": text_of(key.created_at),
+        "expires_at": text_of(key.expires_at),
+        "revoked_at": text_of(key.revoked_at),
+        "seal": key.seal(),
+        "last_used_at": text_of(key.last_used_at),
+    }
 
 
 def _key(row: tuple[object, ...]) -> Key:
@@ -558,14 +360,6 @@ def _key(row: tuple[object, ...]) -> Key:
         revoked_at=None if revoked is None else datetime.fromisoformat(str(revoked)),
         last_used_at=None if used is None else datetime.fromisoformat(str(used)),
     )
-
-
-@contextmanager
-def _refusals(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, sqlite3.Error) as error:
-        raise KeysUnreadable(f"{path} cannot be used: {error}.") from error
 
 
 def text_of(moment: datetime | None) -> str | None:

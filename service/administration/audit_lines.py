@@ -1,4 +1,4 @@
-"""Reading the audit trail backwards, from its latest line, over the files that were moved away.
+"""Lines of the audit trail, and files of them: read backwards from the latest line, over those that were moved away.
 
 A line is found again by its file (the inode, which it keeps under its new name) and the position of its first byte, so
 that lines which are written between two pages, and files which are moved away, shift nothing.
@@ -11,11 +11,10 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 from core.disk.files import disk_errors
 from core.errors import InvalidCursor
-from service.access.audit import LatestLines
 
 BLOCK = 64 * 1024
 """Bytes that are read at a time."""
@@ -56,13 +55,6 @@ class Position:
         if not all(part.isascii() and part.isdigit() and len(part) < 20 for part in (file, offset)):
             raise InvalidCursor("The cursor was not made by this listing.")
         return cls(int(file), int(offset))
-
-
-class Trail(Protocol):
-    """An audit trail that several services write together."""
-
-    def lines(self, before: Position | None) -> Iterator[AuditLine]:
-        """The lines from the latest to the oldest, before one of them; None: all."""
 
 
 @dataclass(frozen=True)
@@ -158,16 +150,3 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
-
-
-def lines_in_memory(latest: LatestLines, before: Position | None) -> Iterator[AuditLine]:
-    """The lines that are held in memory from the latest to the oldest.
-
-    Args:
-        before: only lines before this one; None: all.
-    """
-    lines, written = latest.taken()
-    for back, line in enumerate(reversed(lines)):
-        position = Position(0, written - back)
-        if before is None or position.offset < before.offset:
-            yield AuditLine(position, len(line), json.loads(line))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime, timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, ConfigDict, Field
@@ -12,11 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from core import errors
 from core.maps.pagination import Listing, decode_name, encode_cursor
 from core.places import Timestamp
-from service.access.audit import LatestLines
-from service.administration.audit_lines import AuditLine, Position, Trail, lines_in_memory, lines_of_files
+from service.administration.audit_lines import AuditLine, Position
+from service.administration.audit_trail import AuditTrail, Source
 from service.errors.faults import InvalidRequest
 from service.errors.problems import problem_documentation
-from service.http.routing import EngineDep, FromState, single_values
+from service.http.routing import FromState, single_values
 from service.http.schemas import Cursor, PageParameters
 
 MOST_READ = 8 * 1024 * 1024
@@ -65,7 +65,7 @@ class AuditPage(BaseModel):
 
     items: list[AuditEntry] = Field(description="It may be shorter than the limit, or empty, although more follows.")
     next_cursor: Cursor
-    source: Literal["database", "file", "memory"] = Field(
+    source: Source = Field(
         description="database: the lines of all services that share their state. memory: no file of the trail is "
         "configured, so there are only the latest lines of this process."
     )
@@ -100,9 +100,7 @@ class AuditParameters(PageParameters):
 @router.get("", responses=problem_documentation(errors.InvalidCursor, errors.StorageFailure))
 def read_audit(
     options: Annotated[AuditParameters, Query()],
-    engine: EngineDep,
-    latest: Annotated[LatestLines | None, Depends(FromState("audit_lines"))],
-    shared: Annotated[Trail | None, Depends(FromState("audit_trail"))],
+    trail: Annotated[AuditTrail, Depends(FromState("audit_trail"))],
 ) -> AuditPage:
     """Read the audit trail from its latest line: who changed what, and who was refused.
 
@@ -111,17 +109,11 @@ def read_audit(
     """
     if options.after is not None and options.before is not None and options.after > options.before:
         raise InvalidRequest("after: the time is later than that of before.")
-    listing, path = options.listing(), engine.settings.audit_file
+    listing = options.listing()
     at = None if options.cursor is None else Position.parsed(decode_name(listing, options.cursor))
-    if shared is not None:
-        items, reached = _page(shared.lines(at), options)
-    elif path is not None:
-        items, reached = _page(lines_of_files(path, at), options)
-    else:
-        items, reached = _page(iter(()) if latest is None else lines_in_memory(latest, at), options)
+    items, reached = _page(trail.lines(at), options)
     more = None if reached is None else encode_cursor(listing, reached.text())
-    source: Literal["database", "file", "memory"] = "memory" if path is None else "file"
-    return AuditPage(items=items, next_cursor=more, source=source if shared is None else "database")
+    return AuditPage(items=items, next_cursor=more, source=trail.source)
 
 
 def _page(lines: Iterator[AuditLine], options: AuditParameters) -> tuple[list[AuditEntry], Position | None]:

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from core import errors
 from core.maps.pagination import Listing, decode_name, page_of
 from service.access.gate import Gate
-from service.access.keys import Key, KeyRecords
+from service.access.keys import Key, Keys
 from service.access.roles import ANONYMOUS
 from service.administration.key_schemas import CreatedKey, KeyChanges, KeyPage, KeyView, NewKey, OwnKey
 from service.errors.faults import (
@@ -50,7 +50,7 @@ router = APIRouter(prefix="/v1/keys", tags=["keys"], route_class=StrictRoute, de
 own = APIRouter(prefix="/v1/key", tags=["keys"], dependencies=[Depends(single_values)])
 
 GateDep = Annotated[Gate, Depends(FromState("gate"))]
-StoreDep = Annotated[KeyRecords, Depends(FromState("key_store"))]
+StoreDep = Annotated[Keys, Depends(FromState("key_store"))]
 KeyId = Annotated[str, Path(alias="key", max_length=64, description="Id of the key.", examples=["c69fcf6b7439"])]
 LockOut = Annotated[
     bool,

@@ -17,11 +17,12 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import audit_file
 from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
-from service.access.keys import KeyRecords
+from service.access.keys import Keys
+from service.access.rates import Rates
 from service.administration import audit_routes, key_routes
+from service.administration.audit_trail import audit_trail
 from service.app import routes as root
 from service.app import service_state
 from service.app.gauges import gauges
@@ -46,7 +47,7 @@ from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
 from service.settings import Settings, read_settings
-from service.shared import keys_of, open_database, rates_of
+from service.shared import open_database
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
 from service.upkeep import routes as upkeep
@@ -197,12 +198,12 @@ async def _not_found(scope: Scope, receive: Receive, send: Send) -> None:
     await WebSocket(scope, receive, send).send_denial_response(answer)
 
 
-def _has_keys(store: KeyRecords) -> bool:
+def _has_keys(store: Keys) -> bool:
     """Whether a key was ever created; taken for granted while that cannot be known, for then nobody is let in."""
     try:
         return store.exists()
     except KeysUnreadable:
-        if not store.remote:
+        if not store.place.remote:
             raise
         return True
 
@@ -231,19 +232,19 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     """
     chosen = settings if settings is not None else read_settings()
     database = open_database(chosen)
-    store = keys_of(chosen, database)
+    store = Keys.of(chosen.data_dir, database)
     chosen.check_exposure(has_keys=not as_owner and _has_keys(store))
     may_open = chosen.is_loopback() or chosen.allow_anonymous
     keyring = None if as_owner else Keyring(store, may_open=may_open)
     metrics = Metrics()
-    rates = rates_of(chosen, database)
+    rates = Rates(chosen.rate_per_key, chosen.rate_burst, database)
     gate = Gate(keyring, rates, chosen.is_loopback())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with audit_file(chosen.audit_file) as latest_lines, database or nullcontext(), keyring or nullcontext(), rates:
-            app.state.audit_lines = latest_lines
+        with audit_trail(chosen.audit_file) as trail, database or nullcontext(), keyring or nullcontext(), rates:
+            app.state.audit_trail = trail
             warn_if_exposed(gate, chosen)
             runtime = await to_thread.run_sync(Runtime, chosen, metrics, database)
             runtime.publish(app.state)

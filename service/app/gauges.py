@@ -17,7 +17,7 @@ from core.maps import MapRecord
 from core.maps.status import Tier
 from service.app.runtime import Runtime
 from service.http.bodies import UploadMemory
-from service.jobs.records import JobState
+from service.jobs.job import JobState
 
 
 class RuntimeCollector(Collector):
@@ -41,7 +41,7 @@ class RuntimeCollector(Collector):
         yield _gauge("placerec_storage_threads_busy", "Storage threads that are busy.", busy)
         yield _gauge("placerec_storage_threads_waited_for", "Requests that wait for a storage thread.", waiting)
         yield _gauge("placerec_sessions", "Open sessions.", runtime.sessions.count())
-        yield _gauge("placerec_job_watchers", "Clients that follow jobs.", runtime.jobs.watchers)
+        yield _gauge("placerec_job_watchers", "Clients that follow jobs.", len(runtime.jobs.watchers))
         listeners = runtime.engine.events.listeners
         yield _gauge("placerec_event_listeners", "Clients that listen to the events of maps.", listeners)
         dropped = runtime.engine.review_keeper.dropped

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -16,12 +14,14 @@ from starlette.datastructures import State
 
 from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
+from service.app.probe import Probe
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
 from service.maps import calibration, storage_jobs
 from service.maps.exports import Exports
 from service.maps.imports import Imports
+from service.peers.alone import Alone
 from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder
 from service.places.plans import Plans
@@ -30,19 +30,18 @@ from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
 from service.ray_serve import encoders_for
 from service.sessions.sessions import Sessions
+from service.sessions.table import session_file
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
 from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.upkeep.similarity import Matrices
-from service.worker_threads import in_thread
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
     from service.shared.state import SharedState
 
-DISK_CHECK_SECONDS = 1.0
-PICTURES_CHECK_SECONDS = 5.0
-"""The disk and the object store are checked at most this often; a probe that comes sooner gets the last result."""
+CHECK_SECONDS, PICTURES_CHECK_SECONDS = 1.0, 5.0
+"""The disk, the database and the object store are checked at most this often."""
 
 log = logging.getLogger("placerec.runtime")
 
@@ -68,7 +67,8 @@ class Runtime:
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
             if self.shared is None:
-                self.sessions = Sessions(settings, self.engine.events)
+                ledger = session_file(settings.data_dir)
+                self.sessions = Sessions(settings, self.engine.events, ledger, Alone())
             else:
                 self.sessions = self.shared.sessions(self.engine.events)
             opened.pop_all()
@@ -82,10 +82,13 @@ class Runtime:
         self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
-        self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
         self._not_ready = ""
-        self._pictures_check: asyncio.Task[str] | None = None
-        self._pictures_checked = 0.0
+        maps, folder = self.engine.maps, partial(check_writable, settings.data_dir)
+        own = settings.engine == "files"
+        self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
+        self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
+        silent = "The object store does not answer."
+        self._pictures = Probe(maps.check_pictures, PICTURES_CHECK_SECONDS, silent)
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -114,7 +117,8 @@ class Runtime:
         state.health_examinations = self.health_examinations
         state.similarity_matrices = self.similarity_matrices
         state.exports, state.imports = self.exports, self.imports
-        state.audit_trail = None if self.shared is None else self.shared.audit
+        if self.shared is not None:
+            state.audit_trail = self.shared.audit
 
     def start(self) -> None:
         """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""
@@ -161,13 +165,10 @@ class Runtime:
         Raises:
             NotReady: at least one is not "ok".
         """
-        now = time.monotonic()
-        if now - self._disk_checked > DISK_CHECK_SECONDS:
-            self._disk_checked = now
-            self._maps_state, self._disk_state = await in_thread(self._check_store)
         encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
-        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": self._maps_state}
-        checks["disk"] = self._disk_state
+        checks = {"encoder": encoder if encoder != "ok" else encoders}
+        checks["maps"] = "ok" if self._database is None else await self._database.outcome()
+        checks["disk"] = await self._disk.outcome()
         if self.shared is not None:
             checks["replica"] = self.shared.replica.state
         if self.stopping:
@@ -175,7 +176,7 @@ class Runtime:
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
         self._note_readiness("; ".join(bad))
         if self.settings.objects is not None:
-            checks["pictures"] = await self._check_pictures()
+            checks["pictures"] = await self._pictures.outcome()
         if self.shared is not None:
             checks["others"] = self.shared.differences.state
         if bad:
@@ -192,44 +193,19 @@ class Runtime:
         elif before and not bad:
             log.info("the service is ready")
 
-    async def _check_pictures(self) -> str:
-        """The state of the object store; queries do without it, so nobody waits long for it here."""
-        check = self._pictures_check
-        sound = check is not None and check.done() and check.result() == "ok"
-        wait = PICTURES_CHECK_SECONDS if sound else DISK_CHECK_SECONDS
-        if check is None or (check.done() and time.monotonic() - self._pictures_checked > wait):
-            self._pictures_checked = time.monotonic()
-            check = self._pictures_check = asyncio.create_task(in_thread(_outcome, self.engine.maps.check_pictures))
-        await asyncio.wait({check}, timeout=1.0)
-        return check.result() if check.done() else "The object store does not answer."
-
-    def _check_store(self) -> tuple[str, str]:
-        """The states of the servers that have the maps, if there are such, and of the disk."""
-        if self.settings.store == "embedded":
-            return "ok", _outcome(self.engine.maps.check_writable)
-        return _outcome(self.engine.maps.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
-
-
-def _outcome(check: Callable[[], None]) -> str:
-    try:
-        check()
-    except PlacerecError as error:
-        return str(error)
-    return "ok"
-
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
-    return Jobs(
+    return Jobs.of_directory(
         settings.data_dir,
-        settings.job_workers,
-        settings.job_queue,
-        settings.job_history,
-        settings.job_watchers,
-        engine.events,
+        workers=settings.job_workers,
+        longest_queue=settings.job_queue,
+        history=settings.job_history,
+        most_watchers=settings.job_watchers,
+        events=engine.events,
     )
 
 
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database, shared_maps=settings.store != "embedded")
+    return SharedState(settings, database, shared_maps=settings.engine != "files")

@@ -199,7 +199,7 @@ async def read_service(
             threads=int(limiter.total_tokens),
         ),
         requests=_requests(runtime),
-        jobs=JobsState(queued=states["queued"], running=states["running"], watchers=runtime.jobs.watchers),
+        jobs=JobsState(queued=states["queued"], running=states["running"], watchers=len(runtime.jobs.watchers)),
         sessions=runtime.sessions.count(),
         listeners=engine.events.listeners,
         maps=_maps(principal, [record.id for record in records]),

@@ -13,7 +13,7 @@ from service.commands.connection.client import AsJson, DataDir, read_settings
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
 if TYPE_CHECKING:
-    from service.access.keys import Key, KeyRecords, KeyState
+    from service.access.keys import Key, Keys, KeyState
 
 keys = typer.Typer(cls=Commands, help="Create, list and delete the keys of a data directory.", no_args_is_help=True)
 
@@ -102,14 +102,15 @@ def moment(text: str) -> datetime:
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
-def _store(data_dir: Any) -> KeyRecords:
-    from service.shared import keys_of, open_database  # with it comes numpy
+def _store(data_dir: Any) -> Keys:
+    from service.access.keys import Keys  # with it comes SQLAlchemy
+    from service.shared import open_database
 
     settings = read_settings(data_dir)
     database = open_database(settings)
     if database is not None:
         atexit.register(database.close)
-    return keys_of(settings, database)
+    return Keys.of(settings.data_dir, database)
 
 
 def _state_of(key: Key) -> KeyState:

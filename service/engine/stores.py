@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from core.disk.files import FolderLock, disk_errors, make_folder
 from core.maps import Store
-from core.milvus import Bucket, open_store
+from core.milvus import open_store
+from core.postgres import Bucket, open_database
 from core.storage import Atlas
 from service.settings import Settings
+
+
+class SweptStore(Store, Protocol):
+    """A store that several services use."""
+
+    def start_sweeping(self) -> None:
+        """Delete what others have left, now and from time to time."""
 
 
 class OpenStore:
@@ -22,23 +32,14 @@ class OpenStore:
     def __init__(self, settings: Settings) -> None:
         self.maps: Store
         self._lock: FolderLock | None = None
-        if settings.store == "embedded":
+        if settings.engine == "files":
             self.maps = Atlas(settings.data_dir)
             return
-        assert settings.milvus is not None and settings.postgres is not None  # the settings were checked
         with disk_errors(f"open the data directory {settings.data_dir}"):
             make_folder(settings.data_dir)
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            certificate = settings.milvus_certificate
-            store = open_store(
-                settings.milvus,
-                settings.postgres.get_secret_value(),
-                settings.milvus_token.get_secret_value(),
-                settings.milvus_database,
-                None if certificate is None else str(certificate),
-                _bucket(settings),
-            )
+            store = _store(settings)
         except BaseException:
             self._lock.release()
             raise
@@ -50,6 +51,24 @@ class OpenStore:
         self.maps.close()
         if self._lock is not None:
             self._lock.release()
+
+
+def _store(settings: Settings) -> SweptStore:
+    """The store of maps in a database."""
+    assert settings.database is not None  # the settings were checked
+    address = settings.database.get_secret_value()
+    if settings.engine == "postgres":
+        return open_database(address, _bucket(settings), settings.row_cache_bytes)
+    assert settings.milvus is not None
+    certificate = settings.milvus_certificate
+    return open_store(
+        settings.milvus,
+        address,
+        settings.milvus_token.get_secret_value(),
+        settings.milvus_database,
+        None if certificate is None else str(certificate),
+        _bucket(settings),
+    )
 
 
 def _bucket(settings: Settings) -> Bucket | None:

@@ -11,7 +11,7 @@ import base64
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
@@ -19,6 +19,7 @@ from core.errors import PlacerecError
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from service.errors.faults import TooManyListeners
 from service.events.feed import Feed, FeedEvent, Listener
+from service.events.relay import EventRelay
 from service.events.schemas import PRIVATE, Event, QueryEvent
 
 LINGER_SECONDS = 120.0
@@ -30,6 +31,8 @@ PICTURE_SIDE, PICTURE_QUALITY = 160, 70
 MOST_DRAWING, MOST_DRAWING_BYTES = 8, 32 << 20
 """The most frames, and bytes of their files, of which pictures are being made; further events go without one."""
 
+NOWHERE: Mapping[str, bool] = {}
+
 log = logging.getLogger("placerec.events")
 
 
@@ -39,20 +42,33 @@ class Events:
     Args:
         most_listeners: how many clients may listen at one time.
         clock: seconds, never going back.
+        relay: brings the events to listeners at other services, and theirs here; None: there are no other services.
     """
 
-    def __init__(self, most_listeners: int = 64, clock: Callable[[], float] = time.monotonic) -> None:
-        self._most_listeners, self._clock = most_listeners, clock
+    def __init__(
+        self,
+        most_listeners: int = 64,
+        clock: Callable[[], float] = time.monotonic,
+        relay: EventRelay | None = None,
+    ) -> None:
+        self._most_listeners, self._clock, self._relay = most_listeners, clock, relay
         self._feeds: dict[str, Feed] = {}
         self._lock = threading.Lock()
         self._drawing = self._drawing_bytes = 0
         self._artist: ThreadPoolExecutor | None = None
         self.listeners = 0
         self.stopping = False
+        if relay is not None:
+            relay.serve(self)
+
+    @property
+    def _elsewhere(self) -> Mapping[str, bool]:
+        """The maps with listeners at other services, and whether they want pictures."""
+        return NOWHERE if self._relay is None else self._relay.elsewhere
 
     def heard(self, map_id: str) -> bool:
         """Whether an event of a map would be sent or stored; call this before an event is made."""
-        return map_id in self._feeds
+        return map_id in self._feeds or (self._relay is not None and map_id in self._relay.elsewhere)
 
     def publish(self, event: Event, frame: bytes | None = None, maps: frozenset[str | None] | None = None) -> None:
         """Tell an event to the listeners of its map, if it is heard.
@@ -64,7 +80,7 @@ class Events:
         feed = self._feeds.get(event.map)
         if feed is not None and self._is_forgotten(event.map, feed):
             feed = None
-        if feed is None and not self._heard_elsewhere(event.map):
+        if feed is None and event.map not in self._elsewhere:
             return
         if frame is not None and self._shows_pictures(event.map, feed) and self._may_draw(len(frame)):
             try:
@@ -74,13 +90,9 @@ class Events:
         else:
             self._add(feed, event, maps, None)
 
-    def _heard_elsewhere(self, map_id: str) -> bool:
-        """Whether another service has listeners of a map."""
-        return False
-
     def _shows_pictures(self, map_id: str, feed: Feed | None) -> bool:
         """Whether somebody wants pictures of the frames of a map."""
-        return feed is not None and any(listener.pictures for listener in feed.listeners)
+        return self._elsewhere.get(map_id, False) or (feed is not None and feed.shows_pictures)
 
     def _add(self, feed: Feed | None, event: Event, maps: frozenset[str | None] | None, picture: str | None) -> None:
         # ASCII, since some clients take characters such as U+2028 for the end of a line.
@@ -88,13 +100,30 @@ class Events:
         public = event.model_dump_json(ensure_ascii=True, exclude=set(PRIVATE))
         verdict = event.verdict if isinstance(event, QueryEvent) else None
         stored = FeedEvent(0, event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
-        self._keep(event.map, feed, stored)
+        self._store(feed, stored)
+        if self._relay is not None:
+            self._relay.send(event.map, stored)
 
-    def _keep(self, map_id: str, feed: Feed | None, event: FeedEvent) -> None:
+    def _store(self, feed: Feed | None, event: FeedEvent) -> None:
         """Add an event to the feed of its map, if the map has one."""
         with self._lock:
             if feed is not None and not feed.ended:
                 feed.add(event)
+
+    # Events of other services
+
+    def listened(self) -> dict[str, bool]:
+        """The maps that have a feed, and whether a listener wants pictures."""
+        with self._lock:
+            self._drop_left()
+            return {map_id: feed.shows_pictures for map_id, feed in self._feeds.items()}
+
+    def receive(self, map_id: str, event: FeedEvent | None) -> None:
+        """Add an event of another service to the feed of its map; None: the map was deleted."""
+        if event is None:
+            self._end(map_id)
+        else:
+            self._store(self._feeds.get(map_id), event)
 
     def _is_forgotten(self, map_id: str, feed: Feed) -> bool:
         """Drop a feed that nobody has listened to for a while; whether it was dropped."""
@@ -156,7 +185,7 @@ class Events:
             listener = Listener(feed, resumed, pictures)
             feed.listeners.append(listener)
             self._drop_left()
-        self._listeners_changed()
+        self._say_listeners_changed()
         try:
             yield listener
         finally:
@@ -165,10 +194,11 @@ class Events:
                 feed.listeners.remove(listener)
                 if not feed.listeners:
                     feed.left_at = self._clock()
-            self._listeners_changed()
+            self._say_listeners_changed()
 
-    def _listeners_changed(self) -> None:
-        """Called whenever a listener has come or gone."""
+    def _say_listeners_changed(self) -> None:
+        if self._relay is not None:
+            self._relay.listeners_changed()
 
     def _drop_left(self) -> None:
         """Drop the feeds without listeners that were left for long, and the longest left ones if they are too many."""
@@ -180,6 +210,11 @@ class Events:
 
     def end(self, map_id: str) -> None:
         """End the streams of a map that was deleted; earlier events are still read."""
+        self._end(map_id)
+        if self._relay is not None:
+            self._relay.send(map_id, None)
+
+    def _end(self, map_id: str) -> None:
         with self._lock:
             feed = self._feeds.pop(map_id, None)
             if feed is not None:

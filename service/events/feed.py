@@ -98,6 +98,11 @@ class Feed:
             self.size -= self.latest.popleft().size
         self.wake()
 
+    @property
+    def shows_pictures(self) -> bool:
+        """Whether a listener wants pictures."""
+        return any(listener.pictures for listener in self.listeners)
+
     def wake(self) -> None:
         """Let the listeners look what is new."""
         for listener in self.listeners:

@@ -14,7 +14,7 @@ from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import ClientGone
-from service.jobs.records import Job
+from service.jobs.job import Job
 
 Work = Callable[["JobContext"], Mapping[str, Any]]
 """The function of a job; it returns the job's result as a JSON object."""
@@ -54,7 +54,7 @@ class Supervisor(Protocol):
 class JobContext:
     """The interface between a running job and the service; it is used in the job's thread.
 
-    id, map_id, arguments, attempt, maps: as in :class:`service.jobs.records.Job`.
+    id, map_id, arguments, attempt, maps: as in :class:`service.jobs.job.Job`.
     notes: the notes of :meth:`remember`, also of an earlier attempt.
     """
 

@@ -7,37 +7,51 @@ the points where it calls :meth:`JobContext.check_cancelled`.
 
 from __future__ import annotations
 
-import asyncio
-import itertools
 import json
 import logging
 import secrets
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from core.errors import PlacerecError
+from core.disk.files import Damage
+from core.errors import PlacerecError, StorageFailure, StorageFull, StoreUnavailable
+from core.ledger import Ledger
 from service.access.audit import ASKER, asker_of_fields, note_job, now_asking
-from service.errors.faults import JobEnded, JobLost, JobQueueFull, TooManyWatchers, UnknownJob
+from service.errors.faults import JobLost, UnknownJob
 from service.errors.problems import problem_of
 from service.events.events import Events
-from service.events.schemas import JobEvent
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
-from service.jobs.records import DAMAGED, Job, JobRecords, JobState
+from service.jobs.file import open_file
+from service.jobs.job import Job, JobState
+from service.jobs.rows import DAMAGED
+from service.jobs.table import JobTable
+from service.jobs.watchers import Watchers
+from service.peers.alone import Alone
+from service.peers.peers import Peers
 
 __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jobs", "Work"]
 
 MOST_RESULT_BYTES = 4 << 20
 """The longest result, as JSON, that a job may have."""
 
-TELLING_SECONDS = 1.0
-"""The shortest time between two events of a job's progress."""
+REFUSALS = (StorageFull, StorageFailure, Damage)
+"""The errors of a database that refuses, and may do so no longer after a while."""
+
+RETRY_SECONDS = 0.2
+"""How soon a write of a running job is tried again while the database refuses."""
+
+TAKING_SECONDS = 2.0
+"""How soon it is tried again to take a job while the database refuses."""
+
+TOPIC = "job"
+"""The topic of messages between services: the id of a job that has changed, and that of the service that says so."""
 
 Discard = Callable[[Job], None]
 """Removes the files of a job once the job has ended."""
@@ -46,51 +60,76 @@ log = logging.getLogger("placerec.jobs")
 
 
 class Jobs:
-    """All jobs of a data directory.  Thread-safe; reading never waits for a disk.
+    """The jobs of one service, or of all services that share a ledger.  Thread-safe.
+
+    The table of the jobs is what counts; a service also holds in memory the jobs that it does.  Whoever adds or takes a
+    job holds one lock, so that each job is taken once, and of each map at most one job runs.  A service that does a job
+    writes only as its owner, in the attempt in which it took it: one that was away for too long, and whose job another
+    has taken over, finds that out at its next write, or before.
 
     Args:
-        directory: the data directory, which this process holds.
-        workers: how many jobs run at one time; of one map at most one job runs.
-        longest_queue: how many jobs may wait.
+        ledger: has the table of the jobs.
+        peers: the services that share it.
+        shared_maps: whether all services have the same maps; else each does the jobs that were submitted to it.
+        workers: how many jobs run at one time here.
+        longest_queue: how many jobs may wait, over all services.
         history: how many ended jobs are remembered.
         most_watchers: how many clients may follow jobs at one time.
         events: receives the progress of jobs; None: it is not published.
 
     Raises:
-        DataDirectoryTooNew: a later version of placerec wrote the jobs' file.
-        StorageFull, StorageFailure: the jobs' file cannot be opened.
+        StorageFull, StorageFailure: the jobs of a service that is alone cannot be read.
     """
 
     def __init__(
         self,
-        directory: Path,
+        ledger: Ledger,
+        peers: Peers,
+        shared_maps: bool = False,
         workers: int = 1,
         longest_queue: int = 32,
         history: int = 200,
         most_watchers: int = 64,
         events: Events | None = None,
     ) -> None:
-        self._workers, self._longest_queue, self._history = workers, longest_queue, history
-        self._most_watchers, self._events = most_watchers, events
-        self._published: dict[str, tuple[str, float]] = {}  # of running jobs: the state published last, and when
+        self._peers, self._shared_maps, self._workers = peers, shared_maps, workers
+        self._longest_queue = longest_queue
+        self.watchers = Watchers(most_watchers, events)
+        self._table = JobTable(ledger, peers, longest_queue, history)
         self.stopping = False
-        self._changed = threading.Condition()  # held while a job is changed
+        self._changed = threading.Condition()  # held while a job is changed in memory
         self._kinds: dict[str, Work] = {}
         self._discards: dict[str, Discard] = {}
-        self._numbers = itertools.count(1)
-        self._gave_way: dict[str, tuple[int, int]] = {}  # the position in the queue of jobs that gave way
-        self._works: dict[str, Work] = {}
-        self._jobs: dict[str, Job] = {}
-        self._last_number = 0
-        self._watchers: list[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = []
+        self._works: dict[str, Work] = {}  # of the jobs of this service that cannot be resumed
+        self._jobs: dict[str, Job] = {}  # those that this service does
+        self._lost: set[str] = set()  # those of them that another one has taken over
+        self._taking = threading.Lock()  # held while a job is taken, and while it is looked what is to be let go
+        self._resumed = False  # whether the jobs of the last run wait again, or have ended
+        self._news = 0  # grows whenever there may be a job to take
+        self._counts: Counter[JobState] = Counter()  # over all services, some seconds ago
         self._threads: list[threading.Thread] = []
-        self._open(directory)
+        self._put_aside: str | None = None  # the name of a damaged file
+        self._close_ledger: Callable[[], None] = lambda: None
+        peers.every(self.keep_up)
+        peers.hear(TOPIC, self._hear)
 
-    def _open(self, directory: Path) -> None:
-        """Read the jobs of earlier runs."""
-        self._records = JobRecords(directory)
-        self._jobs |= {job.id: job for job in self._records.read()}
-        self._last_number = self._records.last_number()
+    @classmethod
+    def of_directory(cls, directory: Path, **limits: Any) -> Jobs:
+        """The jobs of a service that is alone, in a file of its data directory, which this process holds.
+
+        Reading them never waits for a disk.
+
+        Args:
+            limits: as of the class.
+
+        Raises:
+            DataDirectoryTooNew, DataDirectoryTooOld: the jobs' file is of a version that is not read.
+            StorageFull, StorageFailure: it cannot be opened.
+        """
+        ledger, put_aside = open_file(directory)
+        jobs = cls(ledger, Alone(), **limits)
+        jobs._put_aside, jobs._close_ledger = put_aside, ledger.close
+        return jobs
 
     # Kinds, start and end
 
@@ -107,36 +146,19 @@ class Jobs:
 
     def start(self) -> None:
         """Resume the jobs of the last run of the service and start the workers; all kinds must be registered before."""
-        self._resume()
+        with suppress(*REFUSALS):  # it is done before the first job is taken
+            self.keep_up()
         for number in range(self._workers):
             thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
             thread.start()
             self._threads.append(thread)
-
-    def _resume(self) -> None:
-        """Let the jobs of the last run go on, and end those that cannot."""
-        for job in [job for job in self.all() if not job.ended]:
-            if job.resumable and job.kind in self._kinds:
-                self._works[job.id] = self._kinds[job.kind]
-                if job.state == "running":
-                    self._change(job.id, state="queued", message="waits to be resumed after a restart of the service")
-                continue
-            state = "running" if job.state == "running" else "waiting"
-            why = "this kind of job cannot be resumed"
-            if job.message == DAMAGED:
-                why = DAMAGED
-            elif job.resumable:
-                why = f"this version of placerec knows no jobs of the kind {job.kind}"
-            lost = JobLost(f"The service ended while the job was {state}, and {why}.")
-            self._end(job.id, "failed", problem=problem_of_job(lost))
-            self._discard(job)
 
     def stop_soon(self) -> None:
         """Ask the running jobs to stop, and end the streams of watchers; returns at once."""
         with self._changed:
             self.stopping = True
             self._changed.notify_all()
-        self._notify(None)
+        self.watchers.wake(None)
 
     def close(self, timeout: float = 10.0) -> None:
         """Stop, and wait at most ``timeout`` seconds for running jobs; those that go on count as killed."""
@@ -146,10 +168,65 @@ class Jobs:
             thread.join(max(0.0, until - time.monotonic()))
             if thread.is_alive():
                 log.warning("a job does not stop; the service stops without waiting for it")
-        self._close()
+        self._close_ledger()
 
-    def _close(self) -> None:
-        self._records.close()
+    # Keeping up with other services
+
+    def keep_up(self) -> None:
+        """Take over what is left of services that are gone, and learn which jobs were lost or cancelled.
+
+        Raises:
+            StorageFull, StorageFailure.
+        """
+        with self._taking:
+            held = self._jobs.copy()
+            owned = self._table.held()
+            changed = self._table.recover(self._kinds, self._works.copy(), held, _problem_of_lost)
+        self._mirror(held.values(), owned)
+        for job in changed:
+            if job.ended:
+                note_event(job, job.state)
+                self._discard(job)
+            self._announce(job)
+        self._counts = self._table.counts()
+        self._resumed = True
+        self._rouse()
+
+    def _mirror(self, held: Iterable[Job], owned: Mapping[tuple[str, int], bool]) -> None:
+        """Note which of the jobs of this service are cancelled, or not its own any more."""
+        with self._changed:
+            for job_id in {job.id for job in held} & self._jobs.keys():
+                job = self._jobs[job_id]
+                if (cancelling := owned.get((job_id, job.attempt))) is None:
+                    self._lost.add(job_id)
+                elif cancelling and not job.cancelling:
+                    self._jobs[job_id] = replace(job, cancelling=True, change=job.change + 1)
+
+    def _hear(self, text: str | None) -> None:
+        """Learn that another service has changed a job; None: any may have."""
+        job_id, _, service = (text or "").partition(" ")
+        if service == self._peers.id:
+            return
+        if held := [job for job in self._jobs.copy().values() if text is None or job.id == job_id]:
+            self._mirror(held, self._table.held())
+        elif self._discards and (job := self._table.get(job_id)) is not None and job.ended:
+            self._discard(job)
+        self._rouse()
+        self.watchers.wake(job_id or None)
+
+    def _announce(self, job: Job) -> None:
+        """Notify everybody who follows a job, and the other services."""
+        self.watchers.notify(job)
+        if job.state != "running":
+            self._rouse()
+        with suppress(PlacerecError):  # others look by themselves after a while
+            self._peers.say(TOPIC, f"{job.id} {self._peers.id}")
+
+    def _rouse(self) -> None:
+        """Let the workers look for a job."""
+        with self._changed:
+            self._news += 1
+            self._changed.notify_all()
 
     # Submitting, reading and cancelling
 
@@ -161,7 +238,7 @@ class Jobs:
         arguments: Mapping[str, Any] | None = None,
         maps: Mapping[str, str] | None = None,
     ) -> Job:
-        """Add a job to the queue; it is on disk when this returns.
+        """Add a job to the queue; it is durable when this returns.
 
         Args:
             work: the function of the job; None: that of the registered kind, which survives a restart.
@@ -183,39 +260,27 @@ class Jobs:
             created_at=datetime.now(UTC),
             maps=dict(maps or {}),
             asker=now_asking(),
+            home=None if work is None and self._shared_maps and kind not in self._discards else self._peers.id,
         )
-        job = self._add(job, self._kinds[kind] if work is None else work)
-        self._tell(job)
+        if work is not None:
+            self._works[job.id] = work
+        try:
+            job = self._table.add(job)
+        except BaseException:
+            self._works.pop(job.id, None)
+            raise
+        self._announce(job)
         log.info("job queued", extra={"job": job.id, "kind": kind, "map": map_id})
-        return job
-
-    def _add(self, job: Job, work: Work) -> Job:
-        """Add a job to the queue; the job with its number."""
-        with self._changed:
-            self.check_room()
-            job = replace(job, number=self._last_number + 1)
-            self._records.put(job)
-            self._last_number = job.number
-            self._works[job.id], self._jobs[job.id] = work, job
-            self._changed.notify_all()
         return job
 
     def check_room(self) -> None:
         """Raise JobQueueFull if no further job may wait; a route calls it before it reads a long body."""
-        if sum(job.state == "queued" for job in self._jobs.copy().values()) >= self._longest_queue:
-            raise self._queue_full()
-
-    def _queue_full(self) -> JobQueueFull:
-        return JobQueueFull(f"{self._longest_queue} jobs are waiting already; send this one again later.")
+        if self.counts()["queued"] >= self._longest_queue:
+            raise self._table.queue_full()
 
     def counts(self) -> Counter[JobState]:
         """How many of the jobs that are remembered are in each state; never waits."""
-        return Counter(job.state for job in self._jobs.copy().values())
-
-    @property
-    def watchers(self) -> int:
-        """The number of clients that follow jobs now."""
-        return len(self._watchers)
+        return self._table.counts() if self._peers.alone else self._counts
 
     def get(self, job_id: str) -> Job:
         """The present state of a job.
@@ -224,15 +289,21 @@ class Jobs:
             UnknownJob: there is no such job, or it ended so long ago that it is forgotten.
         """
         found = self._jobs.get(job_id)
+        if found is None or job_id in self._lost:
+            found = self._table.get(job_id)
         if found is None:
-            aside = self._records.put_aside
-            more = "" if aside is None else f" The records of earlier jobs were damaged; they are put aside as {aside}."
-            raise UnknownJob(f"There is no job {job_id[:80]!r}.{more}")
+            raise self._unknown(job_id)
         return found
+
+    def _unknown(self, job_id: str) -> UnknownJob:
+        aside = self._put_aside
+        more = "" if aside is None else f" The records of earlier jobs were damaged; they are put aside as {aside}."
+        return UnknownJob(f"There is no job {job_id[:80]!r}.{more}")
 
     def all(self) -> list[Job]:
         """All jobs that are remembered, the oldest first."""
-        return sorted(self._jobs.copy().values(), key=lambda job: job.number)
+        held = {name: job for name, job in self._jobs.copy().items() if name not in self._lost}
+        return [held.get(job.id, job) if job.state == "running" else job for job in self._table.all()]
 
     def cancel(self, job_id: str) -> Job:
         """Ask a job to stop.  A waiting job is cancelled at once, a running one at the next point where it can stop.
@@ -242,56 +313,36 @@ class Jobs:
             JobEnded: the job has succeeded or failed.
             StorageFull, StorageFailure: the request could not be stored; the job goes on.
         """
-        with self._changed:
-            job = self.get(job_id)
-            if job.state in ("succeeded", "failed"):
-                raise JobEnded(f"The job {job_id} has {job.state} already.")
-            if ended := job.state == "queued" and (not job.attempt or job_id in self._gave_way):
-                job = self._end(job_id, "cancelled")
-            elif job.state != "cancelled" and not job.cancelling:
-                changed = replace(job, cancelling=True, change=job.change + 1)
-                self._records.update(changed)
-                self._jobs[job_id] = changed
+        found = self._table.cancel(job_id)
+        if found is None:
+            raise self._unknown(job_id)
+        job, ended = found
         if ended:
+            self._works.pop(job_id, None)
+            note_event(job, job.state)
             self._discard(job)
-            return job
-        self._notify(job_id)
-        return self.get(job_id)
-
-    @contextmanager
-    def watching(self, job_id: str) -> Iterator[asyncio.Event]:
-        """An event of the running loop that is set whenever the job changes, or when the service stops.
-
-        Raises:
-            TooManyWatchers: too many clients follow jobs already.
-        """
-        if len(self._watchers) >= self._most_watchers:
-            raise TooManyWatchers("Too many clients follow jobs already; read the job instead, or try again later.")
-        watcher = (job_id, asyncio.get_running_loop(), asyncio.Event())
-        self._watchers.append(watcher)
-        try:
-            yield watcher[2]
-        finally:
-            self._watchers.remove(watcher)
+        elif not job.ended:
+            self._mirror([job], {(job_id, job.attempt): job.cancelling})
+        self._announce(job)
+        return job
 
     # The workers
 
     def _work(self) -> None:
         while (job := self._take()) is not None:
-            if job.id not in self._gave_way:  # a job that gave way was noted when it began
-                note_event(job, "running")
             try:
                 self._do(job)
             except Exception:  # this code has a defect: the job has failed, and the worker goes on
                 log.exception("job %s failed", job.id)
-                self._end(job.id, "failed", problem=problem_of_job(RuntimeError()))
+                with suppress(Exception):
+                    self._end(job.id, "failed", message="", problem=problem_of_job(RuntimeError()))
 
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
         context = JobContext(self, job)
         ASKER.set(asker_of_fields(job.asker))  # it works on behalf of its caller
         try:
-            result = dict(self._works[job.id](context))
+            result = dict((self._works[job.id] if job.id in self._works else self._kinds[job.kind])(context))
             if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:
                 raise ValueError("the result is too long to be stored")
         except JobCancelled:
@@ -299,7 +350,7 @@ class Jobs:
         except JobInterrupted:
             ended = self._put_off(job)
         except JobGivesWay:
-            ended = self._give_way(job)
+            ended = self._release(job, "waits for the jobs of other maps", self._table.give_way)
         except Exception as error:
             problem = problem_of_job(error)
             if problem["status"] == 500:
@@ -307,62 +358,111 @@ class Jobs:
             ended = self._end(job.id, "failed", problem=problem)
         else:
             ended = self._end(job.id, "succeeded", result=result)
-        if ended.ended:
-            self._discard(ended)
         seconds = round(time.perf_counter() - began, 2)
         log.info("job %s", ended.state, extra={"job": job.id, "kind": job.kind, "map": job.map_id, "seconds": seconds})
 
     def _take(self) -> Job | None:
         """Wait for the next job and mark it as running; None when the service stops."""
-        with self._changed:
-            while not self.stopping:
-                for job in self._ready():
-                    now = datetime.now(UTC)
-                    return self._change(job.id, state="running", attempt=job.attempt + 1, started_at=now)
-                self._changed.wait()
+        while not self.stopping:
+            news, patience = self._news, None
+            try:
+                if self._peers.living and (job := self._take_one()) is not None:
+                    return job
+            except Exception as error:
+                log.warning("no job can be taken: %s", error)
+                patience = TAKING_SECONDS
+            with self._changed:
+                self._changed.wait_for(lambda news=news: self.stopping or self._news != news, patience)  # type: ignore[misc]
         return None
 
-    def _ready(self, but_for: str | None = None) -> list[Job]:
-        """The jobs that may run now, in order; jobs of one map run one after another, in the order of submission."""
-        first: dict[str | None, int] = {}
-        for job in (open_ := [job for job in self.all() if not job.ended and job.id != but_for]):
-            first.setdefault(job.map_id, job.number)
-        ready = [
-            job
-            for job in open_
-            if job.state == "queued"
-            and job.id in self._works
-            and (job.map_id is None or first[job.map_id] == job.number)
-        ]
-        return sorted(ready, key=lambda job: self._gave_way.get(job.id, (job.number, 0)))
+    def _take_one(self) -> Job | None:
+        if not self._resumed:
+            self.keep_up()
+        with self._taking:
+            taken = self._table.take(self._kinds, self._works.copy())
+            if taken is None:
+                return None
+            job, had_given_way = taken
+            self._jobs[job.id] = job
+        if not had_given_way:  # else it was noted when it began
+            note_event(job, "running")
+        self._announce(job)
+        return job
 
     def others_wait(self, job_id: str) -> bool:
         """Whether jobs of other maps wait that could run if this one gave way."""
-        with self._changed:
-            own = self._jobs[job_id].map_id
-            return any(job.map_id is None or job.map_id != own for job in self._ready(job_id))
-
-    def _give_way(self, job: Job) -> Job:
-        """Let a job wait behind those that were submitted until now."""
-        self._gave_way[job.id] = (self._last_number, next(self._numbers))
-        changed = self._change(job.id, state="queued", message="waits for the jobs of other maps")
-        with self._changed:
-            self._changed.notify_all()
-        return changed
+        with suppress(PlacerecError):
+            return self._table.others_wait(self._jobs[job_id].map_id, self._kinds, self._works.copy())
+        return False
 
     def interrupts(self, job_id: str) -> bool:
-        """Whether a running job has to stop so that it can go on later."""
-        return self.stopping
+        """Whether a running job has to stop so that it can go on later, or was lost to another service."""
+        return self.stopping or job_id in self._lost or not self._peers.living
 
     def _put_off(self, job: Job) -> Job:
         """Let a job wait that was interrupted."""
         if job.resumable:
-            return self._change(job.id, state="queued", message="is resumed when the service starts again")
+            again = "waits to be resumed" if job.home is None else "is resumed when the service starts again"
+            return self._release(job, again, self._table.put_off)
         why = "The service was stopped while the job was running, and this kind of job cannot be resumed."
         return self._end(job.id, "failed", problem=problem_of_job(JobLost(why)))
 
+    def _release(self, job: Job, message: str, write: Callable[[Job], Job | None]) -> Job:
+        before = self._jobs[job.id]
+        released = replace(before, state="queued", message=message, change=before.change + 1)
+        if self._persist(released, write) is None:
+            released = replace(released, message="was lost to another service")
+        self._drop(job.id)
+        self._announce(released)
+        return released
+
+    def _end(self, job_id: str, state: JobState, **outcome: Any) -> Job:
+        """End a job that runs here; it waits if it was lost to another service."""
+        job = self._jobs[job_id]
+        now = datetime.now(UTC)
+        ended = replace(job, state=state, ended_at=now, notes={}, change=job.change + 1, **outcome)
+        written = self._persist(ended, self._table.end)
+        self._drop(job_id)
+        if written is None:
+            log.warning("the end of job %s could not be written; it is done again", job_id)
+            return replace(job, state="queued")
+        note_event(ended, state)
+        self._discard(ended)
+        self._announce(ended)
+        return ended
+
+    def _persist(
+        self, job: Job, write: Callable[[Job], Job | None], awaited: tuple[type[Exception], ...] = REFUSALS
+    ) -> Job | None:
+        """Write a running job, again and again while the database refuses; None if the job is lost, or must wait.
+
+        Args:
+            awaited: the errors after which it is written again.
+        """
+        refused = False
+        while True:
+            try:
+                return write(job)
+            except awaited as error:
+                if not refused:
+                    log.warning("job %s cannot be written down: %s", job.id, error)
+                if self.stopping or not self._peers.living:
+                    return None
+                if self._peers.alone and not refused:  # nobody else can do it meanwhile
+                    self._jobs[job.id] = job
+                    self.watchers.notify(job)
+                refused = True
+                time.sleep(RETRY_SECONDS)
+
+    def _drop(self, job_id: str) -> None:
+        with self._changed:
+            self._jobs.pop(job_id, None)
+            self._works.pop(job_id, None)
+            self._lost.discard(job_id)
+
     def _discard(self, job: Job) -> None:
-        if (discard := self._discards.get(job.kind)) is not None:
+        """Remove the files of an ended job, if this service has them."""
+        if job.home == self._peers.id and (discard := self._discards.get(job.kind)) is not None:
             try:
                 discard(job)
             except Exception as error:  # the files are removed at the next start
@@ -371,95 +471,41 @@ class Jobs:
     # Changes
 
     def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
-        """Note the progress of a job: on disk if ``writing``, and for its watchers if ``noticing``."""
-        if writing:
-            self._change(job_id, **progress)
-            return
+        """Note the progress of a job: durably if ``writing``, and for its watchers if ``noticing``.
+
+        If the database refuses, the job goes on all the same.
+        """
         with self._changed:
             job = self._jobs[job_id]
-            if {name: getattr(job, name) for name in progress} != progress:
-                self._jobs[job_id] = replace(job, change=job.change + 1, **progress)
-        if noticing:
-            self._notify(job_id)
+            if writing or {name: getattr(job, name) for name in progress} != progress:
+                job = self._jobs[job_id] = replace(job, change=job.change + 1, **progress)
+        if writing:
+            self._write(job)
+            self._announce(job)
+        elif noticing:
+            self.watchers.notify(job)
+
+    def _write(self, job: Job) -> None:
+        try:
+            written = self._table.progress(job)
+        except Exception as error:
+            log.error("job %s cannot be written down: %s", job.id, error)
+        else:
+            self._mirror([job], {} if written is None else {(job.id, job.attempt): written.cancelling})
 
     def note(self, job_id: str, notes: Mapping[str, Any]) -> None:
         """Store the notes of a job for its next attempt.
 
         Raises:
-            StorageFull, StorageFailure: the disk is full or refuses.
+            StorageFull, StorageFailure: the database refuses.
+            JobInterrupted: the job was lost to another service, or the database is away for too long.
         """
         with self._changed:
-            job = replace(self._jobs[job_id], notes=dict(notes))
-            self._records.put(job)
-            self._jobs[job_id] = job
-
-    def _end(self, job_id: str, state: str, **outcome: Any) -> Job:
-        """End a job, and forget the oldest ended jobs beyond ``history``."""
-        with self._changed:
-            past = [job for job in self.all() if job.ended]
-            past = past[: max(0, len(past) + 1 - self._history)]
-            for job in past:
-                del self._jobs[job.id]
-            ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
-            note_event(ended, state)
-            self._works.pop(job_id, None)
-            self._gave_way.pop(job_id, None)
-            self._changed.notify_all()  # another one of the same map may run
-            if past:
-                with suppress(PlacerecError):  # they are removed from disk another time
-                    self._records.forget([job.number for job in past])
-        return ended
-
-    def _change(self, job_id: str, **changes: Any) -> Job:
-        """Change a job in memory and on disk; if the disk refuses, the job goes on all the same."""
-        with self._changed:
-            before = self._jobs[job_id]
-            change = 0 if "attempt" in changes else before.change + 1
-            job = self._jobs[job_id] = replace(before, change=change, **changes)
-            try:
-                (self._records.put if "notes" in changes else self._records.update)(job)
-            except Exception as error:
-                log.error("job %s cannot be written down: %s", job_id, error)
-        self._notify(job_id)
-        return job
-
-    def _notify(self, job_id: str | None) -> None:
-        """Wake the watchers of a job; all watchers for None."""
-        if job_id is not None and (job := self._jobs.get(job_id)) is not None:
-            self._tell(job)
-        for watched, loop, event in self._watchers.copy():
-            if job_id in (None, watched):
-                with suppress(RuntimeError):  # its loop has ended
-                    loop.call_soon_threadsafe(event.set)
-
-    def _tell(self, job: Job) -> None:
-        """Publish the state of a job to the listeners of its maps; mere progress at most once in a while."""
-        used, events = job.used_maps(), self._events
-        if events is None or not any(events.heard(name) for name in used if name is not None):
-            self._published.pop(job.id, None)
-            return
-        state, now = f"{job.state} {job.cancelling}", time.monotonic()
-        published, moment = self._published.get(job.id, ("", 0.0))
-        if published == state and now - moment < TELLING_SECONDS:
-            return
-        self._published[job.id] = (state, now)
-        if job.ended:
-            self._published.pop(job.id, None)
-        for name in used - {None}:
-            events.publish(_event(str(name), job), maps=frozenset(used))
-
-
-def _event(map_id: str, job: Job) -> JobEvent:
-    return JobEvent.now(
-        map_id,
-        asker_of_fields(job.asker),
-        job=job.id,
-        job_kind=job.kind,
-        state=job.state,
-        progress={"done": job.done, "total": job.total, "message": job.message},
-        cancelling=job.cancelling,
-        problem=job.problem,
-    )
+            job = self._jobs[job_id]
+            noted = self._jobs[job_id] = replace(job, notes=dict(notes), change=job.change + 1)
+        if self._persist(noted, self._table.note, (StoreUnavailable,)) is None:
+            self._lost.add(job_id)
+            raise JobInterrupted
 
 
 def problem_of_job(error: Exception) -> dict[str, Any]:
@@ -471,3 +517,14 @@ def note_event(job: Job, event: str) -> None:
     """Write a line of the audit trail about a job."""
     line = {"job": job.id, "kind": job.kind, "map": job.map_id, "attempt": job.attempt}
     note_job(event, line, job.arguments, job.problem, job.asker)
+
+
+def _problem_of_lost(job: Job) -> dict[str, Any]:
+    """The problem of a job that this service cannot do any more."""
+    why = "this kind of job cannot be resumed"
+    if job.message == DAMAGED:
+        why = DAMAGED
+    elif job.resumable:
+        why = f"this version of placerec knows no jobs of the kind {job.kind}"
+    state = "running" if job.state == "running" else "waiting"
+    return problem_of_job(JobLost(f"The service ended while the job was {state}, and {why}."))

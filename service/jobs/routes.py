@@ -30,8 +30,8 @@ from service.http.event_stream import (
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
+from service.jobs.job import Job, JobState
 from service.jobs.jobs import Jobs
-from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
 from service.worker_threads import in_thread
@@ -96,7 +96,7 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
     job = await in_thread(_job_for, jobs, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
-        with jobs.watching(job_id) as changed:
+        with jobs.watchers.watching(job_id) as changed:
             while not (job := await in_thread(jobs.get, job_id)).ended and not jobs.stopping:
                 if not await set_within(changed, until - time.monotonic()):
                     break
@@ -160,7 +160,7 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
     """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
-    with jobs.watching(job_id) as changed:
+    with jobs.watchers.watching(job_id) as changed:
         yield OPENING
         while True:
             try:

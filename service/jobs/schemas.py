@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from core.places import Timestamp
 from service.errors.problems import Problem
 from service.http.schemas import Cursor
-from service.jobs.records import Job, JobState
+from service.jobs.job import Job, JobState
 
 JOB_EXAMPLE: dict[str, Any] = {
     "id": "5f0c6a1de2b94c77",

@@ -42,8 +42,8 @@ from service.errors.faults import ClientGone, DigestMismatch, TooManyImports, To
 from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
 from service.jobs.context import JobContext
+from service.jobs.job import Job
 from service.jobs.jobs import Jobs
-from service.jobs.records import Job
 from service.maps.limits import check_new_map
 from service.worker_threads import to_its_end
 

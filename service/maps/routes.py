@@ -46,8 +46,9 @@ from service.maps.schemas import (
     ReviewChanges,
 )
 from service.queries.answers import StatisticsDep
+from service.queries.counts import VerdictCounts
 from service.queries.given_answers import MapKey
-from service.queries.statistics import QueryStatistics, VerdictCounts, map_key
+from service.queries.statistics import QueryStatistics, map_key
 
 router = APIRouter(
     prefix="/v1/maps",

@@ -14,7 +14,7 @@ from core.maps import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, 
 from core.maps.records import COMPACT_FROM
 from core.places import Timestamp
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
-from service.queries.statistics import VerdictCounts
+from service.queries.counts import VerdictCounts
 
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",

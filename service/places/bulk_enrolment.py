@@ -21,8 +21,8 @@ from service.http.bodies import intake_of, parse_json
 from service.http.multipart import FormPart
 from service.http.uploads import FIELD_PARTS, FORM, media_type
 from service.jobs.context import JobContext, creation_time, run_after_requests
+from service.jobs.job import Job
 from service.jobs.jobs import Jobs
-from service.jobs.records import Job
 from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
 from service.places.enrolment import Enrolled, FrameToEnrol, enrol
 from service.places.staging import StagedForm, StagedPart, Staging

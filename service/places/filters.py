@@ -8,9 +8,9 @@ from typing import Annotated, Any
 from fastapi import Query
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.ledger.maps.places import LONGEST_TEXT
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import Camera, Timestamp
-from core.ledger.maps.places import LONGEST_TEXT
 from service.errors.faults import InvalidRequest
 from service.http.schemas import PageParameters
 

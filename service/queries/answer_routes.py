@@ -16,9 +16,11 @@ from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, MapId, PlaceId, PrincipalDep, single_values
 from service.http.schemas import Parameters
 from service.queries.answers import StatisticsDep
-from service.queries.given_answers import MOST_OF_MAP, GivenAnswer
+from service.queries.counts import HourCount
+from service.queries.given_answers import GivenAnswer
+from service.queries.recent_answers import MOST_OF_MAP
 from service.queries.schemas import EstimatedPose
-from service.queries.statistics import HourCount, map_key
+from service.queries.statistics import map_key
 
 router = APIRouter(prefix="/v1/maps/{map}", tags=["queries"], dependencies=[Depends(single_values)])
 

@@ -1,9 +1,7 @@
-"""Answers as they were given, for listeners, counts, lists and review; and the latest ones of each map."""
+"""Answers as they were given, for listeners, counts, lists and review."""
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict, deque
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -12,12 +10,6 @@ from core.judgement.verdict import Verdict
 from service.access.audit import ASKER, Asker
 from service.events.schemas import QueryEvent
 from service.queries.schemas import EstimatedPose, QueryAnswer
-
-MOST_OF_MAP = 500
-"""Answers of one map that are stored."""
-
-MOST = 20_000
-"""Answers of all maps together; those of the map that was queried least recently go first."""
 
 MOST_MATCHES = 5
 """Matches that are stored of one answer, the best ones."""
@@ -135,30 +127,3 @@ REVIEWED = {
     "request_id", "key", "operation", "verdict", "probability", "best", "score", "decision", "threshold", "reason",
     "camera", "session", "frame", "file", "revision",
 }  # fmt: skip
-
-
-class RecentAnswers:
-    """The latest answers of each map, bounded in number.  Any thread may use it."""
-
-    def __init__(self) -> None:
-        self._stored: OrderedDict[MapKey, deque[GivenAnswer]] = OrderedDict()
-        self._count = 0
-        self._lock = threading.Lock()
-
-    def add(self, key: MapKey, answer: GivenAnswer) -> None:
-        """Store an answer of a map."""
-        with self._lock:
-            of_map = self._stored.get(key)
-            if of_map is None:
-                of_map = self._stored[key] = deque(maxlen=MOST_OF_MAP)
-            else:
-                self._stored.move_to_end(key)
-            self._count += len(of_map) < MOST_OF_MAP
-            of_map.append(answer)
-            while self._count > MOST:
-                self._count -= len(self._stored.popitem(last=False)[1])
-
-    def of_map(self, key: MapKey) -> list[GivenAnswer]:
-        """The answers of a map, the latest first."""
-        with self._lock:
-            return list(reversed(self._stored.get(key, ())))

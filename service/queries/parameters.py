@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from core.judgement.priors import Constraint, Disc, Facing, GeographicBox, Period
+from core.ledger.maps.places import LONGEST_TEXT
 from core.maps.place_filter import Scalar
 from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
 from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
 from core.recognition.question import Question
-from core.ledger.maps.places import LONGEST_TEXT
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.filters import MOST_NAMES, checked_metadata, parsed_json

@@ -32,7 +32,8 @@ from service.sessions.schemas import (
     SessionReport,
     SessionView,
 )
-from service.sessions.sessions import Session, SessionMoved, Sessions, alive_rows
+from service.sessions.session import Session
+from service.sessions.sessions import SessionMoved, Sessions, alive_rows
 from service.worker_threads import in_thread
 
 
@@ -195,7 +196,7 @@ def _advance(
     believed = 1e3 * (time.perf_counter() - started)
     answer.milliseconds = rounded({"belief": believed, "total": 1e3 * (time.monotonic() - began)})
     # The session changes only here, after everything that may fail: a frame that raises does not count.
-    session.answer, session.lost = answer.model_dump_json(), lost
+    session.answer, session.lost, session.frames = answer.model_dump_json(), lost, run.frames
     session.request = request_id
     session.touch()
     if options.frame is not None:
@@ -251,7 +252,7 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
     )
 
 
-def session_view(session: Session, frames: int) -> SessionView:
+def session_view(session: Session) -> SessionView:
     """The JSON view of a session, as it is listed."""
     options = session.options.model_dump()
     return SessionView(
@@ -260,7 +261,7 @@ def session_view(session: Session, frames: int) -> SessionView:
         map=session.map_id,
         created_at=datetime.fromtimestamp(session.created, UTC),
         expires_at=datetime.fromtimestamp(session.expires, UTC),
-        frames=frames,
+        frames=session.frames,
         last_frame=session.number,
         restored=session.restored,
         frames_lost=session.lost,
@@ -271,5 +272,5 @@ def session_report(sessions: Sessions, map_: Map, session: Session, k: int = 5) 
     """The JSON view of a session with its present belief; call it in the session's turn, in a thread."""
     run = sessions.run(map_, session)
     found = run.look(k, alive_rows(map_))
-    view = session_view(session, run.frames)
+    view = session_view(session)
     return SessionReport(**view.model_dump(), belief=belief_view(map_, run, found))

@@ -71,7 +71,7 @@ def create_session(
         map_.cameras.mask(new.camera)
     session = sessions.create(map_, new)
     response.headers["Location"] = f"{engine.settings.root_path}/v1/maps/{map_id}/sessions/{session.id}"
-    return session_view(session, 0)
+    return session_view(session)
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
@@ -82,9 +82,7 @@ async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: 
     after = decode_name(listing, page.cursor)
     found = [session for session in await in_thread(sessions.of_map, map_) if session.id > after]
     shown, more = page_of(listing, found, page.limit, lambda session: session.id)
-    counts = await in_thread(lambda: [sessions.frames_of(session) for session in shown])
-    items = [session_view(session, count) for session, count in zip(shown, counts, strict=True)]
-    return SessionPage(items=items, next_cursor=more)
+    return SessionPage(items=[session_view(session) for session in shown], next_cursor=more)
 
 
 @router.get("/{session}", responses=GONE)

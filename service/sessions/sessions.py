@@ -1,152 +1,49 @@
-"""The sessions of all maps: they are limited in number and memory, expire without frames, and survive a restart."""
+"""The sessions of all maps: they are limited in number and memory, expire without frames, and survive a restart.
+
+A session's record in the ledger is what counts.  A service holds the belief in memory, too, with the revision of the
+record that it was saved as: if that is still the record's, the next frame goes on from memory, else the belief is read.
+A frame is saved only onto the revision that it was processed from, so that of two frames that two services process at
+the same time one comes after the other.
+
+Where services share the ledger, a session expires by the clock of the database, and each looks at the record before
+each frame.  Where nobody else writes to it, all living sessions are held in memory, expire by this machine's monotonic
+clock, and are found and listed without a look at the disk.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
 import secrets
-import sqlite3
 import threading
-import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
-from core.disk.files import disk_errors
-from core.errors import UnknownSequence
-from core.maps import Map, Snapshot
-from core.maps.selection import Conditions, Selection
-from core.recognition.stages import neighborhood_of
+from core.belief import DamagedRecord, PlaceGraph, Run, from_bytes
+from core.disk.files import Damage
+from core.errors import StorageFailure, StorageFull, UnknownSequence
+from core.ledger import Ledger
+from core.maps import Map
 from service.access.audit import ASKER
-from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
+from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NO_ASKER, SessionEvent
+from service.peers.peers import Peers
+from service.sessions.graphs import SessionGraphs
 from service.sessions.schemas import NewSession
-from service.sessions.store import SessionRecords, SessionStore, StoredSession
+from service.sessions.session import Session, creation_time
+from service.sessions.table import SessionRecord, SessionTable
 from service.settings import Settings
-
-WAITING = 8
-"""The most frames of one session that may wait for their turn."""
-
-REMEMBERED_SECONDS = 24 * 3600.0
-"""For how long an ended session is remembered as ended; later it counts as unknown."""
-
-REMEMBERED = 10_000
-"""How many ended sessions are remembered."""
-
-GRAPH_REUSE = 20.0
-"""The graph of a map that changes is used for this multiple of the time it took to build, then built again."""
-
-REPEATED_SECONDS = 60.0
-"""For how long a session that has no frame is the answer to the request that began it, sent again."""
-
-CLOCKS_DIFFER = 1.0
-"""Two clocks that differ by fewer seconds count as equal, so that the reported expiry of a session does not jitter."""
 
 EXPIRED = "No frame came for too long."
 MAP_GONE = "Its map was deleted; the map of that id is another one now."
 STATE_LOST = "Its saved belief was damaged on disk."
 
+REFUSALS = (StorageFull, StorageFailure, Damage)
+
 log = logging.getLogger("placerec.sessions")
-
-
-@dataclass(eq=False)
-class Session:
-    """One robot's run in one map.
-
-    created, used: when the session was created and when its last frame came, seconds since 1970 UTC.
-    number: the robot's number of the last frame.
-    moment: when the last frame was taken, seconds since 1970 UTC.
-    request: the id that the client gave the request of the last frame.
-    lost: how many frames were lost by a restart; None if that is not known.
-    answer: the last answer, JSON.
-    run: the belief; None after a restart, until the next frame.
-    restored: whether the session was restored after a restart.
-    streaming: whether a WebSocket streams into the session.
-    begun_by: who began it, and the id of that request; None after a restart.
-    waiting: how many frames are being processed or wait for that.
-    revision: of its record, where services share it; grows with every frame.
-    idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
-        one may be set.
-    """
-
-    id: str
-    map_id: str
-    map_created_at: str
-    options: NewSession
-    expires_after: float
-    created: float
-    used: float
-    number: int | None = None
-    moment: float | None = None
-    request: str | None = None
-    lost: int | None = None
-    answer: str | None = None
-    run: Run | None = None
-    restored: bool = False
-    streaming: bool = False
-    begun_by: tuple[str, str | None, str | None] | None = None
-    waiting: int = 0
-    revision: int = 0
-    idle_since: float = field(default_factory=time.monotonic)
-    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-    @property
-    def expires(self) -> float:
-        """When the session expires unless a frame comes, seconds since 1970 UTC, by the clock as it is set now."""
-        used = time.time() - (time.monotonic() - self.idle_since)
-        return self.expires_after + (self.used if abs(used - self.used) < CLOCKS_DIFFER else used)
-
-    def touch(self) -> None:
-        """Note that a frame has come now."""
-        self.used, self.idle_since = time.time(), time.monotonic()
-
-    @property
-    def selection(self) -> Selection | None:
-        """The filter for the session's sequences; None: all places of the map."""
-        names = self.options.sequences
-        return None if names is None else Selection(Conditions(sequences=tuple(names)))
-
-    @asynccontextmanager
-    async def turn(self) -> AsyncIterator[None]:
-        """Hold the session's turn for one frame; frames get it in the order of their arrival.
-
-        Raises:
-            QueueFull: too many frames of the session wait already.
-        """
-        if self.waiting >= WAITING:
-            raise QueueFull("Too many frames of this session are waiting; send this one again in a moment.")
-        self.waiting += 1
-        try:
-            async with self._lock:
-                yield
-        finally:
-            self.waiting -= 1
-
-
-@dataclass(frozen=True, eq=False)
-class _CachedGraph:
-    """The graph of a map's snapshot.
-
-    made: when it was finished, by the monotonic clock.
-    took: how many seconds it took to build.
-    """
-
-    snapshot: Snapshot
-    graph: PlaceGraph
-    made: float
-    took: float
-
-    def serves(self, snapshot: Snapshot, now: float) -> bool:
-        """Whether the graph is that of the snapshot, or recent enough to be used for it."""
-        return self.snapshot is snapshot or now - self.made < GRAPH_REUSE * self.took
 
 
 class SessionMoved(Exception):
@@ -154,123 +51,113 @@ class SessionMoved(Exception):
 
 
 class Sessions:
-    """All sessions.  Thread-safe.
+    """All sessions of the services that share a ledger.  Any thread may use it; all methods but ``count`` may block.
+
+    Every method but ``count`` and ``save`` may raise StorageFull, StorageFailure and Damage: the ledger cannot be read
+    or written.  A frame that cannot be saved is answered all the same, and says so; the next one at this service goes
+    on from it.
 
     Args:
         events: receives the begin and the end of sessions.
-        store: keeps the sessions; None: a file in the data directory.
+        ledger: has the sessions.
+        peers: the services that share it.
     """
 
-    def __init__(self, settings: Settings, events: Events, store: SessionRecords | None = None) -> None:
-        self._settings, self._events = settings, events
-        self._store = SessionStore(settings.data_dir) if store is None else store
+    def __init__(self, settings: Settings, events: Events, ledger: Ledger, peers: Peers) -> None:
+        self._settings, self._events, self._alone = settings, events, peers.alone
+        self._ledger, self._table, self._graphs = ledger, SessionTable(ledger), SessionGraphs()
         self._lock = threading.RLock()
-        self._graph_lock = threading.Lock()
-        self._graphs: dict[tuple[str, str, tuple[str, ...]], _CachedGraph] = {}
-        self._living: dict[str, Session] = {}
-        self._ended: dict[str, tuple[str, str]] = {}
-        self._load()
+        self._held: dict[str, Session] = {}
+        self._counted = 0  # sessions of all services
+        if self._alone:
+            self._restore()
+        peers.every(self.tidy)
 
     def close(self) -> None:
-        """Close the file, which has every answered frame."""
-        with self._lock:
-            self._store.close()
+        """Close the file, which has every answered frame; a ledger that services share is closed by its owner."""
+        if self._alone:
+            self._ledger.close()
 
-    def _load(self) -> None:
-        now, restored = time.time(), []
-        for stored in sorted(self._store.all(), key=lambda one: -one.used):
-            if stored.ended is not None:
-                if now - stored.used > REMEMBERED_SECONDS or len(self._ended) >= REMEMBERED:
-                    self._store.forget(stored.id)
-                else:
-                    self._ended[stored.id] = (stored.map, stored.ended)
-                continue
-            try:
-                session = session_of(stored)
-            except (ValueError, KeyError, TypeError, ValidationError) as error:
-                log.error("session %s cannot be restored: %s", stored.id, error)
-                self._store.end(stored.id, STATE_LOST, now)
-                self._ended[stored.id] = (stored.map, STATE_LOST)
-                continue
-            restored.append(stored.id)
-            session.restored, session.idle_since = True, time.monotonic() - max(0.0, now - stored.used)
-            self._living[stored.id] = session
-        if restored:
-            log.info("sessions are restored", extra={"sessions": len(restored)})
+    def _restore(self) -> None:
+        """Hold the sessions of before a restart."""
+        for record in self._table.living():
+            if (session := self._session_of(record)) is not None:
+                session.restored = True
+                self._held[session.id] = session
+        if self._held:
+            log.info("sessions are restored", extra={"sessions": len(self._held)})
+
+    def _session_of(self, record: SessionRecord) -> Session | None:
+        """The session of a record; None if that is damaged, and the session is over."""
+        try:
+            return Session.of(record)
+        except ValueError as error:
+            log.error("session %s cannot be restored: %s", record.id, error)
+            self._table.end(record.id, STATE_LOST)
+            return None
 
     # Creating, finding and ending sessions
 
     def create(self, map_: Map, options: NewSession) -> Session:
-        """Create a session; blocks, so call it in a thread.
+        """Create a session.
 
         The same request again, because its answer was lost, gets the session that it has begun, if no frame has come.
 
         Raises:
             TooManySessions: there are too many sessions, or they would need too much memory.
             UnknownSequence: the map has no sequence of one of the names.
-            StorageFull, StorageFailure: the session cannot be saved.
         """
-        names = options.sequences or []
-        if absent := map_.unknown_sequences(names):
+        if absent := map_.unknown_sequences(options.sequences or []):
             raise UnknownSequence(f"The map has no sequence {min(absent)!r}.")
-        if (begun := self._begun_before(map_, options)) is not None:
-            return begun
-        graph = self.graph(map_, None if options.sequences is None else Selection(Conditions(sequences=tuple(names))))
-        now, longest = time.time(), self._settings.session_expiry
+        longest = self._settings.session_expiry
         expires_after = min(options.expires_after or longest, longest)
-        session = Session(
-            f"s-{secrets.token_hex(8)}", map_.record.id, creation_time(map_), options, expires_after, now, now,
-            run=Run(options.run_options(), graph),
-        )  # fmt: skip
-        self._keep(session)
-        session.begun_by = asking_now()
+        session = Session(f"s-{secrets.token_hex(8)}", map_.record.id, creation_time(map_), options, expires_after)
+        self._end_expired()
+        begun_by = _begun_by()
+        if (begun := self._begun_before(map_, session, begun_by)) is not None:
+            return begun
+        session.run = Run(options.run_options(), self._graphs.graph(map_, session.selection))
+        self._hold(session)
+        try:
+            session.created = session.used = self._table.add(session.record(), self._settings.max_sessions, begun_by)
+        except BaseException:
+            self._let_go(session.id)
+            raise
         self._tell(session, "begun")
         return session
 
-    def _keep(self, session: Session) -> None:
-        """Keep a new session, if there is room for it."""
-        with self._lock:
-            self._sweep()
-            if len(self._living) >= self._settings.max_sessions:
-                raise TooManySessions(f"There are {len(self._living)} sessions already; delete one that is over.")
-            self._hold(session)
-        try:
-            with disk_errors("keep a session"):
-                self._store.write(stored_of(session))
-        except BaseException:
-            with self._lock:
-                self._living.pop(session.id, None)
-            raise
-
     def _hold(self, session: Session) -> None:
-        """Hold a new session in memory; the caller holds the lock.
+        """Hold a new session in memory.
 
         Raises:
             TooManySessions: it would need too much memory.
         """
-        assert session.run is not None
-        runs = [one.run for one in (*self._living.values(), session) if one.run]
-        graphs = {id(run.graph): run.graph.bytes for run in runs}
-        held = sum(graphs.values()) + sum(run.bytes for run in runs)
-        if held > self._settings.max_session_memory:
-            raise TooManySessions(
-                f"The sessions would hold {held >> 20} MiB, more than they are allowed to; delete one that is over."
-            )
-        self._living[session.id] = session
-
-    def _begun_before(self, map_: Map, options: NewSession) -> Session | None:
-        """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
-        asking, oldest = asking_now(), time.monotonic() - REPEATED_SECONDS
-        if asking is None:
-            return None
         with self._lock:
-            self._sweep()
-            for one in self._living.values():
-                same = one.begun_by == asking and one.idle_since >= oldest and one.options == options
-                unused = one.number is None and one.answer is None and not one.waiting and not one.streaming
-                if same and unused and (one.map_id, one.map_created_at) == (map_.record.id, creation_time(map_)):
-                    return one
-        return None
+            runs = [one.run for one in (*self._held.values(), session) if one.run]
+            graphs = {id(run.graph): run.graph.bytes for run in runs}
+            held = sum(graphs.values()) + sum(run.bytes for run in runs)
+            if held <= self._settings.max_session_memory:
+                self._held[session.id] = session
+                return
+            self._graphs.drop_unused(self._held.values())
+        raise TooManySessions(
+            f"The sessions would hold {held >> 20} MiB, more than they are allowed to; delete one that is over."
+        )
+
+    def _let_go(self, session_id: str) -> bool:
+        """Hold a session no longer; whether it was held."""
+        with self._lock:
+            held = self._held.pop(session_id, None) is not None
+            self._graphs.drop_unused(self._held.values())
+            return held
+
+    def _begun_before(self, map_: Map, session: Session, begun_by: str | None) -> Session | None:
+        """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
+        found = None if begun_by is None else self._table.begun(begun_by, session.record())
+        if found is None:
+            return None
+        begun = self.find(map_, found)
+        return None if begun.answer is not None or begun.waiting or begun.streaming else begun
 
     def find(self, map_: Map, session_id: str) -> Session:
         """A session of a map that has not ended.
@@ -279,46 +166,88 @@ class Sessions:
             UnknownSession: the map has no such session.
             SessionExpired: the session has ended.
         """
+        self._end_expired()
+        session = self._held.get(session_id)
+        if session is None or not self._alone:
+            session = self._look(map_, session_id)
+        if session.map_id != map_.record.id:
+            raise _unknown(session_id)
+        if not session.is_about(map_):
+            self._end(session, MAP_GONE)
+            raise _ended(session_id, MAP_GONE)
+        if session.over:
+            raise _ended(session_id, EXPIRED)
+        return session
+
+    def _look(self, map_: Map, session_id: str) -> Session:
+        """A session that has not ended, with what its record says of it now.
+
+        Raises:
+            UnknownSession, SessionExpired.
+        """
+        head = self._table.head(session_id)
+        if head is None or head.ended is not None:
+            self._let_go(session_id)
+        if head is None or head.map != map_.record.id:
+            raise _unknown(session_id)
+        if head.ended is not None:
+            raise _ended(session_id, head.ended)
+        session = self._held.get(session_id) or self._session_of(head)
+        if session is None:
+            raise _ended(session_id, STATE_LOST)
         with self._lock:
-            self._sweep()
-            session = self._living.get(session_id)
-            if (
-                session is not None
-                and session.map_id == map_.record.id
-                and session.map_created_at != creation_time(map_)
-            ):
-                self._end(session, MAP_GONE)
-                session = None
-            if session is not None and session.map_id == map_.record.id:
-                return session
-            ended = self._ended.get(session_id)
-        if ended is not None and ended[0] == map_.record.id:
-            raise SessionExpired(f"The session {session_id[:80]} is over. {ended[1]} Begin a new one.")
-        raise UnknownSession(f"The map has no session {session_id[:80]!r}.")
+            session = self._held.setdefault(session_id, session)
+        session.see(head)
+        return session
 
     def of_map(self, map_: Map) -> list[Session]:
         """The sessions of a map that have not ended, in the order of their ids."""
+        if not self._alone:
+            found = self._table.living_of(map_.record.id, creation_time(map_))
+            return [session for record in found if (session := self._session_of(record)) is not None]
+        self._end_expired()
         with self._lock:
-            self._sweep()
-            found = [one for one in self._living.values() if one.map_id == map_.record.id]
-        return sorted((one for one in found if one.map_created_at == creation_time(map_)), key=lambda one: one.id)
+            held = list(self._held.values())
+        return sorted((one for one in held if one.is_about(map_)), key=lambda one: one.id)
 
     def count(self) -> int:
-        """The number of sessions of all maps that have not ended."""
-        return len(self._living)
+        """The number of sessions of all maps that have not ended; those of other services a few seconds ago."""
+        return len(self._held) if self._alone else self._counted
 
     def delete(self, session: Session) -> None:
-        """Delete a session; later it counts as unknown.
-
-        Raises:
-            StorageFull, StorageFailure: the disk refuses.
-        """
-        with self._lock:  # so that a frame that is being processed does not save the session again
-            with disk_errors("delete a session"):
-                self._store.forget(session.id)
-            self._living.pop(session.id, None)
-            self._drop_unused_graphs()
+        """Delete a session; later it counts as unknown."""
+        self._table.forget(session.id)
+        self._let_go(session.id)
         self._tell(session, "ended", "It was deleted.")
+
+    def tidy(self) -> None:
+        """End the sessions of all services that have expired, and let go of those that this one holds in vain."""
+        for record in self._table.end_expired(EXPIRED):
+            if (session := self._session_of(record)) is not None:
+                self._tell(session, "ended", EXPIRED)
+        for session in self._expired():
+            if not session.streaming:
+                self._let_go(session.id)
+        self._counted = self._table.count()
+
+    def _end_expired(self) -> None:
+        """End the sessions that have expired; where services share them, :meth:`tidy` does that."""
+        if self._alone:
+            for session in self._expired():
+                self._end(session, EXPIRED)
+
+    def _expired(self) -> list[Session]:
+        with self._lock:
+            return [one for one in self._held.values() if one.over]
+
+    def _end(self, session: Session, reason: str) -> None:
+        if not self._let_go(session.id):  # another thread ends it
+            return
+        try:
+            self._table.end(session.id, reason)
+        except REFUSALS as error:
+            log.warning("the end of session %s is not saved: %s", session.id, error)
+        self._tell(session, "ended", reason)
 
     def _tell(self, session: Session, change: Literal["begun", "ended"], reason: str | None = None) -> None:
         """Tell the listeners of a session's map, if it has any; a session that ends by itself was ended by nobody."""
@@ -331,106 +260,56 @@ class Sessions:
         )
         self._events.publish(event)
 
-    def _sweep(self) -> None:
-        now = time.monotonic()
-        over = [one for one in self._living.values() if now - one.idle_since >= one.expires_after and not one.waiting]
-        for session in over:
-            self._end(session, EXPIRED)
-
-    def _end(self, session: Session, reason: str) -> None:
-        self._living.pop(session.id, None)
-        self._ended[session.id] = (session.map_id, reason)
-        while len(self._ended) > REMEMBERED:
-            self._forget_on_disk(next(iter(self._ended)))
-        self._drop_unused_graphs()
-        try:
-            self._store.end(session.id, reason, time.time())
-        except sqlite3.Error as error:
-            log.warning("the end of session %s is not saved: %s", session.id, error)
-        self._tell(session, "ended", reason)
-
-    def _forget_on_disk(self, session_id: str) -> None:
-        self._ended.pop(session_id)
-        try:
-            self._store.forget(session_id)
-        except sqlite3.Error as error:
-            log.warning("session %s cannot be deleted on disk: %s", session_id, error)
-
-    # Graphs and runs
-
-    def graph(self, map_: Map, selection: Selection | None) -> PlaceGraph:
-        """The graph of the places that a session is about; while the map changes it may be slightly out of date."""
-        names = selection.filters.sequences or () if selection else ()
-        key = (map_.record.id, creation_time(map_), names)
-        neighborhood = neighborhood_of(map_)
-        with self._graph_lock:
-            snapshot, known, now = map_.snapshot(), self._graphs.get(key), time.monotonic()
-            if known is not None and known.graph.neighborhood == neighborhood and known.serves(snapshot, now):
-                return known.graph
-            scope = map_.scope(selection)
-            snapshot = scope.snapshot
-            graph = place_graph(snapshot.whereabouts, scope.living_rows(), snapshot.rows, neighborhood)
-            done = time.monotonic()
-            self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)
-            if len(self._graphs) > self._settings.max_sessions:  # some are of refused or ended sessions
-                with self._lock:
-                    self._drop_unused_graphs()
-            return graph
-
-    def _drop_unused_graphs(self) -> None:
-        """Drop the graphs of maps and sequences that no session uses."""
-        used = {(one.map_id, one.map_created_at, tuple(one.options.sequences or ())) for one in self._living.values()}
-        for key in list(self._graphs):
-            if key not in used:
-                self._graphs.pop(key, None)
+    # Runs
 
     def run(self, map_: Map, session: Session) -> Run:
         """The session's run, over the present places of the map; call it in the session's turn.
 
         Raises:
-            SessionExpired: the saved belief cannot be read.
+            SessionExpired: the saved belief cannot be read, or the session has ended.
         """
-        graph = self.graph(map_, session.selection)
-        if session.run is None:
+        graph = self._graphs.graph(map_, session.selection)
+        if session.run is None or session.revision != session.recorded:
             try:
-                stored = self._store.read(session.id)
-                state = None if stored is None or stored.state is None else from_bytes(stored.state)
-            except (sqlite3.Error, DamagedRecord) as error:
-                raise self._damaged(session, error) from error
-            session.run = restored_run(session, graph, state)
-            session.answer = None if stored is None else stored.answer
+                session.run = self._read(session, graph)
+            except (Damage, DamagedRecord) as error:
+                log.error("session %s cannot be restored: %s", session.id, error)
+                self._end(session, STATE_LOST)
+                raise _ended(session.id, STATE_LOST) from error
         session.run.place_on(graph)
         return session.run
 
-    def _damaged(self, session: Session, error: Exception) -> SessionExpired:
-        """End a session whose saved belief cannot be read; the error of its next frame."""
-        log.error("session %s cannot be restored: %s", session.id, error)
-        with self._lock:
-            self._end(session, STATE_LOST)
-        return SessionExpired(f"The session {session.id} is over. {STATE_LOST} Begin a new one.")
-
-    def frames_of(self, session: Session) -> int:
-        """How many frames a session has processed; 0 if that cannot be read.  The session is not restored for this."""
-        if session.run is not None:
-            return session.run.frames
-        try:
-            stored = self._store.read(session.id)
-            return 0 if stored is None or stored.state is None else from_bytes(stored.state).frames
-        except (sqlite3.Error, DamagedRecord):
-            return 0
+    def _read(self, session: Session, graph: PlaceGraph) -> Run:
+        """A session's run as it was saved."""
+        record = self._table.read(session.id)
+        if record is None:
+            raise _ended(session.id, "It ended meanwhile.")
+        options = session.options.run_options()
+        run = Run(options, graph) if record.state is None else Run.restored(options, graph, from_bytes(record.state))
+        session.read_fields(record)
+        return run
 
     def save(self, session: Session) -> bool:
-        """Save a session; returns whether it was saved: not if the disk refuses, or if the session has ended.
+        """Save a session after a frame; returns whether it was saved: not if the disk or server refuses, or if the
+        session has ended.
 
         Raises:
             SessionMoved: another service has saved a frame of it in the meantime; the session is read again.
         """
         try:
-            # The lock is not held: writing to disk takes a while, and other sessions need the lock.
-            return self._store.renew(stored_of(session), session.revision)
-        except sqlite3.Error as error:
+            # No lock is held: writing to disk takes a while, and other sessions need the lock.
+            if self._table.renew(session.record()):
+                session.revision += 1
+                session.recorded = session.revision
+                return True
+            head = self._table.head(session.id)
+        except REFUSALS as error:
             log.warning("session %s is not saved: %s", session.id, error)
             return False
+        session.run = None  # what was saved by another service counts
+        if head is None or head.ended is not None:
+            return False
+        raise SessionMoved
 
 
 def alive_rows(map_: Map) -> NDArray[np.bool_]:
@@ -438,48 +317,15 @@ def alive_rows(map_: Map) -> NDArray[np.bool_]:
     return map_.snapshot().alive
 
 
-def creation_time(map_: Map) -> str:
-    return map_.record.created_at.isoformat()
+def _unknown(session_id: str) -> UnknownSession:
+    return UnknownSession(f"The map has no session {session_id[:80]!r}.")
 
 
-def asking_now() -> tuple[str, str | None, str | None] | None:
+def _ended(session_id: str, reason: str) -> SessionExpired:
+    return SessionExpired(f"The session {session_id[:80]} is over. {reason} Begin a new one.")
+
+
+def _begun_by() -> str | None:
     """The present caller and the id of the request; None if requests cannot be distinguished."""
     asker = ASKER.get()
-    return None if asker.request_id is None else (asker.principal, asker.key, asker.request_id)
-
-
-def session_of(stored: StoredSession) -> Session:
-    """A session without its run; raises ValueError, KeyError or TypeError if its record is damaged."""
-    content = json.loads(stored.options)
-    expires_after = float(content.pop("expires_after"))
-    options = NewSession.model_validate(content)
-    return Session(
-        stored.id, stored.map, stored.map_created_at, options, expires_after, stored.created, stored.used,
-        stored.number, stored.moment, stored.request, stored.lost,
-    )  # fmt: skip
-
-
-def restored_run(session: Session, graph: PlaceGraph, state: RunState | None) -> Run:
-    """A session's run as it was saved; a new one for None."""
-    options = session.options.run_options()
-    return Run(options, graph) if state is None else Run.restored(options, graph, state)
-
-
-def stored_of(session: Session) -> StoredSession:
-    options = {**session.options.model_dump(mode="json"), "expires_after": session.expires_after}
-    state: RunState | None = None if session.run is None else session.run.state()
-    return StoredSession(
-        session.id,
-        session.map_id,
-        session.map_created_at,
-        json.dumps(options),
-        session.created,
-        session.used,
-        session.number,
-        session.moment,
-        session.request,
-        session.lost,
-        None,
-        None if state is None else to_bytes(state),
-        session.answer,
-    )
+    return None if asker.request_id is None else json.dumps([asker.principal, asker.key, asker.request_id])

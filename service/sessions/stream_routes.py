@@ -42,7 +42,8 @@ from service.http.schemas import validated
 from service.http.uploads import check_frame
 from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters
-from service.sessions.sessions import Session, Sessions
+from service.sessions.session import Session
+from service.sessions.sessions import Sessions
 from service.worker_threads import in_thread
 
 router = APIRouter()

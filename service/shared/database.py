@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from core.ledger.postgres import PostgresLedger
+from service.access import key_table, rates
+from service.administration import audit_trail
+from service.events import relay
+from service.jobs import rows
+from service.peers import replica
+from service.queries import count_tables, recent_answers
+from service.sessions import table as sessions
 
-from psycopg import Connection
-
-from core.ledger.postgres import PostgresLedger, prepare
-from core.ledger.tables import Tables
-
-TEXT = (Path(__file__).parent / "tables.sql").read_text()
-
-TABLES: Sequence[Tables] = ()
-"""The tables of the parts that are written for both databases."""
-
-
-def make_tables(connection: Connection[Any]) -> None:
-    """Make those that are missing."""
-    prepare(connection, TABLES)
-    connection.execute(TEXT)
+TABLES = (
+    replica.TABLES, rows.TABLES, sessions.TABLES, key_table.TABLES, rates.TABLES, audit_trail.TABLES,
+    count_tables.TABLES, recent_answers.TABLES, relay.TABLES,
+)  # fmt: skip
+"""The tables of all parts that services share."""
 
 
 class SharedDatabase(PostgresLedger):
@@ -29,25 +23,6 @@ class SharedDatabase(PostgresLedger):
 
     def __init__(self, address: str) -> None:
         super().__init__(address, TABLES)
-        self._make_tables = make_tables
-
-    def query(self, action: str, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Execute one statement given as text, which is durable when this returns; the rows that it gives.
-
-        Args:
-            action: its work, for the message of an error.
-        """
-        with self.connection(action) as connection:
-            cursor = connection.execute(query, values)
-            return [] if cursor.description is None else cursor.fetchall()
-
-    @contextmanager
-    def text_transaction(self, action: str, lock: int | None = None) -> Iterator[Connection[Any]]:
-        """A transaction for statements given as text, as :meth:`transaction`."""
-        with self.connection(action) as connection, connection.transaction():
-            if lock is not None:
-                connection.execute("SELECT pg_advisory_xact_lock(%s)", (lock,))
-            yield connection
 
     def __enter__(self) -> SharedDatabase:
         return self

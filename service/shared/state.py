@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from service.administration.audit_trail import AuditTable, detach
 from service.engine.engine import Engine
 from service.events.events import Events
+from service.events.relay import EventRelay
 from service.jobs.jobs import Jobs
+from service.peers.differences import ReplicaDifferences
+from service.peers.replica import ServiceReplica
 from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings
-from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
-from service.shared.differences import ReplicaDifferences
-from service.shared.events import SharedEvents
-from service.shared.jobs import SharedJobs
-from service.shared.replica import ServiceReplica
-from service.shared.sessions import SharedSessions
-from service.shared.statistics import SharedStatistics
 
 
 class SharedState:
@@ -27,37 +24,38 @@ class SharedState:
     """
 
     def __init__(self, settings: Settings, database: SharedDatabase, shared_maps: bool) -> None:
-        self._settings, self._shared_maps = settings, shared_maps
+        self._settings, self._database, self._shared_maps = settings, database, shared_maps
         self.replica = ServiceReplica(database, settings.data_dir)
         self.differences = ReplicaDifferences(settings, database, self.replica.id)
         self.replica.every(self.differences.compare)
         self.audit = AuditTable(database, self.replica.id)
-        self.events = SharedEvents(self.replica, settings.event_listeners)
+        self._relay = EventRelay(self.replica, database)
+        self.events = Events(settings.event_listeners, relay=self._relay)
 
     def statistics(self, engine: Engine) -> QueryStatistics:
         """The statistics of all services."""
-        return SharedStatistics.of_services(engine, self.replica.database)
+        return QueryStatistics.of_engine(engine, self._database)
 
     def jobs(self, events: Events) -> Jobs:
         """All jobs of all services."""
         given = self._settings
-        return SharedJobs(
-            self.replica, self._shared_maps, given.job_workers, given.job_queue, given.job_history, given.job_watchers,
-            events,
+        return Jobs(
+            self._database, self.replica, self._shared_maps, given.job_workers, given.job_queue, given.job_history,
+            given.job_watchers, events,
         )  # fmt: skip
 
     def sessions(self, events: Events) -> Sessions:
         """All sessions of all services."""
-        return SharedSessions(self._settings, events, self.replica)
+        return Sessions(self._settings, events, self._database, self.replica)
 
     def start(self) -> None:
         """Begin to take part; all parts must be made before."""
-        self.events.start()
+        self._relay.start()
         self.replica.start()
         self.audit.start()
 
     def close(self) -> None:
         """Leave the others; blocks."""
-        self.events.close()
-        self.audit.close()
+        self._relay.close()
+        detach(self.audit)
         self.replica.close()

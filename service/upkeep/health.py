@@ -23,7 +23,7 @@ from core.upkeep.drift import Trend, score_trend, unknown_trend
 from core.upkeep.hubness import Alias
 from core.upkeep.redundancy import first_looks, stops
 from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
-from service.queries.statistics import Statistics
+from service.queries.counts import Statistics
 from service.upkeep.schemas import (
     AliasingView,
     AliasView,

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import os
 import random
+import secrets
 import shutil
-import sqlite3
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from core.disk.files import Damage
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
 from core.maps.archives.reading import Archive, check
 from core.storage import Atlas
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.errors.faults import KeysUnreadable
-from service.jobs.records import Job, JobRecords
-from service.queries.statistics import QueryStatistics, Statistics
-from service.sessions.store import SessionStore, StoredSession
+from service.jobs.file import open_file
+from service.jobs.job import Job
+from service.jobs.table import JobTable
+from service.peers.alone import Alone
+from service.queries.count_tables import statistics_file
+from service.queries.counts import Statistics
+from service.queries.statistics import QueryStatistics
+from service.sessions.table import SessionRecord, SessionTable, session_file
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map
@@ -37,30 +44,32 @@ KEY = ("lab", "2026-11-21T10:00:00+00:00")
 
 def use_jobs(folder: Path) -> object:
     """Read all jobs, then add one."""
-    records = JobRecords(folder)
+    ledger, _ = open_file(folder)
     try:
-        found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in records.read()]
-        number = records.last_number() + 1
-        records.put(Job(number, f"j{number}", "verify", "lab", {"a": "x" * 50}, True, datetime(2026, 1, 1, tzinfo=UTC)))
+        table = JobTable(ledger, Alone(), longest_queue=1000, history=1000)
+        found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in table.all()]
+        job_id = secrets.token_hex(8)
+        table.add(Job(0, job_id, "verify", "lab", {"a": "x" * 50}, True, datetime(2026, 1, 1, tzinfo=UTC)))
         return found
     finally:
-        records.close()
+        ledger.close()
 
 
 def use_sessions(folder: Path) -> object:
     """Read all sessions with their beliefs, then add one."""
-    store = SessionStore(folder)
+    file = session_file(folder)
+    table = SessionTable(file)
     try:
-        found = [store.read(session.id) for session in store.all()]
-        store.write(StoredSession(f"s{len(found)}", "lab", KEY[1], "{}", 1.0, 2.0, state=b"believed" * 20))
-        return found
+        found = [table.read(session.id) for session in table.living()]
+        table.add(SessionRecord(f"s{len(found)}", "lab", KEY[1], "{}", 900.0, state=b"believed" * 20), most=100)
+        return [None if one is None else replace(one, idle=0.0) for one in found]
     finally:
-        store.close()
+        file.close()
 
 
 def use_statistics(folder: Path) -> object:
     """Read the statistics of a map, then count one more answer."""
-    statistics = QueryStatistics(folder, 3600, lambda: {KEY: 5}, lambda _: set())
+    statistics = QueryStatistics(statistics_file(folder), 3600, lambda: {KEY: 5}, lambda _: set())
     try:
         found: Statistics = statistics.read(KEY)
         statistics.observe(KEY, "recognized", "p0", 0.5, 0.5)
@@ -72,7 +81,7 @@ def use_statistics(folder: Path) -> object:
 
 def use_keys(folder: Path) -> object:
     """Read all keys."""
-    return [(key.id, key.name, key.role, key.maps, key.digest) for key in KeyStore(folder).all()]
+    return [(key.id, key.name, key.role, key.maps, key.digest) for key in Keys.of(folder).all()]
 
 
 def use_export(folder: Path) -> object:
@@ -98,7 +107,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for _ in range(4):
         for use in (use_jobs, use_sessions, use_statistics):
             use(folder)
-    store = KeyStore(folder)
+    store = Keys.of(folder)
     for name in ("robot", "operator"):
         store.create(name, "query" if name == "robot" else "admin")
     atlas = Atlas(folder / "maps", rows_per_segment=4)
@@ -135,8 +144,8 @@ def run_cases(sound: Path, folder: Path, name: str, count: int) -> Counter[str]:
             found = USES[name](copy)
             put_aside = list(copy.glob(f"{name}.damaged*"))
             outcomes["put aside" if put_aside else "harmless" if found == expected else "other"] += 1
-        except (*REFUSALS, sqlite3.Error) as refusal:
-            assert not isinstance(refusal, sqlite3.Error) or name == "sessions.sqlite"
+        except (*REFUSALS, Damage) as refusal:
+            assert not isinstance(refusal, Damage) or name == "sessions.sqlite"
             assert str(refusal)
             outcomes["refused"] += 1
         except Exception as error:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.fuzz import api, http, images, streams
 from tests.fuzz.encoder import SMALL, install_small_encoder
 from tests.fuzz.pictures.originals import originals
@@ -36,7 +36,7 @@ def service(url: str | None, key: bool = False, **settings: object) -> Iterator[
         return
     with tempfile.TemporaryDirectory(prefix="placerec-fuzz-") as folder:
         install_small_encoder(Path(folder) / "models")
-        token = KeyStore(Path(folder) / "data").create("fuzzer", "admin")[1] if key else None
+        token = Keys.of(Path(folder) / "data").create("fuzzer", "admin")[1] if key else None
         server = Server(Path(folder), {"encoder": SMALL, "log_level": "warning", **settings}, key=token).wait()
         try:
             yield str(server.client.base_url), server

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.access.roles import OPERATIONS
 from service.http.openapi import LINKS
 from tests.fuzz import api
@@ -20,7 +20,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, st
     """A running service and its administrator's key: drawn requests create keys, with which it asks for one."""
     folder = tmp_path_factory.mktemp("keyed")
     install_small_encoder(folder / "models")
-    _, key = KeyStore(folder / "data").create("fuzzer", "admin")
+    _, key = Keys.of(folder / "data").create("fuzzer", "admin")
     server = Server(folder, {**api.TIGHT, "encoder": SMALL}, key=key).wait()
     yield server, key
     server.check_running()

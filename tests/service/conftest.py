@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 import pytest
@@ -12,6 +14,10 @@ import pytest
 from tests.service.encoders import install_coarse_encoder, install_two_stage_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+    from tests.service.shared.postgres import Postgres
 
 _numbers = itertools.count()
 
@@ -52,22 +58,28 @@ STRICT: dict[str, object] = {
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--store",
-        choices=("embedded", "milvus"),
-        default="embedded",
-        help="where the server of most tests keeps its maps; milvus starts a PostgreSQL and a Milvus",
+        choices=("files", "postgres", "milvus"),
+        default="files",
+        help="what keeps the vectors of the server of most tests; postgres and milvus start what they need",
     )
 
 
 @contextmanager
 def store_settings(kind: str) -> Iterator[dict[str, object]]:
     """The settings of a store, whose servers run as long as the block."""
-    if kind == "embedded":
+    if kind == "files":
         yield {}
+        return
+    if kind == "postgres":
+        from tests.service.shared.postgres import running_postgres
+
+        with running_postgres() as postgres:
+            yield {"database": postgres.address}
         return
     from tests.core.milvus.servers import running_servers  # needs what speaks to them
 
     with running_servers() as servers:
-        yield {"store": kind, "milvus": servers.milvus_address, "postgres": servers.postgres_address}
+        yield {"vectors": kind, "milvus": servers.milvus_address, "database": servers.postgres_address}
 
 
 @pytest.fixture(scope="session")
@@ -96,6 +108,26 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     running = Server(tmp_path_factory.mktemp("strict"), settings=STRICT).wait()
     yield running
     assert running.stop() == 0
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A real PostgreSQL."""
+    from tests.service.shared.postgres import running_postgres  # needs what speaks to it
+
+    with running_postgres() as postgres:
+        yield postgres
+
+
+@pytest.fixture
+def database(postgres: Postgres) -> Iterator[SharedDatabase]:
+    """The ledger of services, with nothing in it."""
+    from service.shared.database import SharedDatabase
+
+    postgres.empty()
+    database = SharedDatabase(postgres.address)
+    yield database
+    database.close()
 
 
 @pytest.fixture
@@ -136,3 +168,13 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the data of a service that has one map."""
+    from tests.service.shared.services import prepare
+
+    folder = tmp_path_factory.mktemp("prepared")
+    prepare(folder)
+    return folder

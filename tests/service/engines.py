@@ -14,7 +14,7 @@ from core.maps import Enrolment
 from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
-from service.jobs.records import Job
+from service.jobs.job import Job
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from tests.core.storage.frames import keypoints_of

@@ -13,8 +13,7 @@ from core.geometry.keypoints import count_of
 from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import read_cameras
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.frames import StoredObject
-from core.ledger.maps.map import ObjectReader
+from core.ledger.maps.frames import ObjectReader
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.schema import SEQUENCES
 from core.ledger.statements import Statement
@@ -86,15 +85,9 @@ class LedgerSource(ABC):
         """The pictures of those of the places that keep one."""
         for some in pieces([place for place in group if place.picture_bytes]):
             stored = frames.pictures_at(self.connection, [place.row for place in some])
-            far = {row: one for row, one in stored.items() if isinstance(one, StoredObject)}
-            if far and self._objects is None:
-                raise StorageFailure("The picture is in an object store, and this service is configured without one.")
-            read = [] if self._objects is None else self._objects.read(list(far.values()))
-            found = dict(zip(far, read, strict=True))
+            found = frames.read_pictures(self._objects, stored)
             for place in some:
-                near = stored.get(place.row)
-                picture = near if isinstance(near, bytes) else found.get(place.row)
-                if picture is None:
+                if (picture := found.get(place.row)) is None:
                     raise StorageFailure(f"The picture of place {place.id!r} is missing, or damaged.")
                 yield picture
 

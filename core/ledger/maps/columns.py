@@ -18,12 +18,14 @@ from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereab
 _P = PLACES.c
 _AT_ONCE = 65_536
 _NUMBERS = 12
-_COLUMNS = Statement(
+_COLUMNS = (
     select(
         _P.row, _P.checksum, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
         func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), func.substr(_P.timestamp, 1, 26),
     ).where(_P.map == bindparam("map"))
 )  # fmt: skip
+_ALL = Statement(_COLUMNS)
+_CHANGED = Statement(_COLUMNS.where(_P.revision > bindparam("after")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +41,21 @@ class Columns:
     whereabouts: Whereabouts
 
 
-def read_columns(connection: MapConnection, rows: int) -> Columns:
+def read_columns(connection: MapConnection, rows: int, after: int | None = None) -> Columns:
     """Row, checksum and whereabouts of every place.
 
     Args:
         rows: how many rows the map has.
+        after: only places that changed since this revision of the map; None: all.
 
     Raises:
         DamagedRow: a place has a row that the map has not.
         ValueError: a pose is invalid.
     """
     numbers, moments = [np.empty((0, _NUMBERS))], [np.empty(0, "datetime64[us]")]
-    for page in connection.pages(_COLUMNS, _AT_ONCE):
-        numbers.append(np.array([values[:_NUMBERS] for values in page], dtype=np.float64))
+    pages = connection.pages(_ALL, _AT_ONCE) if after is None else [connection.execute(_CHANGED, after=after)]
+    for page in pages:
+        numbers.append(np.array([values[:_NUMBERS] for values in page], np.float64).reshape(-1, _NUMBERS))
         moments.append(np.array([values[_NUMBERS] for values in page], dtype="datetime64[us]"))
     found = np.concatenate(numbers)
     row = found[:, 0].astype(np.int64)

@@ -8,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from sqlalchemy import and_, bindparam, delete, exists, func, select, union
 
@@ -108,6 +109,27 @@ StoredPicture = bytes | StoredObject
 """A picture in its row: its bytes, or the object that has them."""
 
 
+class ObjectReader(Protocol):
+    """Reads objects: the bytes of each in order; None: it is missing or damaged."""
+
+    def read(self, stored: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
+
+
+def read_pictures(objects: ObjectReader | None, pictures: Mapping[int, StoredPicture]) -> dict[int, bytes]:
+    """Pictures by row, wherever they are; those whose object is missing, or damaged, are left out.
+
+    Raises:
+        StorageFailure: one is in an object store, and none is known.
+        StoreUnavailable: the object store cannot be reached, or refuses.
+    """
+    far = {row: one for row, one in pictures.items() if isinstance(one, StoredObject)}
+    if far and objects is None:
+        raise StorageFailure("The picture is in an object store, and this service is configured without one.")
+    near = {row: one for row, one in pictures.items() if not isinstance(one, StoredObject)}
+    found = zip(far, [] if objects is None else objects.read(list(far.values())), strict=True)
+    return near | {row: picture for row, picture in found if picture is not None}
+
+
 def checksum_of(record: bytes, digest: bytes) -> int:
     """The checksum of a record of the keypoints of the frame with this digest."""
     return zlib.crc32(record, zlib.crc32(digest))
@@ -126,8 +148,13 @@ def put_picture(connection: MapConnection, row: int, picture: StoredPicture) -> 
     connection.execute(_PUT_PICTURE, row=row, **given)
 
 
-def pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, StoredPicture]:
+def pictures_at(
+    connection: MapConnection, rows: Sequence[int], damaged: set[int] | None = None
+) -> dict[int, StoredPicture]:
     """The pictures of frames by row; frames without one are left out.
+
+    Args:
+        damaged: gets the rows whose bytes do not match their SHA-256; None: those raise.
 
     Raises:
         StorageFailure: the bytes of one do not match their SHA-256.
@@ -138,8 +165,10 @@ def pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, Sto
             found[row] = StoredObject(name, size, digest)
         elif isinstance(content, bytes) and hashlib.sha256(content).digest() == digest:
             found[row] = content
-        else:
+        elif damaged is None:
             raise StorageFailure("A stored picture is damaged.")
+        else:
+            damaged.add(row)
     return found
 
 
@@ -162,6 +191,11 @@ def rows_of_no_place(connection: MapConnection) -> list[int]:
 
 
 # Keypoints
+
+
+def damaged_keypoints_at(connection: MapConnection, rows: Sequence[int]) -> set[int]:
+    """Those of some rows whose keypoints do not match their checksum."""
+    return {row for row, _, *stored in connection.execute(_KEYPOINTS_AT, rows=list(rows)) if not _is_sound(*stored)}
 
 
 def damaged_keypoints(connection: MapConnection) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Protocol, overload
+from typing import Any, overload
 
 from core.errors import (
     InvalidImage,
@@ -22,7 +22,7 @@ from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import Cameras
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.counterparts import Counterparts
-from core.ledger.maps.frames import StoredObject
+from core.ledger.maps.frames import ObjectReader, read_pictures
 from core.ledger.maps.plan import Plan
 from core.ledger.maps.transfer import Transfer
 from core.ledger.maps.writing import Write
@@ -40,12 +40,6 @@ from core.maps.records import (
     patched_record,
 )
 from core.places import Place, PlaceFields
-
-
-class ObjectReader(Protocol):
-    """Reads objects: the bytes of each in order; None: it is missing or damaged."""
-
-    def read(self, stored: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
 
 
 class LedgerMap(ABC):
@@ -183,11 +177,9 @@ class LedgerMap(ABC):
                     pictures = frames.pictures_at(connection, [stored.row])
                 except StorageFailure as damage:
                     raise StorageFailure(f"The stored picture of place {place_id!r} is damaged.") from damage
-            picture = pictures.get(stored.row)
-            if not isinstance(picture, StoredObject):
-                return stored.place, picture
-            if (content := read_object(self.objects, picture)) is not None:
-                return stored.place, content
+            found = read_pictures(self.objects, pictures)
+            if stored.row in found or stored.row not in pictures:
+                return stored.place, found.get(stored.row)
             if stored.row == before:
                 raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
             before = stored.row  # or the place got another frame meanwhile
@@ -296,18 +288,6 @@ class LedgerMap(ABC):
 
 
 _AT_ONCE = 1000
-
-
-def read_object(objects: ObjectReader | None, picture: StoredObject) -> bytes | None:
-    """The bytes of a picture in an object store; None: it is missing or damaged.
-
-    Raises:
-        StorageFailure: this service is configured without an object store.
-        StoreUnavailable: the object store cannot be reached, or refuses.
-    """
-    if objects is None:
-        raise StorageFailure("The picture is in an object store, and this service is configured without one.")
-    return objects.read([picture])[0]
 
 
 def _not_more(ids: list[str], most: int) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,17 @@ from core.maps.counterparts import PlaceStation
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter, Scalar
 from core.maps.records import Keep, Outline
 from core.maps.stored_fields import POSE_VALUES, field_columns, moment_text
-from core.places import Place, PlaceFields, Pose
+from core.places import (
+    GEOGRAPHIC,
+    METRIC,
+    NO_POSE,
+    NO_TIME,
+    Place,
+    PlaceFields,
+    Pose,
+    Whereabouts,
+    microseconds,
+)
 
 LONGEST_TEXT = 512
 """Most characters of a text in a place's metadata by which the place can be found; longer texts are only stored."""
@@ -248,7 +259,7 @@ def _values(wanted: PlaceFilter) -> dict[str, Any]:
         "camera_name": wanted.camera,
         "from_moment": wanted.after and moment_text(wanted.after),
         "to_moment": wanted.before and moment_text(wanted.before),
-        **{f"token_{at}": token for at, token in enumerate(_tokens(wanted.metadata, whole=True))},
+        **{f"token_{at}": token for at, token in enumerate(wanted_tokens(wanted.metadata))},
     }
     return {name: value for name, value in given.items() if value is not None}
 
@@ -374,7 +385,30 @@ def remove(connection: MapConnection, stored: StoredPlace) -> None:
     _delete_tokens(connection, stored)
 
 
+def whereabouts_of(stored: Sequence[StoredPlace]) -> Whereabouts:
+    """Where and when the frames of places were taken, in their order."""
+    poses = [one.place.pose for one in stored]
+    moments = [one.place.timestamp for one in stored]
+    return Whereabouts(
+        np.array(
+            [NO_POSE if pose is None else METRIC if pose.kind() == "metric" else GEOGRAPHIC for pose in poses], np.int8
+        ),
+        np.array([np.zeros(3) if pose is None else pose.position() for pose in poses]).reshape(-1, 3),
+        np.array([one.sequence for one in stored], np.int32),
+        np.array([one.ordinal for one in stored], np.int64),
+        np.array([nan if pose is None or pose.heading is None else pose.heading for pose in poses], np.float32),
+        np.array([NO_TIME if moment is None else microseconds(moment) for moment in moments], np.int64),
+        np.array([one.sequence if one.track is None else one.track for one in stored], np.int32),
+        np.array([one.ordinal if one.station is None else one.station for one in stored], np.int64),
+    )
+
+
 # Metadata
+
+
+def wanted_tokens(metadata: Mapping[str, Scalar]) -> list[str]:
+    """The tokens that the places with all of these values have; no place has those of long texts."""
+    return _tokens(metadata, whole=True)
 
 
 def _tokens(metadata: Mapping[str, Any], whole: bool = False) -> list[str]:
@@ -426,7 +460,7 @@ def rows_with(
         rows: to choose from; None: all.
     """
     found = None if rows is None else np.unique(rows)
-    for token in _tokens(metadata, whole=True):
+    for token in wanted_tokens(metadata):
         if found is not None and len(found) <= FEW:
             ((text,),) = connection.execute(_ROWS_WITH_AMONG, token=token, rows=found.tolist())
         else:

@@ -17,9 +17,7 @@ _P, _S = PLACES.c, SEQUENCES.c
 _DIGITS = {"x": 3, "y": 3, "z": 3, "latitude": 7, "longitude": 7, "heading": 2}
 """Metres to the millimetre, degrees of position to a centimetre on the ground."""
 
-_NAMES = Statement(
-    select(_S.code, _S.name).where(_S.map == bindparam("map"), _S.name.is_not(None)).order_by(_S.name)
-)
+_NAMES = Statement(select(_S.code, _S.name).where(_S.map == bindparam("map"), _S.name.is_not(None)).order_by(_S.name))
 _LISTED = (
     select(
         _P.id,

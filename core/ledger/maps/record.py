@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from core.ledger.database import Connection
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import MAPS, PLACES, SEQUENCES
-from core.ledger.statements import Statement
+from core.ledger.statements import Statement, seconds_now
 from core.maps.records import MapRecord, validation_message
 from core.places import NO_SEQUENCE
 
@@ -25,7 +24,8 @@ class MapState:
     number: never used for another map, also of the same id; 1 in a file.
     places, rows: how many places there are; all their rows are below ``rows``.
     numbers: the number of the next place.
-    revision: grows with every write.
+    revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
+        and made again is told from the first one.
     inserted: the timestamp from which on Milvus sees all descriptors that count.
     collection: Milvus's id of the collection that has them; 0 as long as there are none.
     """
@@ -36,18 +36,19 @@ class MapState:
     rows: int = 0
     numbers: int = 1
     revision: int = 0
+    stamp: str = ""
     inserted: int = 0
     collection: int = 0
 
 
-_SEALED = ("id", "record")  # the counters change with every write, and are compared with the places
-_COUNTERS = ("places", "rows", "numbers", "revision", "inserted", "collection")
-_STATE = (MAPS.c.number, MAPS.c.id, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
+_SEALED = ("record",)  # the counters change with every write, and are compared with the places
+_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "inserted", "collection")
+_STATE = (MAPS.c.number, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
 
 _CREATE = Statement(
     lambda insert: (
         insert(MAPS)
-        .values({name: bindparam(name) for name in ("id", "record", "listed", "touched", "seal")})
+        .values({name: bindparam(name) for name in ("id", "record", "listed", "seal")} | {"touched": seconds_now()})
         .on_conflict_do_nothing()
         .returning(MAPS.c.number)
     )
@@ -56,6 +57,9 @@ _CREATE_SEQUENCE = Statement(lambda insert: insert(SEQUENCES).values(map=bindpar
 _OF_NUMBER = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")))
 _OF_NUMBER_LOCKED = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")).with_for_update())
 _LISTED = Statement(select(*_STATE).where(MAPS.c.id == bindparam("id"), MAPS.c.listed == 1))
+_NUMBER_OF = Statement(select(MAPS.c.number).where(MAPS.c.id == bindparam("id")))
+_ALL = Statement(select(MAPS.c.number, MAPS.c.record).order_by(MAPS.c.number))
+_COLLECTIONS = Statement(select(MAPS.c.collection, MAPS.c.id).where(MAPS.c.collection != 0).order_by(MAPS.c.id))
 _IS_LISTED = Statement(select(MAPS.c.listed).where(MAPS.c.id == bindparam("id")))
 _RECORDS = Statement(
     select(*_STATE)
@@ -64,12 +68,12 @@ _RECORDS = Statement(
     .limit(bindparam("most"))
 )
 _UNLISTED = Statement(
-    select(MAPS.c.id, MAPS.c.number).where(MAPS.c.listed == 0, MAPS.c.touched <= bindparam("untouched_since"))
+    select(MAPS.c.id, MAPS.c.number).where(
+        MAPS.c.listed == 0, MAPS.c.touched <= seconds_now() - bindparam("untouched_seconds")
+    )
 )
 _PUBLISH = Statement(
-    update(MAPS)
-    .where(MAPS.c.number == bindparam("map"), MAPS.c.listed == 0)
-    .values(id=bindparam("new_id"), listed=1, seal=bindparam("new_seal"))
+    update(MAPS).where(MAPS.c.number == bindparam("map"), MAPS.c.listed == 0).values(id=bindparam("new_id"), listed=1)
 )
 _UPDATE = Statement(
     update(MAPS)
@@ -79,7 +83,7 @@ _UPDATE = Statement(
 _COUNT = Statement(
     update(MAPS)
     .where(MAPS.c.number == bindparam("map"))
-    .values({name: bindparam(f"new_{name}") for name in ("touched", *_COUNTERS)})
+    .values({name: bindparam(f"new_{name}") for name in _COUNTERS} | {"touched": seconds_now()})
 )
 _HIGHEST = Statement(
     select(
@@ -102,8 +106,8 @@ def create(connection: Connection, record: MapRecord, name: str | None = None, l
     Raises:
         MapExists: the id is taken.
     """
-    values = sealed(_SEALED, {"id": name or record.id, "record": record.model_dump_json()})
-    made = connection.execute(_CREATE, **values, listed=int(listed), touched=time.time())
+    values = sealed(_SEALED, {"record": record.model_dump_json()})
+    made = connection.execute(_CREATE, id=name or record.id, **values, listed=int(listed))
     if not made:
         raise taken(connection, name or record.id)
     number = int(made[0][0])
@@ -123,29 +127,27 @@ def is_taken(connection: Connection, map_id: str) -> bool:
     return bool(connection.execute(_IS_LISTED, id=map_id))
 
 
-def publish(connection: Connection, map_number: int, map_id: str, record: MapRecord) -> None:
+def publish(connection: Connection, map_number: int, map_id: str) -> None:
     """List a map that was being built, under its id.
 
     Raises:
         UnknownMap: it is gone, or listed already.
-        MapExists: the id is taken by a listed map.
+        MapExists: another map has the id.
     """
-    holder = connection.execute(_LISTED, id=map_id)
-    if holder:
-        raise MapExists(f"There is already a map {map_id!r}.")
-    seal = sealed(_SEALED, {"id": map_id, "record": record.model_dump_json()})["seal"]
-    if not connection.change(_PUBLISH, map=map_number, new_id=map_id, new_seal=seal):
+    for (holder,) in connection.execute(_NUMBER_OF, id=map_id):
+        if holder != map_number:
+            raise taken(connection, map_id)
+    if not connection.change(_PUBLISH, map=map_number, new_id=map_id):
         raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
 
 
-def unlisted(connection: Connection, untouched_since: float | None = None) -> dict[str, int]:
+def unlisted(connection: Connection, untouched_seconds: float = 0) -> dict[str, int]:
     """The numbers of the maps that are being built, by the ids that they have meanwhile.
 
     Args:
-        untouched_since: only those without a write since this moment, in seconds since 1970; None: all.
+        untouched_seconds: only those without a write for this time.
     """
-    since = float("inf") if untouched_since is None else untouched_since
-    return dict(connection.execute(_UNLISTED, untouched_since=since))
+    return dict(connection.execute(_UNLISTED, untouched_seconds=untouched_seconds))
 
 
 def find(connection: Connection, map_id: str) -> MapState:
@@ -179,8 +181,8 @@ def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
 
 
 def _state(values: tuple[Any, ...]) -> MapState:
-    number, name, text, seal, *counters = values
-    if not is_sound((name, text), seal):
+    number, text, seal, *counters = values
+    if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
         return MapState(number, MapRecord.model_validate_json(text), *counters)
@@ -195,7 +197,7 @@ def records_after(connection: Connection, after: str, limit: int) -> list[MapRec
 
 def put_counters(connection: MapConnection, state: MapState) -> None:
     """Store the counters of a map, as every write to it does."""
-    connection.change(_COUNT, new_touched=time.time(), **{f"new_{one}": getattr(state, one) for one in _COUNTERS})
+    connection.change(_COUNT, **{f"new_{one}": getattr(state, one) for one in _COUNTERS})
 
 
 def wrong_counters(connection: MapConnection) -> list[str]:
@@ -213,11 +215,30 @@ def wrong_counters(connection: MapConnection) -> list[str]:
 
 
 def put_record(connection: MapConnection, record: MapRecord) -> None:
-    """Store the record of a map that is listed under its id."""
-    values = sealed(_SEALED, {"id": record.id, "record": record.model_dump_json()})
+    """Store the record of a map."""
+    values = sealed(_SEALED, {"record": record.model_dump_json()})
     connection.change(_UPDATE, new_record=values["record"], new_seal=values["seal"])
 
 
 def delete_map(connection: MapConnection) -> None:
     """Delete a map with all that belongs to it."""
     connection.change(_DELETE)
+
+
+def numbers(connection: Connection) -> list[int]:
+    """The numbers of all maps, also of unlisted ones."""
+    return [number for number, _ in connection.execute(_ALL)]
+
+
+def encoders(connection: Connection) -> list[tuple[str, int]]:
+    """The encoders of all maps, each with the values of its descriptors."""
+    found = (MapRecord.model_validate_json(text) for _, text in connection.execute(_ALL))
+    return sorted({(record.encoder, record.dimension) for record in found})
+
+
+def used_collections(connection: Connection) -> dict[int, list[str]]:
+    """Milvus's ids of the collections that have descriptors of maps, and these maps."""
+    found: dict[int, list[str]] = {}
+    for collection, map_id in connection.execute(_COLLECTIONS):
+        found.setdefault(collection, []).append(map_id)
+    return found

@@ -44,6 +44,7 @@ MAPS = Table(
     _column("rows", integer(), server_default="0"),  # the number of the next row
     _column("codes", integer(), server_default="0"),  # the code of the next sequence or lost track
     _column("revision", integer(), server_default="0"),  # grows with every write
+    _column("stamp", text(), server_default=""),  # drawn at random by the write that made this revision
     _column("inserted", integer(), server_default="0"),  # Milvus's timestamp of the last insertion that counts
     _column("collection", integer(), server_default="0"),  # Milvus's id of the collection that has its descriptors
     _column("seal", integer()),
@@ -88,6 +89,7 @@ PLACES = _table(
 )  # fmt: skip
 Index("places_of_sequence", PLACES.c.map, PLACES.c.sequence, PLACES.c.number)
 Index("places_in_order", PLACES.c.map, PLACES.c.sequence, PLACES.c.ordinal)
+Index("places_by_revision", PLACES.c.map, PLACES.c.revision).ddl_if(dialect="postgresql")
 Index("places_by_key", PLACES.c.key, unique=True, sqlite_where=PLACES.c.key.is_not(None))
 
 # The index by which places are found by their metadata (:func:`core.ledger.maps.places.tokens_of`).

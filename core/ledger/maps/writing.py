@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -282,7 +283,7 @@ class Write(ABC):
             StorageFull, StorageFailure, OSError, sqlite3.Error: one of them refuses.
         """
         if self.changed or self.state != self._before:
-            self.state = replace(self.state, revision=self._revision)
+            self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8))
         self._finish()
         if self.state != self._before:
             record.put_counters(self.connection, self.state)

@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from threading import Barrier
-from typing import Any, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from core.index.table import Block
 from core.maps.store import Ranking, merged
 from core.places import Neighborhood, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
-from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
 from core.storage.search.segment import HeldRows, Location, Segment, whereabouts_of
 from core.threads import cores, in_turns, keep_to
@@ -63,6 +62,21 @@ def together(run: Callable[[Part], None], parts: Sequence[Part]) -> None:
     in_turns(run, parts, threads()[0] if helpers > 0 else None, helpers)
 
 
+class RowSource(Protocol):
+    """Reads rows that are not in memory, each checked by the checksum that the ledger has of it."""
+
+    def descriptors(self, rows: NDArray[np.int64], checksums: NDArray[np.uint32]) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D]."""
+
+    def inner_products(
+        self, queries: NDArray[np.float32], rows: NDArray[np.int64], checksums: NDArray[np.uint32]
+    ) -> NDArray[np.float32]:
+        """Inner products of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
+
+    def locals(self, rows: NDArray[np.int64], checksums: NDArray[np.uint32]) -> NDArray[np.int8]:
+        """The local descriptors of rows: int8 [k, C, L]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """All places of a map at one moment (:class:`core.maps.store.Snapshot`).  Immutable; any thread may search it.
@@ -79,7 +93,7 @@ class Snapshot:
     rows_per_segment: int
     segments: tuple[Segment, ...] = ()
     local_shape: tuple[int, int] = NO_LOCAL
-    row_reader: RowReader | None = None
+    row_reader: RowSource | None = None
     table: CodeTable | None = None
     holds: bool = True
     halves: bool = False
@@ -250,7 +264,7 @@ class Snapshot:
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         found = np.empty((len(rows), *self.local_shape), np.int8)
-        self._read(rows, found, lambda segment, offset: segment.local[offset], RowReader.locals)
+        self._read(rows, found, lambda segment, offset: segment.local[offset], "locals")
         return found
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -261,7 +275,7 @@ class Snapshot:
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         found = np.empty((len(rows), self.dimension), np.float32)
-        self._read(rows, found, lambda segment, offset: vectors(segment.index)[offset], RowReader.descriptors)
+        self._read(rows, found, lambda segment, offset: vectors(segment.index)[offset], "descriptors")
         return found
 
     def _read(
@@ -269,7 +283,7 @@ class Snapshot:
         rows: NDArray[np.int64],
         found: NDArray[Any],
         in_memory: Callable[[Segment, int], NDArray[Any]],
-        on_disk: Callable[[RowReader, NDArray[np.int64], NDArray[np.uint32]], NDArray[Any]],
+        on_disk: Literal["descriptors", "locals"],
     ) -> None:
         """Fill ``found`` with the stored data of rows: a row of a segment, or rows on disk."""
         self._check_rows(rows)
@@ -281,7 +295,7 @@ class Snapshot:
             assert self.row_reader is not None
             wanted = rows[~held]
             with self.guard():
-                found[~held] = on_disk(self.row_reader, wanted, self._checksums(wanted))
+                found[~held] = getattr(self.row_reader, on_disk)(wanted, self._checksums(wanted))
 
     def appended(
         self,
@@ -289,6 +303,7 @@ class Snapshot:
         locations: Sequence[Location],
         local: Sequence[Local] | Local = (),
         checksums: Sequence[int] | None = None,
+        codes: Codes | None = None,
     ) -> Snapshot:
         """The snapshot with further places.  Call it only on the newest snapshot, from one thread at a time.
 
@@ -296,6 +311,7 @@ class Snapshot:
             descriptors, locations, local: one of each per place, float32 [D] (or float16 in a map that holds halves)
                 and int8 [C, L]; ``local`` may be left out if the map has no local descriptors.
             checksums: of the rows, as SQLite has them; None: it has none.
+            codes: of the descriptors; None: they are computed.
         """
         if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
             raise ValueError("every place of this map has local descriptors")
@@ -314,7 +330,8 @@ class Snapshot:
             done = min(stop, len(descriptors))
         table = self.table
         if table is not None and len(table) == self.rows and len(descriptors):
-            table = table.appended(table.coder.encode(np.asarray(descriptors, np.float32)))
+            made = table.coder.encode(np.asarray(descriptors, np.float32)) if codes is None else codes
+            table = table.appended(made)
         return replace(self, segments=tuple(segments), table=table)
 
     def moved(self, locations: Mapping[int, Location]) -> Snapshot:

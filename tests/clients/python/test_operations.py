@@ -16,7 +16,7 @@ import pytest
 
 from placerec_client import AsyncClient, Client, Map, NewPlace, Problem, models, problems
 from placerec_client.model import Model
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.clients.python.models import operations
 from tests.service.scenes import encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server
@@ -89,7 +89,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str
     """The address and an administrator's key of a service that has keys."""
     folder = tmp_path_factory.mktemp("guarded")
     (folder / "data").mkdir()
-    _, key = KeyStore(folder / "data").create("ann", "admin")
+    _, key = Keys.of(folder / "data").create("ann", "admin")
     running = Server(folder, key=key).wait()
     yield str(running.client.base_url), key
     assert running.stop() == 0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.clients.ros2.network import NoNetwork, own_network
 from tests.clients.ros2.robot import VENV, Robot, Site, walk, walked_again
 from tests.service.scenes import encoded
@@ -31,7 +31,7 @@ def network() -> Iterator[None]:
 def site(network: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """A service with keys, and the map ``walk`` of drawn walls."""
     folder = tmp_path_factory.mktemp("site")
-    store = KeyStore(folder / "service" / "data")
+    store = Keys.of(folder / "service" / "data")
     keys = {role: store.create(role, role)[1] for role in ("query", "enrol", "admin")}
     server = Server(folder / "service", key=keys["admin"], forked=False)
     frames = walk()

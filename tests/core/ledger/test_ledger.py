@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import threading
 from dataclasses import replace
@@ -13,6 +14,7 @@ from sqlalchemy import Column, Index, MetaData, Table, bindparam, delete, select
 from core.disk.sqlite_file import DURABLE
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, StorageFull, StoreOfAnotherVersion
 from core.ledger import Ledger, Statement, Tables
+from core.ledger.rows import given_rows
 from core.ledger.sqlite import SqliteLedger, file_of
 from core.ledger.statements import among, binary, greatest, integer, real, seconds_now, text
 from tests.core.ledger.conftest import OpenLedger
@@ -45,6 +47,7 @@ _NUMBERED = Statement(select(_FRUIT.c.name).where(among(_FRUIT.c.number, "number
 _TOUCH = Statement(update(_FRUIT).where(_FRUIT.c.name == bindparam("which")).values(at=seconds_now()))
 _MOMENT = Statement(select(seconds_now() - _FRUIT.c.at, seconds_now()).where(_FRUIT.c.name == bindparam("name")))
 _DELETE = Statement(delete(_FRUIT).where(_FRUIT.c.weight < bindparam("weight")))
+_DELETE_NAMED = Statement(delete(_FRUIT).where(_FRUIT.c.name == bindparam("name")))
 
 
 def _put(ledger: Ledger, name: str, weight: float, picture: bytes | None = None) -> int:
@@ -63,6 +66,19 @@ def test_rows_are_put_replaced_found_and_deleted(open_ledger: OpenLedger) -> Non
     assert ledger.change("delete", _DELETE, weight=1.0) == 0
     third = _put(ledger, "plum", 1.0)
     assert third > second  # a number is never used twice
+
+
+@pytest.mark.parametrize("name", ["pe\0ar", "\ud800", "pear\udfff"])
+def test_a_text_that_cannot_be_stored_is_not_found(open_ledger: OpenLedger, name: str) -> None:
+    ledger = open_ledger(TABLES)
+    _put(ledger, "pear", 1.0)
+    for found in (ledger.execute("look", _MOMENT, name=name), ledger.execute("list", _NAMED, names=[name])):
+        assert found == []
+    assert ledger.execute("list", _NAMED, names=[name, "pear"]) == [("pear",)]
+    assert ledger.change("delete", _DELETE_NAMED, name=name) == 0
+    with pytest.raises((StorageFailure, UnicodeEncodeError)):
+        _put(ledger, "\ud800", 1.0)  # but it is not stored as another one
+    assert ledger.execute("list", _ALL) == [("pear", 1.0)]
 
 
 def test_the_clock_is_that_of_the_database(open_ledger: OpenLedger) -> None:
@@ -165,3 +181,20 @@ def test_a_parameter_without_a_value_is_a_defect(open_ledger: OpenLedger) -> Non
     ledger = open_ledger(TABLES)
     with pytest.raises((KeyError, StorageFailure, sqlite3.ProgrammingError)):
         ledger.execute("put", _PUT, name="pear")
+
+
+def test_many_rows_are_one_parameter(open_ledger: OpenLedger) -> None:
+    columns = [_FRUIT.c.name, _FRUIT.c.weight, _FRUIT.c.at]
+    put = Statement(
+        lambda insert: (
+            (many := insert(_FRUIT).from_select([column.name for column in columns], given_rows("fruit", columns)))
+            .on_conflict_do_update(index_elements=["name"], set_={"weight": _FRUIT.c.weight + many.excluded.weight})
+        )
+    )  # fmt: skip
+    read = Statement(select(*columns).order_by(_FRUIT.c.name))
+    ledger = open_ledger(TABLES)
+    basket = [('Äpfel; "rot" \'', 0.1, 3.5), ("pear", 2, None)]
+    ledger.execute("put", put, fruit=json.dumps(basket))
+    ledger.execute("put", put, fruit=json.dumps([]))
+    ledger.execute("put", put, fruit=json.dumps([("pear", 0.5, 9.0)]))
+    assert sorted(ledger.execute("list", read)) == sorted([basket[0], ("pear", 2.5, None)])

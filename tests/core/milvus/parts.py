@@ -15,11 +15,12 @@ from pymilvus import Collection, connections
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StorageFailure
+from core.ledger.maps.frames import StoredObject
 from core.milvus.collection import collection_name
-from core.milvus.pictures.objects import Objects
-from core.milvus.pictures.stored import StoredObject
+from core.postgres.pictures.objects import Objects
 from tests.core.milvus.clients import ProcessClient
-from tests.core.milvus.servers import Server, Servers
+from tests.core.milvus.servers import Servers
+from tests.core.postgres.servers import Server
 from tests.core.storage.frames import DIMENSION, ENCODER
 
 AWAY_SECONDS = 1.0

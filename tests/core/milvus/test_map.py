@@ -1,25 +1,21 @@
-"""What the contract of all stores leaves open: large maps, writers at the same time, servers that are gone."""
+"""What the contract of all stores leaves open: large maps, writers at the same time, a Milvus that is gone."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import psycopg
 import pytest
 
-from core.errors import RevisionMismatch, StoreOfAnotherVersion, StoreUnavailable
+from core.errors import StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
-from core.maps import Map, MapSettings, PlaceFilter, Selection
+from core.maps import Map, MapSettings, Selection
 from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions
-from core.maps.views import Look, shows_same
 from core.method.catalogue import EncoderCatalogue
 from core.milvus import open_store
-from core.milvus.ledger import VERSION
 from core.milvus.map import MilvusMap
 from core.milvus.snapshot import SHORTLIST
 from core.milvus.store import MilvusStore
@@ -27,8 +23,9 @@ from core.places import Neighborhood, Pose
 from core.recognition import enrol, recognize
 from core.recognition.question import Question
 from core.storage import Atlas
+from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.milvus.servers import Servers
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of, stored_of
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, stored_of
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -109,35 +106,8 @@ def test_a_map_answers_as_one_in_a_data_directory_does(store: MilvusStore, tmp_p
 
 
 def test_writers_at_the_same_time_lose_nothing(servers: Servers, store: MilvusStore) -> None:
-    made(store)
     others = [connected(servers) for _ in range(3)]
-
-    def write(which: int) -> int:
-        lab, refused = others[which].get("lab"), 0
-        for number in range(8):
-            lab.enrol([frame(f"w{which}-{number}", sequence="shared"), frame("both", f"by {which} {number}")])
-            try:
-                lab.edit({"description": f"by {which} {number}"}, lab.record.revision)
-            except RevisionMismatch:
-                refused += 1
-        return refused
-
-    with ThreadPoolExecutor(3) as pool:
-        refused = sum(pool.map(write, range(3)))
-    lab = store.get("lab")
-    listed, _ = lab.places(None, 100, PlaceFilter(sequence="shared"))
-    assert {place.id for place in listed} == {f"w{which}-{number}" for which in range(3) for number in range(8)}
-    outline = lab.transfer.outline()
-    first: dict[int, Look] = {}  # what the first frame at each position shows; other frames there show it, too
-    for place in sorted((place for place in outline if place.sequence == "shared"), key=lambda place: place.ordinal):
-        look = Look(descriptor_of(place.id), local_of(place.id))
-        assert place.ordinal == len(first) or shows_same(look, first[place.ordinal], about=True)
-        first.setdefault(place.ordinal, look)
-    assert len(first) > 16
-    assert lab.count_places() == 25 and lab.record.revision == 1 + 24 - refused
-    for name in ("w0-0", "w2-7"):
-        ((rows, _),) = lab.scope().search(descriptor_of(name)[np.newaxis])
-        assert lab.places_at(rows[:1].tolist())[0] == lab.place(name)
+    check_writers_lose_nothing(store, others)
     for other in others:
         other.close()
 
@@ -152,33 +122,13 @@ def test_what_was_left_over_is_deleted(store: MilvusStore, monkeypatch: pytest.M
     # A query that is under way reads what it has found.
     assert scope.snapshot.locals_at(rows).shape == (2, *LOCAL_SHAPE)
     assert len(scope.snapshot.whereabouts_at(rows)) == 2
-    monkeypatch.setattr("core.milvus.ledger.LEFT_SECONDS", 0)
+    monkeypatch.setattr("core.postgres.rows.LEFT_SECONDS", 0)
     lab.enrol([frame("c")])
     assert lab.snapshot().orphans == ()
     assert len(lab.snapshot()) == 2
 
 
-@pytest.mark.parametrize("other", [VERSION - 1, VERSION + 1])
-def test_tables_of_another_version(servers: Servers, store: MilvusStore, other: int) -> None:
-    made(store)
-
-    def call_it(version: int) -> None:
-        with psycopg.connect(servers.postgres_address) as connection:
-            connection.execute("UPDATE placerec SET version = %s", (version,))
-
-    call_it(other)
-    later = connected(servers)
-    try:
-        for ask in (lambda: later.get("lab"), later.check_writable):
-            with pytest.raises(StoreOfAnotherVersion, match=f"version {other}, which this placerec does not read"):
-                ask()
-    finally:
-        call_it(VERSION)
-    assert later.get("lab").record.id == "lab"
-    later.close()
-
-
-def test_a_server_that_is_gone(servers: Servers, store: MilvusStore) -> None:
+def test_a_milvus_that_is_gone(servers: Servers, store: MilvusStore) -> None:
     made(store).enrol([frame("a")])
     without_milvus = open_store("http://127.0.0.1:9", servers.postgres_address)
     lab = without_milvus.get("lab")
@@ -191,7 +141,3 @@ def test_a_server_that_is_gone(servers: Servers, store: MilvusStore) -> None:
     with pytest.raises(StoreUnavailable, match="Milvus"):
         without_milvus.check_writable()
     without_milvus.close()
-    without_postgres = open_store(servers.milvus_address, "postgresql://placerec@127.0.0.1:9/postgres")
-    with pytest.raises(StoreUnavailable, match="PostgreSQL cannot be reached"):
-        without_postgres.get("lab")
-    without_postgres.close()

@@ -11,9 +11,11 @@ import pytest
 from pymilvus import MilvusClient
 
 from core.errors import StorageFailure, StoreUnavailable
-from core.milvus import ledger, open_store
+from core.ledger.maps import places, record
+from core.milvus import open_store
 from core.milvus.map import MilvusMap
 from core.milvus.store import MilvusStore
+from core.postgres import rows
 from tests.core.milvus.servers import Servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
@@ -36,7 +38,7 @@ def lab(store: MilvusStore) -> MilvusMap:
 def keys_in_milvus(store: MilvusStore, lab: MilvusMap) -> set[int]:
     """Those of the last keys that Milvus has."""
     with lab.viewing() as (connection, _):
-        last = ledger.last_key(connection)
+        last = rows.last_key(connection.whole)
     return set(lab.collection.keys_between(max(0, last - 1000), last + 1))
 
 
@@ -49,7 +51,7 @@ def test_what_a_dead_write_left_is_deleted(store: MilvusStore, lab: MilvusMap, m
         raise StorageFailure("between the insertion and the COMMIT")
 
     with monkeypatch.context() as patched:
-        patched.setattr(ledger, "update", die)
+        patched.setattr(record, "put_counters", die)
         with pytest.raises(StorageFailure):
             lab.enrol([frame("b"), frame("c")])
     assert len(keys_in_milvus(store, lab) - before) == 2
@@ -58,16 +60,16 @@ def test_what_a_dead_write_left_is_deleted(store: MilvusStore, lab: MilvusMap, m
 
 
 def test_what_is_being_written_stays(store: MilvusStore, lab: MilvusMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    update, inserted, go_on = ledger.update, threading.Event(), threading.Event()
+    put_counters, inserted, go_on = record.put_counters, threading.Event(), threading.Event()
 
     def slow(*args: Any) -> None:
         inserted.set()
         assert go_on.wait(60)
-        update(*args)
+        put_counters(*args)
 
     swept: list[int] = []
     with monkeypatch.context() as patched:
-        patched.setattr(ledger, "update", slow)
+        patched.setattr(record, "put_counters", slow)
         writer = threading.Thread(target=lambda: lab.enrol([frame("a")]))
         writer.start()
         assert inserted.wait(60)
@@ -78,23 +80,23 @@ def test_what_is_being_written_stays(store: MilvusStore, lab: MilvusMap, monkeyp
         writer.join(60)
         sweeper.join(60)
     assert swept == [0]
-    ((rows, _),) = lab.scope().search(descriptor_of("a")[np.newaxis])
-    assert [place.id for place in lab.places_at(rows.tolist()) if place] == ["a"]
+    ((found, _),) = lab.scope().search(descriptor_of("a")[np.newaxis])
+    assert [place.id for place in lab.places_at(found.tolist()) if place] == ["a"]
 
 
 def test_what_milvus_lost_is_noticed_and_restored(store: MilvusStore, lab: MilvusMap) -> None:
     lab.enrol([frame(f"p{number}") for number in range(3)])
     assert store.verify("swept").ok
     with lab.viewing() as (connection, _):
-        entry = ledger.find(connection, lab.number, "p1")
-    assert entry is not None
-    lab.collection.delete([entry.key])
+        key = places.expect(connection, "p1").key
+    assert key is not None
+    lab.collection.delete([key])
     report = store.verify("swept")
     assert not report.ok and "'p1' is missing" in report.problems[0]
     lab.rebuild_index()
     assert store.verify("swept").ok
-    ((rows, _),) = lab.scope().search(descriptor_of("p1")[np.newaxis])
-    assert [place.id for place in lab.places_at(rows[:1].tolist()) if place] == ["p1"]
+    ((found, _),) = lab.scope().search(descriptor_of("p1")[np.newaxis])
+    assert [place.id for place in lab.places_at(found[:1].tolist()) if place] == ["p1"]
 
 
 def test_a_milvus_that_does_not_have_the_descriptors(servers: Servers, store: MilvusStore, lab: MilvusMap) -> None:
@@ -113,8 +115,8 @@ def test_a_milvus_that_does_not_have_the_descriptors(servers: Servers, store: Mi
     assert other.sweep() == 0
 
     def first(of: MilvusMap) -> list[str]:
-        ((rows, _),) = of.scope().search(query)
-        return [place.id for place in of.places_at(rows[:1].tolist()) if place is not None]
+        ((found, _),) = of.scope().search(query)
+        return [place.id for place in of.places_at(found[:1].tolist()) if place is not None]
 
     store.check_writable()
     assert first(lab) == ["a"] and lab.count_places() == 2

@@ -13,8 +13,8 @@ from core.errors import UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.ledger.maps.connection import MapConnection
-from core.storage import Atlas, Map
 from core.ledger.maps.writing import Write
+from core.storage import Atlas, Map
 
 MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
 INTRINSICS = Intrinsics(width=64, height=48, fx=50.1, fy=50.2, cx=31.5, cy=23.5)

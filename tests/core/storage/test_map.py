@@ -37,7 +37,7 @@ EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
 
 
 def changes(lab: Map, *items: object) -> list[str]:
-    return [change for _, change in lab.enrol(items)]  # type: ignore[arg-type]
+    return [change for _, change in lab.enrol(items)]
 
 
 def best(lab: Map, shown: str) -> str | None:
@@ -146,7 +146,7 @@ def test_a_batch_over_several_segments_is_searched(lab: Map) -> None:
 def test_one_wrong_item_refuses_them_all(lab: Map, wrong: object, error: type[Exception]) -> None:
     lab.enrol([frame("before")])
     with pytest.raises(error):
-        lab.enrol([frame("p"), wrong])  # type: ignore[list-item]
+        lab.enrol([frame("p"), wrong])
     assert lab.count_places() == 1
     with pytest.raises(UnknownPlace):
         lab.place("p")

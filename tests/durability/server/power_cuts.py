@@ -12,8 +12,8 @@ from typing import Any
 
 import httpx
 
-from service.jobs.records import JobRecords
-from service.sessions.store import SessionStore
+from service.jobs.file import open_file
+from service.sessions.table import SessionTable, session_file
 from tests.durability.model import Lost, World
 from tests.durability.server import operations as requests
 from tests.durability.server.kills import PATIENCE, SETTINGS, Client
@@ -97,10 +97,10 @@ def power(
 
 def _check(processes: StorageProcesses, image: Path, may: list[Moment]) -> None:
     check(processes, image, [moment.world for moment in may])
-    JobRecords(image).close()
-    store = SessionStore(image)
-    found = {one.id: one.number or 0 for one in store.all() if one.ended is None}
-    store.close()
+    open_file(image)[0].close()
+    file = session_file(image)
+    found = {one.id: one.number or 0 for one in SessionTable(file).living()}
+    file.close()
     if (image / "sessions.sqlite.damaged").exists():
         raise Lost("sessions.sqlite is damaged")
     sessions = [moment.session for moment in may]

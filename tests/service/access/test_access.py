@@ -19,7 +19,8 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from service.access.gate import WEBSOCKET, Endpoint, endpoints_of, is_loopback_host
-from service.access.keys import KeyStore
+from service.access.key_file import FILE
+from service.access.keys import Keys
 from service.access.roles import OPERATIONS, covers
 from service.app.application import create_app
 from service.commands.connection.client import CommandTarget, open_service
@@ -47,7 +48,7 @@ def address(endpoint: Endpoint, **parts: str) -> str:
 @pytest.fixture
 def guarded(tmp_path: Path) -> Iterator[tuple[FastAPI, dict[str, str]]]:
     """An application that has keys: one of each role for all maps, and for the map lab alone."""
-    store = KeyStore(tmp_path / "data")
+    store = Keys.of(tmp_path / "data")
     tokens = {role: store.create(role, role)[1] for role in ("query", "enrol", "admin")}
     tokens |= {f"lab-{role}": store.create(f"lab-{role}", role, ["lab"])[1] for role in ("query", "enrol", "admin")}
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path / "data"))
@@ -135,7 +136,7 @@ async def test_without_a_key_no_answer_shows_the_content(guarded: tuple[FastAPI,
 
 @pytest.mark.anyio
 async def test_under_a_path_of_a_proxy_the_same_key_is_needed(tmp_path: Path) -> None:
-    KeyStore(tmp_path).create("ann", "admin")
+    Keys.of(tmp_path).create("ann", "admin")
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path, root_path="/placerec"))
     with app.state.gate.keyring:
         async with asking(app) as client:
@@ -146,9 +147,9 @@ async def test_under_a_path_of_a_proxy_the_same_key_is_needed(tmp_path: Path) ->
 
 @pytest.mark.anyio
 async def test_a_damaged_file_of_keys_stops_the_start(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path)
+    store = Keys.of(tmp_path)
     store.create("ann", "admin")
-    store.path.write_bytes(b"")
+    (tmp_path / FILE).write_bytes(b"")
     app = create_app(Settings(host="0.0.0.0", data_dir=tmp_path))
     with pytest.raises(Exception, match="is not a file of keys"):
         async with app.router.lifespan_context(app):
@@ -157,7 +158,7 @@ async def test_a_damaged_file_of_keys_stops_the_start(tmp_path: Path) -> None:
 
 @pytest.mark.anyio
 async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> None:
-    KeyStore(tmp_path).create("ann", "query")
+    Keys.of(tmp_path).create("ann", "query")
     async with open_service(CommandTarget(None, tmp_path)) as service:
         assert (await service.get("/v1/maps"))["items"] == []
         await service.request("POST", "/v1/maps", json={"id": "lab"})
@@ -218,7 +219,7 @@ class Keyed:
 
     def __init__(self, folder: Path) -> None:
         install_coarse_encoder(folder / "models")
-        self.store = KeyStore(folder / "data")
+        self.store = Keys.of(folder / "data")
         _, self.admin = self.store.create("ann", "admin")
         _, self.query = self.store.create("robot", "query", ["lab"])
         _, self.enrol = self.store.create("eve", "enrol", ["lab"])
@@ -401,5 +402,5 @@ def test_damaged_maps_are_listed_for_those_who_may_know(keyed: Keyed) -> None:
 
 def test_a_bind_to_the_network_is_served_once_there_are_keys(tmp_path: Path) -> None:
     settings = Settings(host="0.0.0.0", data_dir=tmp_path, allow_anonymous=False)
-    KeyStore(tmp_path).create("ann", "admin")
+    Keys.of(tmp_path).create("ann", "admin")
     assert create_app(settings).state.gate.keyring is not None

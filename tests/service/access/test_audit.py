@@ -1,16 +1,14 @@
-"""The audit trail: who asked is kept with a job, a refusal that repeats fills no disk, a file can be moved away."""
+"""The audit trail: who asked is kept with a job, and a refusal that repeats fills no disk."""
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 
 import pytest
 
-from core.errors import StorageFailure
 from service.access import audit
-from service.access.audit import ASKER, Asker, Refusals, asker_fields, audit_file, note_change
+from service.access.audit import ASKER, Asker, Refusals, asker_fields, note_change
 from service.jobs.jobs import Jobs
 from tests.service.server import Server
 
@@ -48,7 +46,7 @@ def test_a_request_that_changed_nothing_is_no_change(caplog: pytest.LogCaptureFi
 def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before = Jobs(tmp_path)
+    before = Jobs.of_directory(tmp_path)
     before.register("prune", lambda _context: {})
     token = ASKER.set(EVE)
     try:
@@ -57,7 +55,7 @@ def test_the_end_of_a_job_is_logged_with_its_caller_over_a_restart(
     finally:
         ASKER.reset(token)
     before.close(0.0)
-    after = Jobs(tmp_path)
+    after = Jobs.of_directory(tmp_path)
     after.register("prune", lambda _context: {})
     after.start()
     while not after.get(job.id).ended:
@@ -87,20 +85,6 @@ def test_a_repeated_refusal_is_logged_once(caplog: pytest.LogCaptureFixture, mon
     for number in range(2 * audit.MOST_REFUSALS):
         refusals.note(Asker("nobody", client=str(number)), {}, 401, "key-needed")
     assert len(refusals._logged) == audit.MOST_REFUSALS
-
-
-def test_a_file_of_its_own(tmp_path: Path) -> None:
-    path = tmp_path / "audit.jsonl"
-    with audit_file(path):
-        note_change(EVE, {"map": "lab"}, {}, 200)
-        path.rename(tmp_path / "old.jsonl")
-        note_change(EVE, {"map": "yard"}, {}, 200)
-    note_change(EVE, {"map": "late"}, {}, 200)
-    for name, map_id in (("old.jsonl", "lab"), ("audit.jsonl", "yard")):
-        (line,) = (json.loads(text) for text in (tmp_path / name).read_text().splitlines())
-        assert (line["logger"], line["map"], line["principal"]) == ("placerec.audit", map_id, "eve")
-    with pytest.raises(StorageFailure, match="cannot be opened"), audit_file(tmp_path / "absent" / "audit.jsonl"):
-        pass
 
 
 def test_nobody_says_of_itself_where_it_calls_from(server: Server) -> None:

@@ -9,14 +9,25 @@ from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sqlalchemy import bindparam, delete, select, update
 
 from core.errors import InvalidIdentifier
+from core.ledger import Statement
+from core.ledger.sqlite import SqliteConnection
+from service.access.key_file import FILE
+from service.access.key_table import KEYS
 from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
-from service.access.keys import FILE, KeyStore
-from service.access.roles import TOKEN, Principal
-from service.errors.faults import InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable
+from service.access.keys import Key, Keys
+from service.access.roles import TOKEN, Principal, Role
+from service.errors.faults import Fault, InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable, LastAdminKey
+
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
 
 
 class Clock:
@@ -30,25 +41,31 @@ class Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> KeyStore:
-    return KeyStore(tmp_path)
+def file_store(tmp_path: Path) -> Keys:
+    return Keys.of(tmp_path)
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Keys:
+    """Keys in each of the two databases."""
+    return Keys.of(tmp_path, None if request.param == "sqlite" else request.getfixturevalue("database"))
 
 
 def bearer(token: str) -> bytes:
     return f"Bearer {token}".encode()
 
 
-def ring(store: KeyStore, wall: Clock | None = None, monotonic: Clock | None = None) -> Keyring:
+def ring(store: Keys, wall: Clock | None = None, monotonic: Clock | None = None) -> Keyring:
     """A keyring that looks at its file when a test says so."""
     made = Keyring(store, wall or Clock(datetime.now(UTC).timestamp()), monotonic or Clock(0.0))
     made._read()
     return made
 
 
-# The file
+# The database
 
 
-def test_a_key_is_stored_without_its_secret(store: KeyStore, tmp_path: Path) -> None:
+def test_a_key_is_stored_without_its_secret(store: Keys) -> None:
     assert not store.exists() and store.all() == []
     until = datetime.now(UTC) + timedelta(days=30)
     key, token = store.create("robot-7", "query", ["lab", "yard"], until)
@@ -56,13 +73,26 @@ def test_a_key_is_stored_without_its_secret(store: KeyStore, tmp_path: Path) -> 
     assert match is not None and match[1] == key.id and len(match[2]) == 43, "43 of 64 characters: 256 bits"
     assert store.all() == [key]
     assert (key.role, key.maps, key.expires_at) == ("query", frozenset({"lab", "yard"}), until)
-    assert [path.name for path in tmp_path.iterdir()] == [FILE]
-    assert stat.S_IMODE(store.path.stat().st_mode) == 0o600
-    assert match[2].encode() not in store.path.read_bytes() and token.encode() not in store.path.read_bytes()
+    assert match[2] not in str(store.place.execute(Statement(select(KEYS))))
     assert store.create("other", "admin")[1] != token
 
 
-def test_what_cannot_be_a_key_is_refused(store: KeyStore) -> None:
+def test_the_file_is_its_owners_and_has_no_secret(file_store: Keys, tmp_path: Path) -> None:
+    _, token = file_store.create("robot-7", "query")
+    (path,) = tmp_path.iterdir()
+    assert path.name == FILE and stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert token.rpartition("_")[2].encode() not in path.read_bytes() and token.encode() not in path.read_bytes()
+
+
+def test_a_change_of_the_file_leaves_no_journal_that_could_come_back(file_store: Keys) -> None:
+    file_store.create("ann", "query")
+    with file_store.place.changing() as connection:
+        assert isinstance(connection, SqliteConnection)
+        assert connection.driver.execute("PRAGMA synchronous").fetchone() == (3,), "EXTRA, which syncs the folder"
+        assert connection.driver.execute("PRAGMA journal_mode").fetchone() == ("delete",)
+
+
+def test_what_cannot_be_a_key_is_refused(store: Keys) -> None:
     past = datetime.now(UTC) - timedelta(seconds=1)
     for name in ("", "two words", "a" * 65, "0123456789ab", "anonymous", "owner", "new\nline"):
         with pytest.raises(InvalidRequest):
@@ -77,7 +107,7 @@ def test_what_cannot_be_a_key_is_refused(store: KeyStore) -> None:
     assert not store.exists(), "nothing was made on the way"
 
 
-def test_a_name_is_free_again_when_its_key_is_revoked(store: KeyStore) -> None:
+def test_a_name_is_free_again_when_its_key_is_revoked(store: Keys) -> None:
     first, _ = store.create("ann", "query")
     with pytest.raises(InvalidRequest, match="Delete it first"):
         store.create("ann", "admin")
@@ -91,14 +121,14 @@ def test_a_name_is_free_again_when_its_key_is_revoked(store: KeyStore) -> None:
             store.revoke(unknown)
 
 
-def test_first_keys_at_one_moment_are_all_stored(store: KeyStore) -> None:
+def test_first_keys_at_one_moment_are_all_stored(store: Keys, tmp_path: Path) -> None:
     threads = [threading.Thread(target=store.create, args=(f"key-{number}", "query")) for number in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert {key.name for key in store.all()} == {f"key-{number}" for number in range(8)}
-    assert [path.name for path in store.path.parent.iterdir()] == [FILE]
+    assert [path.name for path in tmp_path.iterdir()] == ([] if store.place.remote else [FILE])
 
 
 def _empty(path: Path) -> None:
@@ -113,18 +143,6 @@ def _overwrite(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-300:] = b"\xff" * 300
     path.write_bytes(bytes(data))
-
-
-def _promote(path: Path) -> None:
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("UPDATE keys SET role = 'admin', maps = NULL")
-        connection.commit()
-
-
-def _prolong(path: Path) -> None:
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("UPDATE keys SET expires_at = NULL")
-        connection.commit()
 
 
 def _replace(path: Path) -> None:
@@ -143,17 +161,35 @@ def _share(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage",
-    [_empty, _cut, _overwrite, _promote, _prolong, _replace, _date_forward, _share],
-    ids=lambda one: one.__name__,
+    "damage", [_empty, _cut, _overwrite, _replace, _date_forward, _share], ids=lambda one: one.__name__
 )
-def test_a_damaged_file_lets_nobody_in(store: KeyStore, damage: Callable[[Path], None]) -> None:
+def test_a_damaged_file_lets_nobody_in(file_store: Keys, tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    _, token = file_store.create("ann", "query", ["lab"], datetime.now(UTC) + timedelta(days=1))
+    expect_closed(file_store, token, lambda: damage(tmp_path / FILE))
+    with pytest.raises(KeysUnreadable):
+        Keyring(file_store).start()
+
+
+@pytest.mark.parametrize("change", [{"role": "admin", "maps": None}, {"expires_at": None}, {"digest": bytes(32)}])
+def test_a_row_that_was_changed_lets_nobody_in(store: Keys, change: dict[str, Any]) -> None:
     _, token = store.create("ann", "query", ["lab"], datetime.now(UTC) + timedelta(days=1))
+
+    def forge() -> None:
+        with store.place.changing() as connection:
+            assert connection.change(
+                Statement(update(KEYS).values({name: bindparam(name) for name in change})), **change
+            )
+
+    expect_closed(store, token, forge)
+
+
+def expect_closed(store: Keys, token: str, damage: Callable[[], None]) -> None:
+    """Nobody is let in after some damage, at a running service neither."""
     clock = Clock(0.0)
     running = ring(store, monotonic=clock)
-    damage(store.path)
+    damage()
     assert store.exists(), "keys are demanded all the same"
-    for action in (store.all, lambda: store.create("bob", "admin"), lambda: store.revoke("ann"), Keyring(store).start):
+    for action in (store.all, lambda: store.create("bob", "admin"), lambda: store.revoke("ann"), lambda: ring(store)):
         with pytest.raises(KeysUnreadable):
             action()
     running.look()
@@ -165,10 +201,70 @@ def test_a_damaged_file_lets_nobody_in(store: KeyStore, damage: Callable[[Path],
     assert running.demanded
 
 
+def test_a_directory_without_keys_gets_no_file(file_store: Keys, tmp_path: Path) -> None:
+    with pytest.raises(InvalidRequest):
+        file_store.revoke("ann")
+    with pytest.raises(LastAdminKey):
+        file_store.create("ann", "query", keep_admin=True)
+    assert file_store.all() == [] and list(tmp_path.iterdir()) == []
+
+
+UNTIL = datetime.now(UTC) + timedelta(days=30)
+Step = tuple[str, str, Role, frozenset[str] | None, bool]
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(["create", "narrow", "revoke", "use"]),
+        st.sampled_from(["ann", "bob", "eve"]),
+        st.sampled_from(["query", "enrol", "admin"]),
+        st.sampled_from([None, frozenset({"lab"}), frozenset({"lab", "yard"})]),
+        st.booleans(),
+    ),
+    max_size=15,
+)
+
+
+def outcome(store: Keys, step: Step) -> object:
+    """What comes of a step: what the key is then, or the error."""
+    action, name, role, maps, keep_admin = step
+    found = [key.id for key in store.all() if key.name == name]
+    try:
+        if action == "create":
+            return traits(store.create(name, role, maps, UNTIL, keep_admin)[0])
+        if action == "narrow":
+            return traits(store.narrow(found[-1] if found else name, {"role": role, "maps": maps}, keep_admin))
+        if action == "revoke":
+            return traits(store.revoke(name, keep_admin))
+        if found:
+            store.note_uses(dict.fromkeys(found, UNTIL))
+    except Fault as error:
+        return type(error)
+    return None
+
+
+def traits(key: Key) -> tuple[object, ...]:
+    """A key without what is made at random."""
+    return key.name, key.role, key.maps, key.expires_at, key.revoked_at is None, key.last_used_at
+
+
+@pytest.mark.cluster
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(STEPS)
+def test_random_changes_do_the_same_in_both_databases(
+    database: SharedDatabase, tmp_path_factory: pytest.TempPathFactory, steps: list[Step]
+) -> None:
+    folder = tmp_path_factory.mktemp("keys")
+    database.change("forget all keys", Statement(delete(KEYS)))
+    shared, file = Keys.of(folder, database), Keys.of(folder)
+    for step in steps:
+        assert outcome(shared, step) == outcome(file, step), step
+        assert [traits(key) for key in shared.all()] == [traits(key) for key in file.all()]
+        assert shared.exists() == file.exists()
+
+
 # A running service
 
 
-def test_who_is_let_in(store: KeyStore) -> None:
+def test_who_is_let_in(store: Keys) -> None:
     _, token = store.create("robot", "query", ["lab"])
     running = ring(store)
     principal = running.principal(bearer(token))
@@ -186,7 +282,7 @@ def test_who_is_let_in(store: KeyStore) -> None:
             running.principal(bearer(wrong))
 
 
-def test_a_running_service_learns_of_every_change(store: KeyStore) -> None:
+def test_a_running_service_learns_of_every_change(store: Keys) -> None:
     running = Keyring(store)
     running.look()
     assert not running.demanded
@@ -206,24 +302,24 @@ def test_a_running_service_learns_of_every_change(store: KeyStore) -> None:
     running.close()
 
 
-def test_a_file_that_is_away_for_a_moment_and_for_good(store: KeyStore) -> None:
-    _, token = store.create("ann", "query")
+def test_a_file_that_is_away_for_a_moment_and_for_good(file_store: Keys, tmp_path: Path) -> None:
+    _, token = file_store.create("ann", "query")
     clock = Clock(0.0)
-    running = ring(store, monotonic=clock)
-    aside = store.path.with_name("aside")
-    store.path.rename(aside)
+    running = ring(file_store, monotonic=clock)
+    path, aside = tmp_path / FILE, tmp_path / "aside"
+    path.rename(aside)
     running.look()
     assert running.principal(bearer(token)).name == "ann", "another process may be putting it in place"
     clock.now += GRACE_SECONDS
     running.look()
     with pytest.raises(KeysUnreadable, match="is gone"):
         running.principal(bearer(token))
-    aside.rename(store.path)
+    aside.rename(path)
     running.look()
     assert running.principal(bearer(token)).name == "ann"
 
 
-def test_a_disk_that_does_not_answer_ends_what_nobody_can_check(store: KeyStore) -> None:
+def test_a_disk_that_does_not_answer_ends_what_nobody_can_check(store: Keys) -> None:
     _, token = store.create("ann", "query")
     clock = Clock(0.0)
     running = Keyring(store, monotonic=clock)
@@ -235,7 +331,7 @@ def test_a_disk_that_does_not_answer_ends_what_nobody_can_check(store: KeyStore)
         running.principal(bearer(token))
 
 
-def test_a_key_expires_and_no_clock_brings_it_back(store: KeyStore) -> None:
+def test_a_key_expires_and_no_clock_brings_it_back(store: Keys) -> None:
     made = datetime.now(UTC)
     _, token = store.create("ann", "query", None, made + timedelta(days=30))
     _, lasting = store.create("bob", "query")
@@ -252,7 +348,7 @@ def test_a_key_expires_and_no_clock_brings_it_back(store: KeyStore) -> None:
     assert running.principal(bearer(lasting))
 
 
-def test_a_clock_that_is_set_back_prolongs_no_use(store: KeyStore) -> None:
+def test_a_clock_that_is_set_back_prolongs_no_use(store: Keys) -> None:
     made = datetime.now(UTC)
     _, token = store.create("ann", "query", None, made + timedelta(days=30))
     long_ago = made.timestamp() - 10 * 365 * 86400
@@ -271,7 +367,7 @@ def test_a_clock_that_is_set_back_prolongs_no_use(store: KeyStore) -> None:
         running.principal(bearer(token))
 
 
-def test_last_uses_are_written_now_and_then(store: KeyStore) -> None:
+def test_last_uses_are_written_now_and_then(store: Keys) -> None:
     _, token = store.create("ann", "query")
     before = datetime.now(UTC)
     monotonic = Clock(0.0)

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 import pytest
+from sqlalchemy import column, select, table
 
-from service.access.gate import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
-from service.access.keys import KeyStore
+from core.errors import StorageFailure
+from core.ledger import Statement
+from service.access.keys import Keys
+from service.access.rates import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
 from service.app.application import create_app
 from service.errors.faults import RateExceeded
 from service.settings import Settings
 from tests.service.access.test_keys import Clock
 from tests.service.server import assert_problem
+from tests.service.wire import eventually
+
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+
+_NAMES = Statement(select(column("name")).select_from(table("rates")).order_by(column("name")))
+
+SLOW = 0.01
+"""A rate at which no test gets another token."""
 
 
 def test_a_bucket_lets_a_burst_through_and_then_its_rate() -> None:
@@ -49,7 +62,7 @@ def test_memory_is_bounded() -> None:
 
 def test_wrong_keys_of_an_address_are_throttled() -> None:
     clock = Clock(0.0)
-    rates = Rates(0.0, 1, clock)
+    rates = Rates(0.0, 1, clock=clock)
     for _ in range(FAILURE_BURST):
         rates.admit_failure("10.0.0.1")
     with pytest.raises(RateExceeded):
@@ -65,9 +78,50 @@ def test_what_counts_as_one_caller() -> None:
     assert network_of(None) == network_of("") and network_of("/run/socket") == "/run/socket"
 
 
+@pytest.mark.cluster
+def test_what_one_service_lets_through_the_other_holds_back(database: SharedDatabase) -> None:
+    one, other = (Buckets(SLOW, 10, kind="request") for _ in range(2))
+    assert [one.take("ann") for _ in range(10)] == [0.0] * 10 and one.take("ann") > 0
+    one.exchange(database)
+    assert one.take("ann") == pytest.approx(1 / SLOW, rel=0.2)
+    assert other.take("ann") == 0.0, "it has not heard of it yet"
+    other.exchange(database)
+    assert other.take("ann") == pytest.approx(2 / SLOW, rel=0.2), "what was too much is held back"
+    assert other.take("bob") == 0.0
+    for _ in range(3):  # what is taken meanwhile counts, too, and nothing counts twice
+        other.take("bob")
+        other.exchange(database)
+    one.take("bob")
+    one.exchange(database)
+    assert [one.take("bob") for _ in range(6)] == [0.0] * 5 + [pytest.approx(1 / SLOW, rel=0.2)]
+
+
+@pytest.mark.cluster
+def test_services_exchange_both_limits_by_themselves(database: SharedDatabase) -> None:
+    with Rates(SLOW, 5, database) as one, Rates(SLOW, 5, database) as other:
+        for _ in range(5):
+            one.admit("ann")
+        assert eventually(lambda: other.wait("ann") > 1.5 / SLOW), "more than what it let through itself"
+        one.admit_failure("10.0.0.1")
+        found = [("failure 10.0.0.1",), ("request ann",)]
+        assert eventually(lambda: database.execute("list the buckets", _NAMES) == found)
+
+
+@pytest.mark.cluster
+def test_without_the_database_each_service_keeps_to_the_limit_alone() -> None:
+    from service.shared.database import SharedDatabase
+
+    away = SharedDatabase("postgresql://placerec@127.0.0.1:9/postgres")
+    alone = Buckets(SLOW, 3, kind="request")
+    assert [alone.take("ann") for _ in range(4)] == [0.0] * 3 + [pytest.approx(1 / SLOW, rel=0.2)]
+    with pytest.raises(StorageFailure):
+        alone.exchange(away)
+    assert alone._taken == {"ann": 3}, "it is added later"
+
+
 @pytest.mark.anyio
 async def test_a_key_over_its_rate_learns_when_to_come_again(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path)
+    store = Keys.of(tmp_path)
     (_, first), (_, second) = store.create("ann", "query"), store.create("bob", "query")
     app = create_app(Settings(host="127.0.0.1", data_dir=tmp_path, rate_per_key=0.25, rate_burst=3))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)

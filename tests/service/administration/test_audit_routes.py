@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.administration import audit_routes
 from service.administration.audit_lines import lines_of_files
 from service.administration.audit_routes import AuditParameters
@@ -23,7 +23,7 @@ from tests.service.wire import eventually
 def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A service with keys and a file for its trail."""
     folder = tmp_path_factory.mktemp("audited")
-    store = KeyStore(folder / "data")
+    store = Keys.of(folder / "data")
     _, token = store.create("ops", "admin")
     running = Server(folder, settings={"audit_file": folder / "audit.jsonl"}, key=token).wait()
     yield running

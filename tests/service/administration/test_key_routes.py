@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.access.roles import TOKEN
 from tests.service.server import Server, assert_problem
 from tests.service.wire import eventually
@@ -22,7 +22,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A service with one key, of its administrator."""
     folder = tmp_path_factory.mktemp("keyed")
     (folder / "data").mkdir()
-    _, token = KeyStore(folder / "data").create("ops", "admin")
+    _, token = Keys.of(folder / "data").create("ops", "admin")
     running = Server(folder, settings={"audit_file": folder / "audit.jsonl"}, key=token).wait()
     running.create_map("lab")
     running.create_map("yard")
@@ -226,7 +226,7 @@ def test_the_first_key_of_an_open_service_turns_keys_on(tmp_path: Path) -> None:
             gone = ops.delete(f"/v1/keys/{made['id']}", params={"lock_out": "true"})
             assert gone.json()["state"] == "revoked"
             assert_problem(ops.get("/v1/keys"), 401, "key-refused")
-        assert KeyStore(server.data_dir).create("again", "admin")[0].name == "again", "the command line still can"
+        assert Keys.of(server.data_dir).create("again", "admin")[0].name == "again", "the command line still can"
     finally:
         assert server.stop() == 0
 
@@ -252,7 +252,7 @@ def test_other_machines_cannot_create_the_first_key(tmp_path: Path) -> None:
         body = {"name": "ops", "role": "admin"}
         assert_problem(server.client.post("/v1/keys", json=body), 403, "first-key-local")
         assert server.client.get("/v1/maps").status_code == 200
-        _, token = KeyStore(server.data_dir).create("ops", "admin")
+        _, token = Keys.of(server.data_dir).create("ops", "admin")
         with asking(server, token) as ops:
             assert eventually(lambda: ops.get("/v1/key").json().get("keys_needed") is True)
             assert ops.post("/v1/keys", json={"name": "other", "role": "query"}).status_code == 201

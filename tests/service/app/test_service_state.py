@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -32,7 +32,7 @@ def test_the_state_at_a_glance(server: Server, traverse: str) -> None:
 
 @pytest.mark.thorough
 def test_who_only_queries_sees_no_memory_and_no_settings(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path / "data")
+    store = Keys.of(tmp_path / "data")
     _, admin = store.create("ops", "admin")
     others = [store.create("robot", "query")[1], store.create("of-lab", "admin", ["lab"])[1]]
     server = Server(tmp_path, key=admin).wait()

@@ -10,7 +10,7 @@ import pytest
 import typer.main
 
 from placerec_client.problems import KeyNeeded
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.access.roles import TOKEN
 from service.commands import application
 from service.commands.connection.client import Refused, failures
@@ -48,7 +48,7 @@ def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Pa
     assert (
         "neither a span" in placerec("keys", "create", "ann", "--role", "query", "--expires", "soon", status=1).stderr
     )
-    KeyStore(tmp_path / "data").create("ann", "query")
+    Keys.of(tmp_path / "data").create("ann", "query")
     assert "already" in placerec("keys", "create", "ann", "--role", "query", status=1).stderr
     (tmp_path / "data" / "keys.sqlite").write_bytes(b"no database")
     for words in (("list",), ("delete", "ann"), ("create", "bob", "--role", "query")):

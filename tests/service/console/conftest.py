@@ -11,7 +11,7 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Response, expect, sync_playwright
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.service.console import world
 from tests.service.server import Server
 
@@ -103,7 +103,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="package")
 def keys(folder: Path) -> dict[str, str]:
     """A key of each role for all maps, and one of the role query for a map that is not there."""
-    store = KeyStore(folder / "data")
+    store = Keys.of(folder / "data")
     made = {role: store.create(f"{role}-key", role)[1] for role in ("admin", "enrol", "query")}
     return made | {"stranger": store.create("stranger-key", "query", ["elsewhere"])[1]}
 

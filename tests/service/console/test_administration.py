@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import APIResponse, Route, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.service.console.conftest import Operator, Visit
 from tests.service.console.world import LAB, frame
 from tests.service.map_jobs import wait_until
@@ -168,7 +168,7 @@ def test_a_key_can_be_typed_again_after_the_service_refused_to_look_at_it(
 
 
 def test_another_key_is_requested_after_a_revocation(visit: Visit, keyed: Server) -> None:
-    key, text = KeyStore(keyed.data_dir).create("soon-gone", "query")
+    key, text = Keys.of(keyed.data_dir).create("soon-gone", "query")
     operator = visit(None)
     operator.foresee("401")
     page = operator.page
@@ -176,7 +176,7 @@ def test_another_key_is_requested_after_a_revocation(visit: Visit, keyed: Server
     page.get_by_label("Key").fill(text)
     page.get_by_role("button", name="Use the key").click()
     page.get_by_role("link", name=LAB, exact=True).wait_for()
-    KeyStore(keyed.data_dir).revoke(key.id)
+    Keys.of(keyed.data_dir).revoke(key.id)
     there = {"Authorization": f"Bearer {text}"}
     wait_until(lambda: keyed.client.get("/v1/maps", headers=there).status_code == 401)
     page.get_by_role("link", name="Jobs").click()

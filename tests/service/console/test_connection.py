@@ -11,7 +11,7 @@ from contextlib import suppress
 import pytest
 from playwright.sync_api import expect
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.service.console.conftest import Visit, given_key
 from tests.service.console.world import frame
 from tests.service.server import Server
@@ -70,7 +70,7 @@ class Cable:
 def slow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, str]]:
     """A service that lets a key send five requests a second, and its key."""
     folder = tmp_path_factory.mktemp("slow")
-    _, key = KeyStore(folder / "data").create("ann", "admin")
+    _, key = Keys.of(folder / "data").create("ann", "admin")
     server = Server(folder, {"rate_per_key": 10, "rate_burst": 10}, key=key).wait()
     server.create_map("lab")
     for number in range(15):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.events.listening import listening
 from tests.service.map_jobs import asked, finished, wait_until
@@ -271,7 +271,7 @@ class Keyed:
 
     def __init__(self, folder: Path) -> None:
         install_coarse_encoder(folder / "models")
-        self.store = KeyStore(folder / "data")
+        self.store = Keys.of(folder / "data")
         _, self.admin = self.store.create("ann", "admin")
         self.robot_key, self.robot = self.store.create("robot", "query", ["lab"])
         _, self.operator = self.store.create("eve", "enrol", ["lab"])

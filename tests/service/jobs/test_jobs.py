@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,50 +13,36 @@ from typing import Any
 
 import pytest
 
-from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, UnknownMap
+from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, UnknownMap
+from core.ledger.sqlite import SqliteLedger
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
 from service.jobs.context import JobContext
+from service.jobs.file import FILE
 from service.jobs.jobs import Jobs
-from service.jobs.records import FILE, Job
-
-Kinds = Mapping[str, Callable[[JobContext], Mapping[str, Any]]]
-
-
-@contextmanager
-def running(folder: Path, kinds: Kinds | None = None, **limits: Any) -> Iterator[Jobs]:
-    jobs = Jobs(folder, **limits)
-    for kind, work in (kinds or {}).items():
-        jobs.register(kind, work)
-    jobs.start()
-    try:
-        yield jobs
-    finally:
-        jobs.close(timeout=30)
+from service.jobs.rows import TABLES
+from service.shared.database import SharedDatabase
+from tests.service.jobs.services import Gate, Kinds, Running, Service, end_of, running_alone
 
 
-def end_of(jobs: Jobs, job: Job) -> Job:
-    until = time.monotonic() + 60
-    while not (found := jobs.get(job.id)).ended:
-        assert time.monotonic() < until, found
-        time.sleep(0.005)
-    return found
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+def running(request: pytest.FixtureRequest) -> Running:
+    """Runs the jobs of a service that is alone, or of one that could share them."""
+    if request.param == "sqlite":
+        return running_alone
+    database: SharedDatabase = request.getfixturevalue("database")
+
+    @contextmanager
+    def running_shared(folder: Path, kinds: Kinds | None = None, **limits: Any) -> Iterator[Jobs]:
+        service = Service(database.address, folder, kinds or {}, **limits).start()
+        try:
+            yield service.jobs
+        finally:
+            service.close()
+
+    return running_shared
 
 
-class Gate:
-    """Work that says when it has begun, and goes on when it is let."""
-
-    def __init__(self) -> None:
-        self.begun, self.open = threading.Event(), threading.Event()
-
-    def __call__(self, context: JobContext) -> dict[str, Any]:
-        context.progress(1, 4, "at the gate")
-        self.begun.set()
-        while not self.open.is_set():
-            context.pause(0.01)
-        return {"passed": context.arguments}
-
-
-def test_a_job_runs_and_is_remembered(tmp_path: Path) -> None:
+def test_a_job_runs_and_is_remembered(running: Running, tmp_path: Path) -> None:
     with running(tmp_path) as jobs:
         job = jobs.submit("sum", "lab", lambda _: {"sum": 3})
         assert job.state == "queued" and job.map_id == "lab"
@@ -66,7 +53,7 @@ def test_a_job_runs_and_is_remembered(tmp_path: Path) -> None:
         assert jobs.get(job.id) == ended
 
 
-def test_a_failed_job_says_why_but_hides_internal_errors(tmp_path: Path) -> None:
+def test_a_failed_job_says_why_but_hides_internal_errors(running: Running, tmp_path: Path) -> None:
     def refuse(_: JobContext) -> dict[str, Any]:
         raise UnknownMap("There is no map 'lab'.")
 
@@ -85,7 +72,7 @@ def test_a_failed_job_says_why_but_hides_internal_errors(tmp_path: Path) -> None
     assert "secret" not in str(broken)
 
 
-def test_jobs_take_turns_and_the_queue_is_bounded(tmp_path: Path) -> None:
+def test_jobs_take_turns_and_the_queue_is_bounded(running: Running, tmp_path: Path) -> None:
     gate, order = Gate(), list[int]()
 
     def noting(number: int) -> Callable[[JobContext], dict[str, Any]]:
@@ -107,7 +94,7 @@ def test_jobs_take_turns_and_the_queue_is_bounded(tmp_path: Path) -> None:
     assert order == [0, 1]
 
 
-def test_two_workers_never_work_on_one_map(tmp_path: Path) -> None:
+def test_two_workers_never_work_on_one_map(running: Running, tmp_path: Path) -> None:
     first, other = Gate(), Gate()
     with running(tmp_path, workers=2) as jobs:
         jobs.submit("gate", "lab", first)
@@ -120,7 +107,7 @@ def test_two_workers_never_work_on_one_map(tmp_path: Path) -> None:
         other.open.set()
 
 
-def test_cancelling(tmp_path: Path) -> None:
+def test_cancelling(running: Running, tmp_path: Path) -> None:
     gate, undone = Gate(), threading.Event()
 
     def careful(context: JobContext) -> Mapping[str, Any]:
@@ -144,7 +131,7 @@ def test_cancelling(tmp_path: Path) -> None:
             jobs.cancel("none")
 
 
-def test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start(tmp_path: Path) -> None:
+def test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start(running: Running, tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path, {"gate": gate}) as jobs:
         job = jobs.submit("gate", "lab", arguments={"to": "hall"})
@@ -161,7 +148,7 @@ def test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start(tmp_path: Path
         assert failed.problem["type"] == "urn:placerec:problem:job-lost"
 
 
-def test_a_job_that_cannot_be_resumed_fails_when_the_service_stops(tmp_path: Path) -> None:
+def test_a_job_that_cannot_be_resumed_fails_when_the_service_stops(running: Running, tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
@@ -172,7 +159,7 @@ def test_a_job_that_cannot_be_resumed_fails_when_the_service_stops(tmp_path: Pat
         assert failed.problem["type"] == "urn:placerec:problem:job-lost"
 
 
-def test_a_resumed_job_has_its_notes_and_is_still_cancelled(tmp_path: Path) -> None:
+def test_a_resumed_job_has_its_notes_and_is_still_cancelled(running: Running, tmp_path: Path) -> None:
     begun = threading.Event()
     seen: list[tuple[Mapping[str, Any], bool]] = []
 
@@ -194,7 +181,7 @@ def test_a_resumed_job_has_its_notes_and_is_still_cancelled(tmp_path: Path) -> N
     assert seen == [({}, False), ({"plan": ["a", "b"]}, True)]
 
 
-def test_the_history_is_bounded(tmp_path: Path) -> None:
+def test_the_history_is_bounded(running: Running, tmp_path: Path) -> None:
     with running(tmp_path, history=3) as jobs:
         made = [end_of(jobs, jobs.submit("note", None, lambda _: {})) for _ in range(6)]
         assert [job.id for job in jobs.all()] == [job.id for job in made[3:]]
@@ -205,7 +192,7 @@ def test_the_history_is_bounded(tmp_path: Path) -> None:
         assert jobs.submit("note", None, lambda _: {}).number == 7
 
 
-def test_progress_grows_and_its_versions_differ(tmp_path: Path) -> None:
+def test_progress_grows_and_its_versions_differ(running: Running, tmp_path: Path) -> None:
     gate, versions = Gate(), set()
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
@@ -220,71 +207,111 @@ def test_progress_grows_and_its_versions_differ(tmp_path: Path) -> None:
 
 
 @pytest.mark.anyio
-async def test_watchers_are_bounded(tmp_path: Path) -> None:
+async def test_watchers_are_bounded(running: Running, tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path, most_watchers=1) as jobs:
         job = jobs.submit("gate", None, gate)
-        with jobs.watching(job.id) as changed:
-            with pytest.raises(TooManyWatchers), jobs.watching(job.id):
+        with jobs.watchers.watching(job.id) as changed:
+            with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
                 pass
             gate.open.set()
             await changed.wait()
-        with jobs.watching(job.id):
+        with jobs.watchers.watching(job.id):
             pass
 
 
 def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(b"this is no database" * 100)
-    with running(tmp_path) as jobs:
+    with running_alone(tmp_path) as jobs:
         assert jobs.all() == []
         assert end_of(jobs, jobs.submit("note", None, lambda _: {})).state == "succeeded"
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
 
 
 @pytest.mark.parametrize(
-    ("version", "refusal"), [(99, DataDirectoryTooNew), (1, DataDirectoryTooOld), (2, DataDirectoryTooOld)]
+    ("version", "refusal"),
+    [(TABLES.version + 1, DataDirectoryTooNew), (1, DataDirectoryTooOld), (TABLES.version - 1, DataDirectoryTooOld)],
 )
 def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refusal: type[Exception]) -> None:
-    import sqlite3
-
-    with running(tmp_path):
+    with running_alone(tmp_path):
         pass
     connection = sqlite3.connect(tmp_path / FILE)
     connection.execute(f"PRAGMA user_version = {version}")
     connection.close()
     before = (tmp_path / FILE).read_bytes()
     with pytest.raises(refusal, match=re.escape(f"{tmp_path / FILE} was written")):
-        Jobs(tmp_path)
+        Jobs.of_directory(tmp_path)
     assert (tmp_path / FILE).read_bytes() == before
 
 
-def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sqlite3
+def driver_of(jobs: Jobs) -> sqlite3.Connection:
+    """The connection to the file of jobs, by which it can be made to refuse writes."""
+    ledger = jobs._table._ledger
+    assert isinstance(ledger, SqliteLedger)
+    return ledger._connection.driver
 
+
+def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path) -> None:
     gate = Gate()
-    with running(tmp_path) as jobs:
-        job = jobs.submit("gate", None, gate)
+    kinds: Kinds = {"note": lambda _: {}}
+    with running_alone(tmp_path, kinds) as jobs:
+        job, waiting = jobs.submit("gate", None, gate), jobs.submit("note", None)
         assert gate.begun.wait(60)
+        driver_of(jobs).execute("PRAGMA query_only = ON")
+        with pytest.raises(StorageFailure):
+            jobs.submit("note", None)
+        with pytest.raises(StorageFailure):
+            jobs.cancel(job.id)
+        gate.open.set()
+        ended = end_of(jobs, job)
+        assert ended.state == "succeeded" and not ended.cancelling
+        assert [found.id for found in jobs.all()] == [job.id, waiting.id], "what was refused is not there"
+        assert jobs.all()[0] == ended
+        driver_of(jobs).execute("PRAGMA query_only = OFF")
+        assert end_of(jobs, waiting).state == "succeeded"
+    with running_alone(tmp_path, kinds) as jobs:
+        assert jobs.get(job.id) == ended, "its end was written when the disk took it"
 
-        def refuse(_job: Job) -> None:
-            raise sqlite3.OperationalError("disk I/O error")
 
-        with monkeypatch.context() as broken:
-            broken.setattr(jobs._records, "put", refuse)
-            broken.setattr(jobs._records, "update", refuse)
-            with pytest.raises(sqlite3.OperationalError):
-                jobs.submit("note", None, lambda _: {})
-            gate.open.set()
-            assert end_of(jobs, job).state == "succeeded"
-        assert [found.id for found in jobs.all()] == [job.id], "what was refused is not there"
+def test_jobs_are_resumed_when_the_disk_takes_it_at_last(tmp_path: Path) -> None:
+    gate = Gate()
+    with running_alone(tmp_path, {"gate": gate}) as jobs:
+        job = jobs.submit("gate", "lab")
+        assert gate.begun.wait(60)
+        driver_of(jobs).execute("PRAGMA query_only = ON")  # it stays a running one
+    gate.open.set()
+    jobs = Jobs.of_directory(tmp_path)
+    jobs.register("gate", gate)
+    driver_of(jobs).execute("PRAGMA query_only = ON")
+    jobs.start()
+    assert jobs.get(job.id).state == "running"
+    driver_of(jobs).execute("PRAGMA query_only = OFF")
+    ended = end_of(jobs, job)
+    assert (ended.state, ended.attempt) == ("succeeded", 2)
+    jobs.close()
 
 
-def test_a_job_of_an_unknown_kind_fails_at_the_start(tmp_path: Path) -> None:
+def test_notes_that_the_disk_refuses_fail_the_job(tmp_path: Path) -> None:
+    with running_alone(tmp_path) as jobs:
+
+        def noting(context: JobContext) -> Mapping[str, Any]:
+            driver_of(jobs).execute("PRAGMA query_only = ON")
+            try:
+                context.remember(step=1)
+            finally:
+                driver_of(jobs).execute("PRAGMA query_only = OFF")
+            return {}
+
+        failed = end_of(jobs, jobs.submit("note", None, noting))
+        assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:storage-failure"
+
+
+def test_a_job_of_an_unknown_kind_fails_at_the_start(running: Running, tmp_path: Path) -> None:
     gate, discarded = Gate(), list[str]()
-    with running(tmp_path, {"gate": gate}) as jobs:
+    with running(tmp_path, {"gate": gate}, shared_maps=False) as jobs:
         job = jobs.submit("gate", "lab", arguments={"form": "f"})
         assert gate.begun.wait(60)
-    with running(tmp_path, {"other": gate}) as jobs:
+    with running(tmp_path, {"other": gate}, shared_maps=False) as jobs:
         failed = jobs.get(job.id)
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:job-lost" and "gate" in failed.problem["detail"]
@@ -293,10 +320,8 @@ def test_a_job_of_an_unknown_kind_fails_at_the_start(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["a record", "the file"])
 def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) -> None:
-    import sqlite3
-
     gate = Gate()
-    with running(tmp_path, {"gate": gate}) as jobs:
+    with running_alone(tmp_path, {"gate": gate}) as jobs:
         done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
         job = jobs.submit("gate", "lab", arguments={})
         assert gate.begun.wait(60)
@@ -308,7 +333,7 @@ def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) ->
         connection.execute("PRAGMA user_version = 0")
     connection.commit()
     connection.close()
-    with running(tmp_path, {"gate": gate}) as jobs:
+    with running_alone(tmp_path, {"gate": gate}) as jobs:
         assert jobs.get(done.id).result == {"kept": True}
         lost = jobs.get(job.id)
         assert lost.state == "failed" and lost.problem is not None
@@ -320,29 +345,26 @@ def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) ->
         assert end_of(jobs, jobs.submit("gate", "lab", arguments={})).state == "succeeded"
 
 
-def test_the_files_of_a_job_are_discarded_however_it_ends(tmp_path: Path) -> None:
+def test_the_files_of_a_job_are_discarded_however_it_ends(running: Running, tmp_path: Path) -> None:
     gate, discarded = Gate(), list[str]()
 
     def refuse(_: JobContext) -> dict[str, Any]:
         raise UnknownMap("There is no map 'lab'.")
 
-    jobs = Jobs(tmp_path)
-    kinds: Kinds = {"gate": gate, "refuse": refuse}
-    for kind, work in kinds.items():
-        jobs.register(kind, work, lambda job: discarded.append(job.id))
-    jobs.start()
-    first, second, third = (jobs.submit(kind, None, arguments={}) for kind in ("gate", "refuse", "gate"))
-    assert gate.begun.wait(60)
-    jobs.cancel(third.id)
-    assert discarded == [third.id], "cancelled before it began"
-    gate.open.set()
-    end_of(jobs, first)
-    end_of(jobs, second)
-    jobs.close(5)
+    with running(tmp_path) as jobs:
+        for kind, work in (("gate", gate), ("refuse", refuse)):
+            jobs.register(kind, work, lambda job: discarded.append(job.id))
+        first, second, third = (jobs.submit(kind, None, arguments={}) for kind in ("gate", "refuse", "gate"))
+        assert gate.begun.wait(60)
+        jobs.cancel(third.id)
+        assert discarded == [third.id], "cancelled before it began"
+        gate.open.set()
+        end_of(jobs, first)
+        end_of(jobs, second)
     assert sorted(discarded) == sorted([first.id, second.id, third.id])
 
 
-def test_a_job_fails_if_its_map_was_replaced(tmp_path: Path) -> None:
+def test_a_job_fails_if_its_map_was_replaced(running: Running, tmp_path: Path) -> None:
     from core.storage import Atlas
     from service.jobs.context import creation_time
 
@@ -368,7 +390,9 @@ def test_a_job_fails_if_its_map_was_replaced(tmp_path: Path) -> None:
 # Time slices
 
 
-def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_jobs_give_way_to_those_of_other_maps_in_turn(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("service.jobs.context.SLICE_SECONDS", 0.0)
     order, ready = list[str](), threading.Event()
 
@@ -389,7 +413,9 @@ def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monke
     assert order.index("ya0") < order.index("xa2") and order.index("xa1") < order.index("ya2"), order
 
 
-def test_a_job_that_has_given_way_is_cancelled_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_that_has_given_way_is_cancelled_at_once(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("service.jobs.context.SLICE_SECONDS", 0.0)
     gate, ready = Gate(), threading.Event()
 

@@ -6,11 +6,16 @@ from pathlib import Path
 
 import httpx
 import pytest
+from sqlalchemy import func, select, text
 
-from service.access.keys import KeyStore
-from service.queries import given_answers
-from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame, RecentAnswers
+from core.errors import StorageFailure
+from core.ledger import Statement
+from service.access.keys import Keys
+from service.queries import recent_answers
+from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame
+from service.queries.recent_answers import MOST_OF_MAP, TABLES, RecentAnswers
 from service.queries.schemas import QueryAnswer
+from tests.core.ledger.conftest import OpenLedger
 from tests.service.scenes import blank, encoded, jpeg, stranger
 from tests.service.server import Server, assert_problem
 
@@ -106,7 +111,7 @@ def test_a_new_map_of_the_same_name_has_no_answers(server: Server, map_id: str) 
 
 @pytest.mark.thorough
 def test_only_admins_see_who_asked(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path / "data")
+    store = Keys.of(tmp_path / "data")
     _, admin = store.create("ops", "admin")
     _, robot = store.create("robot", "query", ["lab"])
     server = Server(tmp_path, key=admin).wait()
@@ -142,8 +147,8 @@ ANSWER = QueryAnswer(
 
 
 def test_the_answers_of_all_maps_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(given_answers, "MOST_OF_MAP", 10)
-    monkeypatch.setattr(given_answers, "MOST", 25)
+    monkeypatch.setattr(recent_answers, "MOST_OF_MAP", 10)
+    monkeypatch.setattr(recent_answers, "MOST", 25)
     kept = RecentAnswers()
     maps: list[MapKey] = [(f"map-{number}", "then") for number in range(4)]
     for one in (maps[0], maps[1], maps[0]):
@@ -157,3 +162,39 @@ def test_the_answers_of_all_maps_together_are_bounded(monkeypatch: pytest.Monkey
         kept.add(maps[3], GivenAnswer.of(ANSWER, QueriedFrame()))
     assert [len(kept.of_map(one)) for one in maps] == [0, 0, 6, 10]
     assert kept._count == sum(len(kept.of_map(one)) for one in maps)
+
+
+def test_services_share_the_latest_answers_which_are_bounded(
+    open_ledger: OpenLedger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger = open_ledger(TABLES)
+    one, other = RecentAnswers(ledger), RecentAnswers(ledger)
+    for number in range(MOST_OF_MAP + 20):
+        (one, other)[number % 2].add(("lab", "2026"), GivenAnswer.of(ANSWER, QueriedFrame(number=number)))
+    other.add(("hall", "2026"), GivenAnswer.of(ANSWER, QueriedFrame("front", "s-1", 7)))
+    other.flush()
+    stored = one.of_map(("lab", "2026"))
+    assert len(stored) == MOST_OF_MAP and {answer.reason for answer in stored} == {ANSWER.reason}
+    assert [answer.frame for answer in one.of_map(("hall", "2026"))] == [QueriedFrame("front", "s-1", 7)]
+    assert ledger.execute("count", COUNT) == [(MOST_OF_MAP + 1,)]
+    monkeypatch.setattr(recent_answers, "MOST", 40)
+    other.add(("hall", "2026"), GivenAnswer.of(ANSWER, QueriedFrame()))
+    assert len(other.of_map(("hall", "2026"))) == 1, "the earlier one was among the oldest of all"
+    assert ledger.execute("count", COUNT) == [(40,)]
+
+
+def test_answers_wait_in_memory_while_the_ledger_refuses(open_ledger: OpenLedger) -> None:
+    ledger = open_ledger(TABLES)
+    waiting = RecentAnswers(ledger)
+    ledger.execute("remove", REMOVE)
+    for number in range(3):
+        waiting.add(("lab", "2026"), GivenAnswer.of(ANSWER, QueriedFrame(number=number)))
+        with pytest.raises(StorageFailure):
+            waiting.flush()
+    ledger.execute("restore", RESTORE)
+    assert [answer.frame.number for answer in waiting.of_map(("lab", "2026"))] == [2, 1, 0]
+
+
+COUNT = Statement(select(func.count()).select_from(TABLES.metadata.tables["answers"]))
+REMOVE = Statement(text("ALTER TABLE answers RENAME TO away"))
+RESTORE = Statement(text("ALTER TABLE away RENAME TO answers"))

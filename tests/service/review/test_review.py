@@ -16,7 +16,7 @@ import pytest
 
 from core.maps import MapSettings, ReviewSetting
 from core.storage import Atlas
-from service.access.keys import KeyStore
+from service.access.keys import Keys
 from service.engine.review_keeper import MOST_WAITING, ReviewKeeper
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.map_jobs import finished
@@ -268,7 +268,7 @@ def test_labels_calibrate_the_map(reviewed: Server) -> None:
 @pytest.mark.thorough
 def test_review_needs_the_role_enrol(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
-    store = KeyStore(tmp_path / "data")
+    store = Keys.of(tmp_path / "data")
     _, admin = store.create("ann", "admin")
     _, robot = store.create("robot", "query", ["lab"])
     _, operator = store.create("eve", "enrol", ["lab"])

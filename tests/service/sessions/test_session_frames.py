@@ -10,29 +10,36 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 
 from core.errors import StorageFailure
+from core.ledger import Statement
 from core.maps import Map, MapSettings
 from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
+from service.errors.faults import SessionExpired, UnknownSession
 from service.places.enrolment import FrameToEnrol, enrol
+from service.sessions import table as tables
 from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
-from service.sessions.sessions import Session
+from service.sessions.session import Session
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
+from tests.service.sessions.test_session_table import pass_by as shift
 
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def runtime(tmp_path: Path) -> Iterator[Runtime]:
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+def runtime(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Runtime]:
+    """A service whose sessions are in its data directory, or in PostgreSQL."""
     install_coarse_encoder(tmp_path / "models")
-    running = Runtime(Settings(data_dir=tmp_path / "data", encoder=COARSE), Metrics())
+    database = request.getfixturevalue("database") if request.param == "postgresql" else None
+    running = Runtime(Settings(data_dir=tmp_path / "data", encoder=COARSE), Metrics(), database)
     yield running
     running.jobs.close(1)
     running.statistics.close()
@@ -96,7 +103,43 @@ async def test_a_session_deleted_during_a_frame_stays_deleted(runtime: Runtime) 
     await send(runtime, map_, session, 0)
     runtime.sessions.delete(session)
     assert not runtime.sessions.save(session), "as the frame does that was under way"
-    assert runtime.sessions._store.read(session.id) is None
+    assert runtime.sessions._table.head(session.id) is None
+    with pytest.raises(UnknownSession):
+        await send(runtime, map_, session, 1)
+
+
+async def test_a_session_expires_without_frames_and_stays_so(runtime: Runtime) -> None:
+    map_ = await walked(runtime.engine)
+    idle, used = (runtime.sessions.create(map_, NewSession(expires_after=60)) for _ in range(2))
+    await send(runtime, map_, idle, 0)
+    pass_by(runtime, idle, 61)
+    for _ in range(2):
+        with pytest.raises(SessionExpired, match="No frame came"):
+            runtime.sessions.find(map_, idle.id)
+        assert [one.id for one in runtime.sessions.of_map(map_)] == [used.id]
+    pass_by(runtime, used, 59)
+    await send(runtime, map_, used, 0)
+    pass_by(runtime, used, 59)
+    assert runtime.sessions.find(map_, used.id) is used, "the last frame counts"
+
+
+def pass_by(runtime: Runtime, session: Session, seconds: float) -> None:
+    """As if the last frame of a session had come so much earlier, by the clock that counts."""
+    session.idle_since -= seconds
+    shift(runtime.sessions._ledger, session.id, seconds)
+
+
+async def test_a_damaged_belief_ends_its_session(runtime: Runtime) -> None:
+    map_ = await walked(runtime.engine)
+    session = runtime.sessions.create(map_, NewSession())
+    await send(runtime, map_, session, 0)
+    session.run = None  # as after a restart
+    damage = Statement(update(tables._TABLE).values(state=b"damaged"))
+    assert runtime.sessions._ledger.change("damage", damage) == 1
+    for _ in range(2):
+        with pytest.raises(SessionExpired, match="damaged"):
+            await send(runtime, map_, session, 1)
+    assert runtime.sessions.count() == 0 and runtime.sessions.of_map(map_) == []
 
 
 OK, REQUEST, ANSWER, AGAIN = "ok", "request lost", "answer lost", "answer lost, sent again"

@@ -12,7 +12,7 @@ from pathlib import Path
 import psycopg
 
 from service.shared.database import SharedDatabase
-from tests.core.milvus.servers import fixed_ports, postgres_server
+from tests.core.postgres.servers import fixed_ports, postgres_server
 
 
 class Postgres:
@@ -30,9 +30,11 @@ class Postgres:
     def empty(self) -> None:
         """Forget everything."""
         with psycopg.connect(self.address) as connection:
-            connection.execute("DROP SCHEMA IF EXISTS service CASCADE")
+            connection.execute("DROP SCHEMA public CASCADE")
+            connection.execute("CREATE SCHEMA public")
         database = SharedDatabase(self.address)
-        database.query("make its tables", "SELECT 1")
+        with database.connection("make its tables"):
+            pass
         database.close()
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.shared.replica import FILE
+from service.peers.replica import FILE
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -40,7 +40,7 @@ def two_services(
         shutil.copytree(prepared / "data", folder / name / "data")
         (folder / name / "data" / FILE).unlink(missing_ok=True)
         shutil.copytree(prepared / "models", folder / name / "models")
-        given = {"encoder": COARSE, "postgres": address, **settings}
+        given = {"encoder": COARSE, "database": address, **settings}
         servers.append(Server(folder / name, settings=given, key=key))
     try:
         for server in servers:

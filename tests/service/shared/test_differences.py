@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from service.peers.differences import COMMON, ReplicaDifferences
+from service.peers.replica import FILE, ServiceReplica
 from service.settings import Settings
 from service.shared.database import SharedDatabase
-from service.shared.differences import COMMON, ReplicaDifferences
-from service.shared.replica import FILE, ServiceReplica
 from tests.service.encoders import COARSE, install_two_stage_encoder
 from tests.service.server import Server
 from tests.service.sessions.test_sessions import begin
@@ -61,7 +61,7 @@ def test_a_clock_that_is_five_minutes_slow(postgres: Postgres, prepared: Path, t
         for part in ("data", "models"):
             shutil.copytree(prepared / part, tmp_path / name / part)
         (tmp_path / name / "data" / FILE).unlink(missing_ok=True)
-        servers.append(Server(tmp_path / name, {"encoder": COARSE, "postgres": postgres.address}, wrapper=wrapper))
+        servers.append(Server(tmp_path / name, {"encoder": COARSE, "database": postgres.address}, wrapper=wrapper))
     right, slow = (server.wait() for server in servers)
     until = time.monotonic() + 60
     while "PostgreSQL" not in (said := slow.client.get("/readyz").json()["checks"]["others"]):

@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
 
 from service.shared.database import SharedDatabase
-from service.shared.sessions import SessionTable
 from tests.service.encoders import COARSE
 from tests.service.server import Server, assert_problem
-from tests.service.sessions.contract import STEPS, check_records
 from tests.service.sessions.test_sessions import again, begin, post, send
 from tests.service.shared.postgres import Postgres
 from tests.service.shared.services import MAP, two_services
@@ -37,13 +34,6 @@ def services(
 def beliefs(answer: dict[str, Any]) -> dict[str, float]:
     """The probability of each place."""
     return {one["place"]["id"]: one["probability"] for one in answer["candidates"]}
-
-
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(STEPS)
-def test_contract(database: SharedDatabase, steps: list[tuple[str, str, int, bytes]]) -> None:
-    database.query("empty the table", "TRUNCATE service.sessions")
-    check_records(SessionTable(database), steps)
 
 
 def test_services_go_on_with_one_session(services: tuple[Server, Server]) -> None:
@@ -116,7 +106,7 @@ def test_a_killed_service_and_a_database_that_is_away(
             assert time.monotonic() < until
             time.sleep(0.2)
         assert "PostgreSQL" in other.client.get("/readyz").json()["checks"]["replica"]
-        late = Server(tmp_path / "one", settings={"encoder": COARSE, "postgres": postgres.address}).wait("/livez")
+        late = Server(tmp_path / "one", settings={"encoder": COARSE, "database": postgres.address}).wait("/livez")
     finally:
         postgres.server.start()
     other.wait()  # it is ready again by itself, and so is one that was started in the meantime

@@ -28,7 +28,7 @@ def servers() -> Iterator[Servers]:
 
 
 def test_a_killed_service(servers: Servers, tmp_path: Path) -> None:
-    settings = {"encoder": COARSE, "store": "milvus", "postgres": servers.postgres_address}
+    settings = {"encoder": COARSE, "vectors": "milvus", "database": servers.postgres_address}
     settings["milvus"] = servers.milvus_address
     services = []
     for name in ("one", "other"):

@@ -40,9 +40,9 @@ def test_each_refusal_is_said_and_ends_when_it_is_put_right(guarded: Guarded, tm
         shutil.copy(guarded.stranger, path)
     address = f"postgresql://robot:{PASSWORD}@{guarded.postgres_server}?sslmode=verify-full&sslrootcert={trusted[0]}"
     settings: dict[str, object] = {
-        "store": "milvus",
+        "vectors": "milvus",
         "milvus": guarded.milvus_address,
-        "postgres": address,
+        "database": address,
         "encoder": COARSE,
     }
     settings |= {"milvus_token": f"robot:{TOKEN_PASSWORD}", "milvus_certificate": trusted[1]}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.milvus.object_server import SECRET
 from tests.core.milvus.servers import Servers
+from tests.core.postgres.object_server import SECRET
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -34,7 +34,7 @@ def test_queries_go_on_without_the_object_store(servers: Servers, tmp_path: Path
     door = Door(bucket.endpoint)
     install_coarse_encoder(tmp_path / "models")
     settings = {
-        "store": "milvus", "milvus": servers.milvus_address, "postgres": servers.postgres_address, "encoder": COARSE,
+        "vectors": "milvus", "milvus": servers.milvus_address, "database": servers.postgres_address, "encoder": COARSE,
         "objects": bucket.address, "objects_endpoint": door.address, "objects_access_key": bucket.access_key,
         "objects_secret_key": SECRET,
     }  # fmt: skip

@@ -26,8 +26,8 @@ def test_robots_do_not_notice_that_a_replica_is_killed(servers: Servers, tmp_pat
     for number in range(2):
         folder = tmp_path / f"replica-{number}"
         install_coarse_encoder(folder / "models")
-        addresses = {"milvus": servers.milvus_address, "postgres": servers.postgres_address}
-        replicas.append(Server(folder, {"store": "milvus", "encoder": COARSE, **addresses}))
+        addresses = {"milvus": servers.milvus_address, "database": servers.postgres_address}
+        replicas.append(Server(folder, {"vectors": "milvus", "encoder": COARSE, **addresses}))
     for replica in replicas:
         replica.wait()
     front = tmp_path / "nginx"

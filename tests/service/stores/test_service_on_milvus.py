@@ -46,7 +46,13 @@ def place(servers: Servers, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     for name, milvus in (("service", door.address), ("other", servers.milvus_address)):
         folder = tmp_path_factory.mktemp(name)
         install_coarse_encoder(folder / "models")
-        settings = {"store": "milvus", "milvus": milvus, "milvus_token": TOKEN, "postgres": postgres, "encoder": COARSE}
+        settings = {
+            "vectors": "milvus",
+            "milvus": milvus,
+            "milvus_token": TOKEN,
+            "database": postgres,
+            "encoder": COARSE,
+        }
         services.append(Server(folder, settings))
     place = Place(services[0], services[1], door)
     services[1].wait()
@@ -90,7 +96,7 @@ def test_a_milvus_that_is_gone_at_the_start_and_later(place: Place) -> None:
 
 def test_secrets_are_shown_nowhere(place: Place) -> None:
     state = place.service.client.get("/v1/service")
-    assert state.json()["settings"]["store"] == "milvus"
+    assert state.json()["settings"]["vectors"] == "milvus"
     for text in (state.text, place.service.log_file.read_text(), place.other.log_file.read_text()):
         assert PASSWORD not in text and "a-token-to-hide" not in text
 

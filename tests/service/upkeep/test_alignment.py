@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from core.storage.counterparts import Counterparts
 from numpy.typing import NDArray
 
 from core.maps import Enrolment, Map, MapSettings
 from core.places import PlaceFields, Pose
-from core.ledger.maps.counterparts import Counterparts
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
-from service.jobs.records import Job
+from service.jobs.job import Job
 from service.upkeep import alignment
 from tests.service.encoders import COARSE
 from tests.service.engines import ENCODER, end_of, runtime_at, state_of

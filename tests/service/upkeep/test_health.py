@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.queries.statistics import FILE, map_key
+from service.queries.count_tables import FILE
+from service.queries.statistics import map_key
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.engines import runtime_at
 from tests.service.map_jobs import enrol_frames, enrol_many, wait_until, walk_frames
@@ -115,7 +116,7 @@ def test_counts_survive_a_restart(tmp_path: Path) -> None:
     enrol_many(server, "lab", 4)
     server.query("lab", jpeg(1))
     with closing(sqlite3.connect(f"file:{server.data_dir / FILE}?mode=ro", uri=True)) as written:
-        wait_until(lambda: written.execute("SELECT count(*) FROM weeks").fetchone() == (1,))
+        wait_until(lambda: written.execute("SELECT count(*) FROM week_counts").fetchone() == (1,))
     server.kill()
     server = Server(tmp_path).wait()
     assert server.client.get("/v1/maps/lab/health").json()["answers"]["queries"] == 1

@@ -13,16 +13,16 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from core.storage.transfer import Transfer
 
 from core.errors import StorageFull
 from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields
 from core.storage import Atlas
-from core.ledger.maps.transfer import Transfer
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.context import creation_time
-from service.jobs.records import Job
+from service.jobs.job import Job
 from service.upkeep import merging
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of

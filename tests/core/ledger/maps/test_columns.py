@@ -29,9 +29,7 @@ KINDS = {"metric": METRIC, "geographic": GEOGRAPHIC}
 
 
 @pytest.mark.parametrize("at_once", [2, 65_536])
-def test_columns_are_the_fields_of_the_places(
-    lab: MemoryMap, at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columns_are_the_fields_of_the_places(lab: MemoryMap, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(columns, "_AT_ONCE", at_once)
     lab.enrol([replace(frame(f"p{i}"), fields=fields) for i, fields in enumerate(FIELDS)])
     lab.forget("p0")

@@ -1,0 +1,251 @@
+"""Frames that a map stores because its answers were doubtful, and people's labels of them.
+
+A frame is stored whole or not at all.  The frames of a map are bounded by its setting: the oldest frame without a label
+goes first, then the oldest with one.  Frames have their SHA-256, and their rows a checksum.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    CheckConstraint,
+    Column,
+    MetaData,
+    PrimaryKeyConstraint,
+    Table,
+    UniqueConstraint,
+    bindparam,
+    delete,
+    func,
+    select,
+    update,
+)
+
+from core.errors import StorageFailure, UnknownFrame
+from core.ledger.maps.checksums import is_sound, sealed, sealed_columns
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.frames import ObjectReader, StoredObject, StoredPicture, read_pictures
+from core.ledger.statements import Statement, among, binary, integer, text
+from core.maps.records import ReviewSetting
+from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
+from core.maps.stored_fields import moment_text
+
+METADATA = MetaData()
+
+FRAMES = Table(
+    "review_frames", METADATA, Column("map", integer(), nullable=False), Column("number", integer(), nullable=False),
+    Column("at", text(), nullable=False), Column("digest", binary(), nullable=False),
+    Column("size", integer(), nullable=False), Column("answer", text(), nullable=False), Column("label", text()),
+    Column("object", text()), Column("seal", integer(), nullable=False), PrimaryKeyConstraint("map", "number"),
+    UniqueConstraint("map", "digest"), CheckConstraint("length(digest) = 32"), sqlite_strict=True,
+)  # fmt: skip
+# Apart from the frames, so that a listing need not read the pictures.
+_PICTURES = Table(
+    "review_pictures", METADATA, Column("map", integer(), nullable=False), Column("number", integer(), nullable=False),
+    Column("bytes", binary(), nullable=False), PrimaryKeyConstraint("map", "number"), sqlite_strict=True,
+)  # fmt: skip
+# The number of the next frame, so that none is used twice.
+_NUMBERS = Table(
+    "review_numbers", METADATA, Column("map", integer(), primary_key=True), Column("next", integer(), nullable=False),
+    sqlite_strict=True,
+)  # fmt: skip
+
+_F, _P = FRAMES.c, _PICTURES.c
+_COLUMNS = sealed_columns(FRAMES)
+_OF_MAP = _F.map == bindparam("map")
+_READ = select(*(_F[name] for name in _COLUMNS), _F.seal).where(_OF_MAP)
+_PAGE = _READ.where(_F.number < bindparam("before")).order_by(_F.number.desc()).limit(bindparam("most"))
+_PAGES = {
+    None: Statement(_PAGE),
+    True: Statement(_PAGE.where(_F.label.is_not(None))),
+    False: Statement(_PAGE.where(_F.label.is_(None))),
+}
+_LABELLED = Statement(_READ.where(_F.label.is_not(None)).order_by(_F.number))
+_ALL = Statement(_READ.order_by(_F.number))
+_FIND = Statement(_READ.where(_F.number == bindparam("number")))
+_SIZE = Statement(select(func.count(), func.coalesce(func.sum(_F.size), 0)).where(_OF_MAP))
+_BY_AGE = Statement(select(_F.number, _F.size).where(_OF_MAP).order_by(_F.label.is_not(None), _F.number))
+_PUT = Statement(
+    lambda insert: (
+        insert(FRAMES)
+        .values({name: bindparam(name) for name in ("map", *_COLUMNS, "seal")})
+        .on_conflict_do_nothing()
+        .returning(_F.number)
+    )
+)
+_LABEL = Statement(
+    update(FRAMES)
+    .where(_OF_MAP, _F.number == bindparam("which"))
+    .values(label=bindparam("new_label"), seal=bindparam("new_seal"))
+)
+_DELETE = Statement(delete(FRAMES).where(_OF_MAP, among(_F.number, "numbers")))
+_DELETE_PICTURES = Statement(delete(_PICTURES).where(_P.map == bindparam("map"), among(_P.number, "numbers")))
+_PUT_PICTURE = Statement(
+    lambda insert: insert(_PICTURES).values({name: bindparam(name) for name in ("map", "number", "bytes")})
+)
+_PICTURE = Statement(select(_P.bytes).where(_P.map == bindparam("map"), _P.number == bindparam("number")))
+_NEXT = Statement(
+    lambda insert: (
+        insert(_NUMBERS)
+        .values(map=bindparam("map"), next=2)
+        .on_conflict_do_update(index_elements=["map"], set_={"next": _NUMBERS.c.next + 1})
+        .returning(_NUMBERS.c.next - 1)
+    )
+)
+
+
+class Review(ABC):
+    """The frames of one map that are stored for review (:class:`core.maps.review.Review`).  Any thread may use it."""
+
+    objects: ObjectReader | None = None
+    """Where pictures may be that are not in the ledger."""
+
+    def __init__(self) -> None:
+        self._held: set[int] = set()
+
+    @abstractmethod
+    def _reading(self) -> AbstractContextManager[MapConnection]:
+        """A transaction that reads, and raises if the map is gone."""
+
+    @abstractmethod
+    def _writing(self) -> AbstractContextManager[MapConnection]:
+        """A transaction that writes, and raises if the map is gone."""
+
+    def _picture_to_store(self, connection: MapConnection, picture: bytes) -> StoredPicture:
+        """A picture as its row has it."""
+        return picture
+
+    def _put_object(self, stored: StoredObject, picture: bytes) -> None:
+        """Store a picture that its row names as an object, before the COMMIT."""
+        raise NotImplementedError
+
+    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
+        if len(data) > setting.most_bytes:
+            return False
+        digest = hashlib.sha256(data).digest()
+        with self._writing() as connection:
+            stored = self._picture_to_store(connection, data)
+            ((number,),) = connection.execute(_NEXT)
+            values = {
+                "number": number,
+                "at": moment_text(datetime.now(UTC)),
+                "digest": digest,
+                "size": len(data),
+                "answer": json.dumps(answer),
+                "label": None,
+                "object": stored.name if isinstance(stored, StoredObject) else None,
+            }
+            if not connection.execute(_PUT, **sealed(_COLUMNS, values)):
+                return False
+            if isinstance(stored, StoredObject):
+                self._put_object(stored, data)
+            else:
+                connection.execute(_PUT_PICTURE, number=number, bytes=data)
+            self._drop_oldest(connection, setting)
+        return True
+
+    def shrink(self, setting: ReviewSetting) -> None:
+        with self._writing() as connection:
+            self._drop_oldest(connection, setting)
+
+    def _drop_oldest(self, connection: MapConnection, setting: ReviewSetting) -> None:
+        """Drop frames, those without a label first and the oldest of these first, until the limits hold.
+
+        Those that are held stay.
+        """
+        count, size = _size(connection)
+        if not setting.allows(count, size):
+            by_age = ((int(number), int(length)) for number, length in connection.execute(_BY_AGE))
+            drop(connection, frames_to_drop(by_age, count, size, setting, self._held))
+
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
+        with self._reading() as connection:
+            found = connection.execute(_PAGES[labelled], before=2**62 if before is None else before, most=limit)
+            return StoredReviews([_frame(values) for values in found], *_size(connection))
+
+    def labelled(self) -> list[ReviewFrame]:
+        with self._reading() as connection:
+            return [_frame(values) for values in connection.execute(_LABELLED)]
+
+    def find(self, number: int) -> ReviewFrame:
+        with self._reading() as connection:
+            return _frame(_expect(connection, number))
+
+    def picture(self, number: int) -> bytes:
+        with self._reading() as connection:
+            values = _expect(connection, number)
+            frame, near = _frame(values), connection.one(_PICTURE, number=number)
+        name, stored = values[_COLUMNS.index("object")], dict[int, StoredPicture]()
+        if name is not None:
+            stored[number] = StoredObject(name, frame.size, frame.digest)
+        elif near is not None:
+            stored[number] = near[0]
+        data = read_pictures(self.objects, stored).get(number)
+        if data is None or hashlib.sha256(data).digest() != frame.digest:
+            raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
+        return data
+
+    @contextmanager
+    def held(self, number: int) -> Iterator[None]:
+        """Have this service not drop a frame for newer ones until the block ends; another service may."""
+        self._held.add(number)
+        try:
+            yield
+        finally:
+            self._held.discard(number)
+
+    def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
+        with self._writing() as connection:
+            *stored, _ = values = _expect(connection, number)
+            after = {**dict(zip(_COLUMNS, stored, strict=True)), "label": json.dumps(label)}
+            changed = sealed(_COLUMNS, after)
+            if not connection.change(_LABEL, which=number, new_label=changed["label"], new_seal=changed["seal"]):
+                raise _unknown(number)
+        return replace(_frame(values), label=label)
+
+    def discard(self, number: int) -> None:
+        with self._writing() as connection:
+            _expect(connection, number)
+            drop(connection, [number])
+
+
+def drop(connection: MapConnection, numbers: list[int]) -> None:
+    """Delete frames with their pictures."""
+    connection.execute(_DELETE_PICTURES, numbers=numbers)
+    connection.execute(_DELETE, numbers=numbers)
+
+
+def unsound(connection: MapConnection) -> list[int]:
+    """The numbers of the frames whose row does not match its checksum."""
+    return [int(columns[0]) for *columns, seal in connection.execute(_ALL) if not is_sound(columns, seal)]
+
+
+def _size(connection: MapConnection) -> tuple[int, int]:
+    """How many frames are stored, and their bytes."""
+    ((count, size),) = connection.execute(_SIZE)
+    return int(count), int(size)
+
+
+def _expect(connection: MapConnection, number: int) -> tuple[Any, ...]:
+    values = connection.one(_FIND, number=number)
+    if values is None:
+        raise _unknown(number)
+    return values
+
+
+def _unknown(number: int) -> UnknownFrame:
+    return UnknownFrame(f"The map keeps no frame {number} for review.")
+
+
+def _frame(values: tuple[Any, ...]) -> ReviewFrame:
+    number, at, digest, size, answer, label, *_ = values
+    said = None if label is None else json.loads(label)
+    return ReviewFrame(number, datetime.fromisoformat(at), digest, size, json.loads(answer), said)

@@ -1,0 +1,68 @@
+"""Exporting a map from PostgreSQL: its state of one moment as one file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from core.disk.files import disk_errors
+from core.ledger.maps.archiving import LedgerSource, pieces
+from core.ledger.maps.connection import MapConnection
+from core.ledger.maps.record import MapState
+from core.ledger.postgres import PostgresLedger
+from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
+from core.postgres import rows
+from core.postgres.forms import Form
+
+if TYPE_CHECKING:
+    from core.postgres.pictures.objects import Objects
+
+Viewing = Callable[[], AbstractContextManager[tuple[MapConnection, MapState]]]
+
+
+class Exporter:
+    """Writes export files of one map (:class:`core.maps.store.Exporter`).
+
+    Args:
+        viewing: begins a transaction that reads the map, whose state comes with it.
+        state: a value that is the same as long as nothing is written to the map.
+        database: in which the map is.
+        objects: where pictures may be besides; None: nowhere.
+    """
+
+    def __init__(
+        self, viewing: Viewing, state: Callable[[], object], database: PostgresLedger, objects: Objects | None
+    ) -> None:
+        self._viewing, self.state, self._database, self._objects = viewing, state, database, objects
+
+    def write(
+        self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
+    ) -> Exported:
+        """Write the present state of the map as a new file, which a crash may lose; nothing is left if this raises.
+
+        Raises:
+            UnknownMap: the map was deleted before it was read.
+            StorageFull, StorageFailure.
+        """
+        with disk_errors(f"write {path}"), self._keeping_objects(), self._viewing() as (connection, state):
+            source = _Source(connection, state.record, Form(state.record).frame_bytes, self._objects)
+            return write_archive(source, path, advance, expect)
+
+    def _keeping_objects(self) -> AbstractContextManager[object]:
+        """Have no objects deleted during the block: its transaction still sees rows that are deleted meanwhile."""
+        if self._objects is None:
+            return nullcontext()
+        return self._database.locked("export a map", rows.EXPORTING, 0, shared=True)
+
+
+class _Source(LedgerSource):
+    def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        for some in pieces(group):
+            numbers = [place.row for place in some]
+            found = rows.both_at(self.connection, numbers)
+            yield b"".join(part for row in numbers for part in found[row])
+
+    def expect_there(self) -> None:
+        """The transaction sees the map also if it was deleted since."""

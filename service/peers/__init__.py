@@ -1,0 +1,1 @@
+"""The other services with which one shares its state, if there are any."""

@@ -1,0 +1,159 @@
+"""One session as a service holds it in memory, and its record."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+from core.belief import Run, to_bytes
+from core.maps import Map
+from core.maps.selection import Conditions, Selection
+from service.errors.faults import QueueFull
+from service.sessions.schemas import NewSession
+from service.sessions.table import SessionRecord
+
+WAITING = 8
+"""The most frames of one session that may wait for their turn."""
+
+CLOCKS_DIFFER = 1.0
+"""Two clocks that differ by fewer seconds count as equal, so that the reported expiry of a session does not jitter."""
+
+
+@dataclass(eq=False)
+class Session:
+    """One robot's run in one map.
+
+    expires_after: seconds without a frame after which the session expires.
+    created, used: when the session was created and when its last frame came, seconds since 1970 UTC.
+    number: the robot's number of the last frame.
+    moment: when the last frame was taken, seconds since 1970 UTC.
+    request: the id that the client gave the request of the last frame.
+    lost: how many frames were lost by a restart; None if that is not known.
+    frames: how many frames the session has processed.
+    answer: the last answer, JSON.
+    run: the belief; None until it is read.
+    revision: of the record that the belief was saved as.
+    recorded: the revision of the record, as it was last seen.
+    restored: whether the session was restored after a restart.
+    streaming: whether a WebSocket streams into the session.
+    waiting: how many frames are being processed or wait for that.
+    idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
+        one may be set.
+    """
+
+    id: str
+    map_id: str
+    map_created_at: str
+    options: NewSession
+    expires_after: float
+    created: float = field(default_factory=time.time)
+    used: float = field(default_factory=time.time)
+    number: int | None = None
+    moment: float | None = None
+    request: str | None = None
+    lost: int | None = None
+    frames: int = 0
+    answer: str | None = None
+    run: Run | None = None
+    revision: int = 0
+    recorded: int = 0
+    restored: bool = False
+    streaming: bool = False
+    waiting: int = 0
+    idle_since: float = field(default_factory=time.monotonic)
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    @classmethod
+    def of(cls, record: SessionRecord) -> Session:
+        """A session whose belief is not read yet.
+
+        Raises:
+            ValueError: the record is damaged.
+        """
+        options = NewSession.model_validate_json(record.options)
+        session = cls(record.id, record.map, record.map_created_at, options, record.expires_after, record.created)
+        session.read_fields(record)
+        session.idle_since = time.monotonic() - max(0.0, record.idle)
+        return session
+
+    def read_fields(self, record: SessionRecord) -> None:
+        """Take over what frames change, but for the belief."""
+        self.used, self.revision, self.recorded = record.used, record.revision, record.revision
+        self.number, self.moment, self.request = record.number, record.moment, record.request
+        self.lost, self.frames, self.answer = record.lost, record.frames, record.answer
+
+    def record(self) -> SessionRecord:
+        """The session as it is saved."""
+        return SessionRecord(
+            self.id,
+            self.map_id,
+            self.map_created_at,
+            self.options.model_dump_json(exclude={"expires_after"}),
+            self.expires_after,
+            number=self.number,
+            moment=self.moment,
+            request=self.request,
+            lost=self.lost,
+            frames=self.frames,
+            revision=self.revision,
+            state=None if self.run is None else to_bytes(self.run.state()),
+            answer=self.answer,
+        )
+
+    def see(self, head: SessionRecord) -> None:
+        """Note the revision of the record, and when the last frame came."""
+        self.used, self.recorded = head.used, max(self.recorded, head.revision)
+        self.idle_since = max(self.idle_since, time.monotonic() - max(0.0, head.idle))
+
+    @property
+    def idle(self) -> float:
+        """Seconds since the last frame."""
+        return time.monotonic() - self.idle_since
+
+    @property
+    def over(self) -> bool:
+        """Whether the session has expired; not while a frame is being processed."""
+        return self.idle >= self.expires_after and not self.waiting
+
+    @property
+    def expires(self) -> float:
+        """When the session expires unless a frame comes, seconds since 1970 UTC, by the clock as it is set now."""
+        used = time.time() - self.idle
+        return self.expires_after + (self.used if abs(used - self.used) < CLOCKS_DIFFER else used)
+
+    def touch(self) -> None:
+        """Note that a frame has come now."""
+        self.used, self.idle_since = time.time(), time.monotonic()
+
+    @property
+    def selection(self) -> Selection | None:
+        """The filter for the session's sequences; None: all places of the map."""
+        names = self.options.sequences
+        return None if names is None else Selection(Conditions(sequences=tuple(names)))
+
+    def is_about(self, map_: Map) -> bool:
+        """Whether this is a session of a map, and not of an earlier one of the same id."""
+        return (self.map_id, self.map_created_at) == (map_.record.id, creation_time(map_))
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """Hold the session's turn for one frame; frames get it in the order of their arrival.
+
+        Raises:
+            QueueFull: too many frames of the session wait already.
+        """
+        if self.waiting >= WAITING:
+            raise QueueFull("Too many frames of this session are waiting; send this one again in a moment.")
+        self.waiting += 1
+        try:
+            async with self._lock:
+                yield
+        finally:
+            self.waiting -= 1
+
+
+def creation_time(map_: Map) -> str:
+    return map_.record.created_at.isoformat()

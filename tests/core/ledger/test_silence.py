@@ -1,0 +1,76 @@
+"""A PostgreSQL that falls silent is given up by the client's own deadline, and used again when it is back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import psycopg
+import pytest
+from sqlalchemy import select
+
+from core.errors import StoreUnavailable
+from core.ledger import Statement
+from core.ledger import postgres as connections
+from core.ledger.postgres import PostgresLedger
+from tests.service.shared.postgres import Postgres
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(120)]
+
+_ONE = Statement(select(1))
+
+
+@contextmanager
+def silenced(server: Postgres) -> Iterator[None]:
+    """Stop all processes of the server that serve connections."""
+    with psycopg.connect(server.address) as connection:
+        query = "SELECT pid FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
+        workers = [pid for (pid,) in connection.execute(query)]
+        ((data,),) = connection.execute("SHOW data_directory").fetchall()
+    with open(os.path.join(data, "postmaster.pid"), encoding="utf-8") as file:
+        every = [int(file.readline()), *workers]
+    try:
+        for pid in every:
+            os.kill(pid, signal.SIGSTOP)
+        yield
+    finally:
+        for pid in every:
+            os.kill(pid, signal.SIGCONT)
+
+
+def test_a_server_that_stands_still_is_given_up_soon(postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger = PostgresLedger(postgres.address, [])
+    assert ledger.execute("look", _ONE) == [(1,)]
+    with silenced(postgres):
+        began = time.monotonic()
+        with pytest.raises(StoreUnavailable, match="PostgreSQL"):
+            ledger.execute("look", _ONE)
+        # It would be 75 s without a deadline of its own; this is no measure of speed.
+        assert time.monotonic() - began < 40
+        with pytest.raises(StoreUnavailable, match="PostgreSQL"):
+            ledger.execute("look", _ONE)
+    for _ in range(600):
+        try:
+            assert ledger.execute("look", _ONE) == [(1,)]
+            break
+        except StoreUnavailable:
+            time.sleep(0.1)
+    else:
+        pytest.fail("PostgreSQL is back and not used again")
+    ledger.close()
+
+
+def test_a_statement_without_an_answer_ends_its_connection(postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "ANSWER_SECONDS", 0.5)
+    ledger = PostgresLedger(postgres.address, [])
+    with ledger.connection("look", 0.5) as connection:
+        with pytest.raises(psycopg.OperationalError, match="does not answer within"):
+            connection.execute("SELECT pg_sleep(60)")
+        assert connection.closed
+    silent = pytest.raises(StoreUnavailable, match="PostgreSQL cannot be reached: it does not answer")
+    with silent, ledger.connection("look", 0.5) as connection:
+        connection.execute("SELECT pg_sleep(60)")
+    ledger.close()

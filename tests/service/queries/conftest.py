@@ -1,0 +1,3 @@
+from tests.core.ledger.conftest import open_ledger
+
+__all__ = ["open_ledger"]
