@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core.storage.counterparts import Counterparts
 from numpy.typing import NDArray
 
+from core.ledger.maps.counterparts import Counterparts
 from core.maps import Enrolment, Map, MapSettings
 from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime

@@ -13,9 +13,9 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from core.storage.transfer import Transfer
 
 from core.errors import StorageFull
+from core.ledger.maps.transfer import Transfer
 from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields
 from core.storage import Atlas
