@@ -52,7 +52,7 @@ def _renew(table: SessionTable, session: SessionRecord, number: int) -> None:
     table.renew(replace(session, revision=number))
 
 
-def _look(table: SessionTable, _number: int) -> None:
+def _head(table: SessionTable, _number: int) -> None:
     table.head("s-1")
 
 
@@ -68,7 +68,7 @@ def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
         table = SessionTable(ledger)
         table.add(session, 100)
         saved.append(median(rounds, partial(_renew, table, session)))
-        read.append(median(rounds, partial(_look, table)))
+        read.append(median(rounds, partial(_head, table)))
     print(f"session, looked at before a frame {'':>7}  {read[1]:8.2f}")
     print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
     file.close()

@@ -100,7 +100,7 @@ class Statement:
         expression = given if isinstance(given, ClauseElement) else given(INSERTS[name])
         made = expression.compile(dialect=DIALECTS[name])
         assert isinstance(made, SQLCompiler)
-        constants = {key: value for key, value in made.params.items() if value is not None}
+        constants = {key: made.params[key] for bind, key in made.bind_names.items() if not bind.required}
         names = None if made.positiontup is None else tuple(made.positiontup)
         return Compiled(str(made), names, constants, finds=not (made.isinsert or made.isupdate))
 

@@ -20,8 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, StorageFailure
-from core.ledger.maps import places
-from core.maps import MapSettings
+from core.maps import MapSettings, PlaceFilter
 from core.storage import Atlas, Map
 from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
@@ -118,8 +117,7 @@ def answers(map_: Map) -> State:
     for name in ("lab2", "again", "coded7", "nobody"):
         rows, products = map_.snapshot().search(descriptor_of(name))
         found.append((rows.tolist()[:8], Scores(products[:8])))
-    with map_._reading() as connection:
-        by_metadata = places.rows_with(connection, {"floor": 2}).tolist()
+    by_metadata = map_.ids_of(PlaceFilter(metadata={"floor": 2}), 1000)
     whereabouts = vars(map_.snapshot().whereabouts.take(map_.snapshot().alive.nonzero()[0]))
     spots = zlib.crc32(b"".join(column.tobytes() for column in whereabouts.values()))
     ends = map_.transfer.sequence_ends()
@@ -285,7 +283,7 @@ def test_every_value_of_a_row_has_a_checksum(closed: Sound, tmp_path: Path) -> N
             "track": "1", "station": "7", "pose_of": "'lab1'",
         },
         "maps": {
-            "record": "replace(record, 'image', 'none')", "seal": "seal + 1", "places": "places + 1",
+            "record": "replace(record, 'image', 'none')", "seal": "seal + 1", "id": "'lab2'", "places": "places + 1",
             "rows": "rows - 1", "numbers": "1", "codes": "0", "revision": "0",
         },
         "layout": {"rows_per_segment": "3"},

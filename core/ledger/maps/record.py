@@ -43,7 +43,7 @@ class MapState:
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
 _COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "inserted", "collection")
-_STATE = (MAPS.c.number, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
+_STATE = (MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
 
 _CREATE = Statement(
     lambda insert: (
@@ -181,13 +181,16 @@ def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
 
 
 def _state(values: tuple[Any, ...]) -> MapState:
-    number, text, seal, *counters = values
+    number, map_id, listed, text, seal, *counters = values
     if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
-        return MapState(number, MapRecord.model_validate_json(text), *counters)
+        record = MapRecord.model_validate_json(text)
     except ValueError as error:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
+    if listed and map_id != record.id:
+        raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
+    return MapState(number, record, *counters)
 
 
 def records_after(connection: Connection, after: str, limit: int) -> list[MapRecord]:

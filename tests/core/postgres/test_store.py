@@ -63,10 +63,13 @@ def test_one_of_two_imports_under_one_id_is_refused(postgres: Postgres, store: C
     here.close()
     other, both = CodedStore(postgres.address), threading.Barrier(2)
 
+    def meet() -> None:
+        both.wait(60)
+
     def take(into: CodedStore) -> str:
         with Archive(file) as archive:
             try:
-                into.import_map(archive, ID, lambda *_: None, lambda _: None, 10**6, lambda: both.wait(60) and None)
+                into.import_map(archive, ID, lambda *_: None, lambda _: None, 10**6, meet)
             except MapExists:
                 return "refused"
         return "made"

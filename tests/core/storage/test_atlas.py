@@ -253,12 +253,16 @@ def with_a_changed_record(folder: Path) -> None:
     edit(folder.parents[1], "UPDATE maps SET record = replace(record, 'thumbnail', 'image')")
 
 
+def with_a_changed_name(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE maps SET id = 'kitchen'")
+
+
 def written_anew(folder: Path, **changes: object) -> None:
     """Change the record of a map, and its checksum with it."""
     connection = sqlite3.connect(folder / "map.sqlite", isolation_level=None)
     ((text,),) = connection.execute("SELECT record FROM maps").fetchall()
     changed = json.dumps({**json.loads(text), **changes})
-    connection.execute("UPDATE maps SET record = ?, seal = ?", (changed, checksum_of([changed])))
+    connection.execute("UPDATE maps SET record = ?, seal = ?, id = ?", (changed, checksum_of([changed]), json.loads(changed)["id"]))
     connection.close()
 
 
@@ -291,6 +295,7 @@ def somebody_elses(folder: Path) -> None:
         cut,
         without_a_record,
         with_a_changed_record,
+        with_a_changed_name,
         with_a_senseless_record,
         with_another_layout,
         without_a_table,

@@ -10,10 +10,10 @@ from typing import Any
 import httpx
 import pytest
 
+from core.ledger.maps import places
 from core.maps import MapSettings
 from core.maps.store import HANDED_OVER, HAS_PICTURE
 from core.storage import Atlas
-from core.storage.database.schema import driver_of
 from service.errors.faults import PlanTooLarge
 from service.http.headers import accepts_gzip
 from service.places import plans
@@ -123,7 +123,8 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame("p0"), frame("p1")])
     with lab._writing() as write:
-        driver_of(write.connection).execute("UPDATE places SET pose_of = 'p0' WHERE id = 'p1'")
+        p1 = places.expect(write.connection, "p1")
+        write.set_counterpart(p1, None, None, p1.place.pose, "p0")
     assert f'"flags":[{0},{HANDED_OVER}]' in lab.plan.columns().replace("2", "0").replace("3", "1")
     atlas.close()
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from core.maps import MapSettings
 from core.ledger.maps.transfer import Transfer
+from core.maps import MapSettings
 from service.engine.engine import Engine
 from service.jobs.context import JobInterrupted
 from service.upkeep import pruning

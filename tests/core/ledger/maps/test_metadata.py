@@ -16,6 +16,7 @@ from core.ledger.maps import places
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import LONGEST_TEXT, token_of
 from core.ledger.maps.schema import TOKENS
+from core.ledger.postgres import PostgresConnection
 from core.ledger.sqlite import SqliteConnection
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import PlaceFields
@@ -146,5 +147,6 @@ def explained(connection: MapConnection, statement: Statement, **values: Any) ->
     given = compiled.values({"map": connection.map, **values})
     if isinstance(whole, SqliteConnection):
         return " ".join(row[3] for row in whole.driver.execute(f"EXPLAIN QUERY PLAN {compiled.text}", given))
+    assert isinstance(whole, PostgresConnection)
     whole.driver.execute("SET LOCAL enable_seqscan TO off")  # of the few rows of a test
     return " ".join(line for (line,) in whole.driver.execute(f"EXPLAIN {compiled.text}", given))
