@@ -1,4 +1,4 @@
-"""The interface of a ledger, whatever database it is."""
+"""The interface of a ledger to those who keep records in it, whatever database it is."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ def put_counters(connection: MapConnection, state: MapState) -> None:
 
 
 def wrong_counters(connection: MapConnection) -> list[str]:
-    """The counters of a map that would give out a number a second time."""
+    """The counters of a map that would give a number or a code out a second time."""
     found = connection.one(_HIGHEST)
     if found is None:
         return []
