@@ -51,6 +51,9 @@ MapT = TypeVar("MapT", bound=PostgresMap)
 
 log = logging.getLogger(__name__)
 
+Made = TypeVar("Made", bound=PostgresMap)
+"""The map of an engine."""
+
 
 class PostgresStore(ABC, Generic[MapT]):
     """Maps by id (:class:`core.maps.store.Store`).
