@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 import typer
 
-from core.ledger.maps.frames import StoredObject
 from core.maps import MapSettings
 from core.milvus import ledger, open_store
 from core.milvus.map import MilvusMap

@@ -1,4 +1,4 @@
-"""What a ledger offers to whoever keeps records in it, whatever database it is."""
+"""The interface of a ledger to those who keep records in it, whatever database it is."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Lock(IntEnum):
     JOBS = 7_061_636_575
 
 
-class Connection(Protocol):
+class LedgerConnection(Protocol):
     """A connection for one thread, within a transaction or not."""
 
     @property
@@ -51,7 +51,7 @@ class Ledger(Protocol):
     def change(self, action: str, statement: Statement, **values: Any) -> int:
         """The same; the number of rows that it inserted, updated or deleted."""
 
-    def transaction(self, action: str, lock: Lock | None = None) -> AbstractContextManager[Connection]:
+    def transaction(self, action: str, lock: Lock | None = None) -> AbstractContextManager[LedgerConnection]:
         """A transaction that is committed, durably, at the end of the block, and undone if it raises.
 
         Args:

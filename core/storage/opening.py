@@ -116,7 +116,7 @@ def read_layout(connection: MapConnection, map_id: str = "") -> tuple[MapState, 
         )
         return state, layout
     except (ValueError, UnknownMap) as error:
-        raise Damage(f"the map's own record cannot be read: {error}") from error
+        raise DamagedRow(f"the map's own record cannot be read: {error}") from error
 
 
 def _adopt(folder: Path, connection: MapConnection) -> tuple[MapState, Layout]:

@@ -1,4 +1,4 @@
-"""What is stored of a frame beside its descriptors, by its row: its picture and its keypoints.
+"""Pictures and keypoints of frames by row: the content of a frame that is stored beside its descriptors.
 
 The checksum of keypoints covers the digest of the frame, so that keypoints of another frame do not match it.
 """

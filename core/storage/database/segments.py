@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import CheckConstraint, Column, MetaData, Table, bindparam, func, select, update
 
 from core.disk.files import Damage
-from core.ledger.maps.checksums import checksum_of
+from core.ledger.maps.checksums import DamagedRow, checksum_of
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import PLACES
 from core.ledger.statements import Statement, integer
@@ -76,11 +76,11 @@ def rows_per_segment(connection: MapConnection) -> int:
     """The number of rows of a full segment.
 
     Raises:
-        Damage: it is not what was stored.
+        DamagedRow: it is not what was stored.
     """
     found = connection.whole.execute(_READ_LAYOUT)
     if len(found) != 1 or found[0][1] != checksum_of([found[0][0]]):
-        raise Damage("the map's own record cannot be read: it does not say how many rows a segment has")
+        raise DamagedRow("the map's own record cannot be read: it does not say how many rows a segment has")
     return int(found[0][0])
 
 

@@ -52,7 +52,9 @@ def stores(empty: Postgres) -> Iterator[list[CodedStore]]:
 
 
 def maps_of(stores: list[CodedStore]) -> list[CodedMap]:
-    return [store.get("lab") for store in stores]
+    found = [store.get("lab") for store in stores]
+    assert all(isinstance(one, CodedMap) for one in found)
+    return found
 
 
 def expect_alike(one: CodedMap, address: str) -> None:

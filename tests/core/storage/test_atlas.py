@@ -261,9 +261,9 @@ def written_anew(folder: Path, **changes: object) -> None:
     """Change the record of a map, and its checksum with it."""
     connection = sqlite3.connect(folder / "map.sqlite", isolation_level=None)
     ((text,),) = connection.execute("SELECT record FROM maps").fetchall()
-    record = {**json.loads(text), **changes}
-    values = (record["id"], json.dumps(record))
-    connection.execute("UPDATE maps SET id = ?, record = ?, seal = ?", (*values, checksum_of(values)))
+    changed = json.dumps({**json.loads(text), **changes})
+    values = changed, checksum_of([changed]), json.loads(changed)["id"]
+    connection.execute("UPDATE maps SET record = ?, seal = ?, id = ?", values)
     connection.close()
 
 

@@ -126,8 +126,8 @@ def test_what_does_not_match_its_checksum_is_not_shown(tmp_path: Path) -> None:
     for number in range(3):
         review.keep(bytes([number]), ANSWER, SETTING)
     review.close()
-    edit(tmp_path / FILE, "UPDATE frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
-    edit(tmp_path / FILE, "UPDATE pictures SET bytes = x'FF' WHERE frame = 2")
+    edit(tmp_path / FILE, "UPDATE review_frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
+    edit(tmp_path / FILE, "UPDATE review_pictures SET bytes = x'FF' WHERE number = 2")
     review = frames_at(tmp_path)
     assert [one.number for one in review.page(None, 10).frames] == [3, 2]
     with pytest.raises(StorageFailure, match="damaged"):

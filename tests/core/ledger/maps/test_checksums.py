@@ -107,11 +107,12 @@ def test_a_changed_value_of_a_camera_is_noticed(full: MemoryMap) -> None:
 
 
 def test_a_changed_record_of_a_map_is_noticed(full: MemoryMap) -> None:
-    for column in ("id", "record", "seal"):
-        with (
-            changed(full, MAPS, column, 0) as connection,
-            pytest.raises(DamagedRow, match="does not match its checksum"),
-        ):
+    for column, reason in (
+        ("record", "does not match its checksum"),
+        ("seal", "does not match its checksum"),
+        ("id", "it is that of 'lab', not of 'lab '"),
+    ):
+        with changed(full, MAPS, column, 0) as connection, pytest.raises(DamagedRow, match=reason):
             record.state_of(connection, "lab")
     assert full.record.id == "lab"
 

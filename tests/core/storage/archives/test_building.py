@@ -82,7 +82,7 @@ def deep(levels: int) -> dict[str, Any]:
 
 KEPT = {"kind": "image", "bytes": 11, "sha256": "0" * 64}
 HOSTILE: dict[str, tuple[Made, str]] = {
-    "a place twice": (place(id="p0"), "UNIQUE"),
+    "a place twice": (place(id="p0"), "'p0' is listed twice"),
     "an id that is none": (place(id="../p1"), "id"),
     "an id with an end of line": (place(id="p1\n"), "id"),
     "a field more": (place(owner="me"), "owner"),
@@ -147,7 +147,7 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "no UTF-8": (raw(PLACES, lambda d: d.replace(b"p0", b"\xff\xfe", 1)), "UTF-8"),
     "no object": (raw(PLACES, lambda d: b"[]\n" + d.split(b"\n", 1)[1]), "line 1"),
     "an endless line": (raw(PLACES, lambda d: b" " * (5 << 20) + d), "a line of more than"),
-    "a sequence twice": (counted(SEQUENCES, 0, again), "UNIQUE"),
+    "a sequence twice": (counted(SEQUENCES, 0, again), "'monday' is listed twice"),
     "a sequence of nobody": (line(SEQUENCES, 1, name="sunday"), "does not list"),
     "a sequence named ..": (line(SEQUENCES, 1, name=".."), "name"),
     "a sequence with a mark of direction": (line(SEQUENCES, 1, name="mon\u202eday"), "name"),
@@ -160,7 +160,7 @@ HOSTILE: dict[str, tuple[Made, str]] = {
         counted(SEQUENCES, 0, lambda d: d + b"".join(b'{"name":"s%d","next_ordinal":1}\n' % i for i in range(20))),
         "no more than 10 sequences",
     ),
-    "a camera twice": (counted(CAMERAS, 1, again), "UNIQUE"),
+    "a camera twice": (counted(CAMERAS, 1, again), "'rear' is listed twice"),
     "too many cameras": (counted(CAMERAS, 1, many), "at most 256"),
     "a mask of everything": (line(CAMERAS, 0, mask={"polygons": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}), "mask"),
     "intrinsics without a focal length": (line(CAMERAS, 1, intrinsics={"width": 640, "height": 480}), "intrinsics.fx"),
