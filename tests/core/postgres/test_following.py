@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import psycopg
 import pytest
 
-from core.errors import UnknownPlace
+from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
@@ -155,6 +156,17 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Coded
     assert stores[0].verify("lab").ok
 
 
+def reached(map_: CodedMap) -> None:
+    """Use the connections that were ended, until none is left."""
+    while True:
+        try:
+            map_.count_places()
+        except StoreUnavailable:
+            time.sleep(0.1)
+        else:
+            return
+
+
 def swap_databases(server: Postgres, away: str, back: str) -> None:
     """Put a copy of the database, made before, in its place."""
     with psycopg.connect(server.address.replace("/postgres", "/template1"), autocommit=True) as connection:
@@ -179,6 +191,8 @@ def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(stores: list[C
     lost = there.snapshot().descriptors_at(np.array([row]))  # cached from now on
     swap_databases(empty, "later", "earlier")
     try:
+        for service in (here, there):
+            reached(service)
         # The same number of writes as before: the revision is the same, its stamp is not.
         here.enrol([frame("other", 5002)])
         assert there.rows_of(["lost", "other"]) == [None, row]
