@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import psycopg
@@ -23,6 +23,8 @@ from core.postgres.search.store import CodedStore
 from tests.service.shared.postgres import Postgres
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+
+Answered = TypeVar("Answered")
 
 DIMENSION, LOCAL = 64, (4, 8)
 
@@ -156,15 +158,13 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Coded
     assert stores[0].verify("lab").ok
 
 
-def reached(map_: CodedMap) -> None:
-    """Use the connections that were ended, until none is left."""
+def sent_again(request: Callable[[], Answered]) -> Answered:
+    """The result of a request that is sent again as long as it is refused because a connection was lost."""
     while True:
         try:
-            map_.count_places()
+            return request()
         except StoreUnavailable:
             time.sleep(0.1)
-        else:
-            return
 
 
 def swap_databases(server: Postgres, away: str, back: str) -> None:
@@ -185,17 +185,17 @@ def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(stores: list[C
         query = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'postgres'"
         connection.execute(query)
         connection.execute("CREATE DATABASE earlier TEMPLATE postgres")
-    here.enrol([frame("lost", 5001)])
-    row = there.rows_of(["lost"])[0]
+    sent_again(lambda: here.enrol([frame("lost", 5001)]))
+    row = sent_again(lambda: there.rows_of(["lost"]))[0]
     assert row == 300
     lost = there.snapshot().descriptors_at(np.array([row]))  # cached from now on
     swap_databases(empty, "later", "earlier")
     try:
-        for service in (here, there):
-            reached(service)
         # The same number of writes as before: the revision is the same, its stamp is not.
-        here.enrol([frame("other", 5002)])
-        assert there.rows_of(["lost", "other"]) == [None, row]
+        sent_again(lambda: here.enrol([frame("other", 5002)]))
+        for _ in range(5):
+            sent_again(there.count_places)
+        assert sent_again(lambda: there.rows_of(["lost", "other"])) == [None, row]
         found = there.snapshot().descriptors_at(np.array([row]))
         assert not np.allclose(found, lost) and np.allclose(found[0], frame("other", 5002).descriptor, atol=1e-3)
         for service in (here, there):
