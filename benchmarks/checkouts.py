@@ -17,9 +17,10 @@ import tempfile
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Annotated, Any
 
 import httpx
@@ -114,14 +115,20 @@ def main(
 
 
 @contextmanager
-def running(checkout: Path, data_dir: Path) -> Iterator[tuple[httpx.Client, int, float]]:
-    """A service of a checkout: a client of it, its process, and the seconds until it was ready."""
+def running(
+    checkout: Path, data_dir: Path, settings: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[tuple[httpx.Client, int, float]]:
+    """A service of a checkout: a client of it, its process, and the seconds until it was ready.
+
+    Args:
+        settings: more variables of its environment.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     environment = {**os.environ, "PYTHONPATH": str(checkout), "PLACEREC_DATA_DIR": str(data_dir)}
     words = [sys.executable, "-m", "service.commands", "serve", "--port", str(port)]
-    environment["PLACEREC_LOG_LEVEL"] = "warning"
+    environment |= {"PLACEREC_LOG_LEVEL": "warning", **settings}
     began = time.monotonic()
     process = subprocess.Popen(words, cwd=checkout, env=environment, stderr=subprocess.DEVNULL)
     try:

@@ -63,9 +63,9 @@ class Settings(BaseSettings):
     )
     vectors: Literal["auto", "files", "postgres", "milvus"] = Field(
         default="auto",
-        description="What keeps the maps' descriptors and searches them: files in the data directory, PostgreSQL with "
-        "an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a database, else "
-        "postgres.",
+        description="The engine that keeps the maps' descriptors and searches them: files in the data directory, "
+        "PostgreSQL with an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a "
+        "database, else postgres.",
     )
     row_cache_bytes: int = Field(
         default=256 << 20,
@@ -358,7 +358,7 @@ class Settings(BaseSettings):
 
     @property
     def engine(self) -> Literal["files", "postgres", "milvus"]:
-        """What keeps the maps' descriptors and searches them."""
+        """The engine that keeps the maps' descriptors and searches them."""
         if self.vectors != "auto":
             return self.vectors
         return "files" if self.database is None else "postgres"

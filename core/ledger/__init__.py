@@ -7,8 +7,8 @@ Transactions are explicit: ``BEGIN IMMEDIATE`` and ``synchronous=FULL`` in SQLit
 (:mod:`core.ledger.rows`); a file that may be lost is made anew when it is damaged (:mod:`core.ledger.disposable`).
 """
 
-from core.ledger.database import Connection, Ledger, Lock
+from core.ledger.database import Ledger, LedgerConnection, Lock
 from core.ledger.statements import Statement
 from core.ledger.tables import Tables
 
-__all__ = ["Connection", "Ledger", "Lock", "Statement", "Tables"]
+__all__ = ["Ledger", "LedgerConnection", "Lock", "Statement", "Tables"]

@@ -19,7 +19,7 @@ class Lock(IntEnum):
     JOBS = 7_061_636_575
 
 
-class Connection(Protocol):
+class LedgerConnection(Protocol):
     """A connection for one thread, within a transaction or not."""
 
     @property
@@ -51,7 +51,7 @@ class Ledger(Protocol):
     def change(self, action: str, statement: Statement, **values: Any) -> int:
         """The same; the number of rows that it inserted, updated or deleted."""
 
-    def transaction(self, action: str, lock: Lock | None = None) -> AbstractContextManager[Connection]:
+    def transaction(self, action: str, lock: Lock | None = None) -> AbstractContextManager[LedgerConnection]:
         """A transaction that is committed, durably, at the end of the block, and undone if it raises.
 
         Args:

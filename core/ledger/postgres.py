@@ -224,7 +224,7 @@ def _check(connection: TimedConnection) -> None:
 
 
 class PostgresConnection:
-    """A connection of the pool (:class:`core.ledger.database.Connection`)."""
+    """A connection of the pool (:class:`core.ledger.database.LedgerConnection`)."""
 
     dialect: Literal["postgresql"] = "postgresql"
 

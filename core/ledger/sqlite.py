@@ -31,7 +31,7 @@ def file_of(
 
 
 class SqliteConnection:
-    """A connection to a file (:class:`core.ledger.database.Connection`)."""
+    """A connection to a file (:class:`core.ledger.database.LedgerConnection`)."""
 
     dialect: Literal["sqlite"] = "sqlite"
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Viewing = Callable[[], AbstractContextManager[tuple[MapConnection, MapState]]]
 
 
-class Exporter:
+class PostgresExporter:
     """Writes export files of one map (:class:`core.maps.store.Exporter`).
 
     Args:

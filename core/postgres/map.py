@@ -20,7 +20,7 @@ from core.maps.selection import Selection
 from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
 from core.maps.store import Scope, Snapshot
 from core.postgres import rows
-from core.postgres.exporter import Exporter
+from core.postgres.exporter import PostgresExporter
 from core.postgres.review import PostgresReview
 from core.postgres.writing import PostgresWrite
 
@@ -50,7 +50,7 @@ class PostgresMap(LedgerMap):
         self._paused = threading.local()
         super().__init__()
         self.review = PostgresReview(state.number, self._reading, database, objects)
-        self.exporter = Exporter(self.viewing, lambda: self.state, database, objects)
+        self.exporter = PostgresExporter(self.viewing, lambda: self.state, database, objects)
 
     @property
     def record(self) -> MapRecord:

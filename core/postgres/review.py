@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from core.ledger.maps.connection import MapConnection, Reading
 from core.ledger.maps.frames import StoredObject, StoredPicture
-from core.ledger.maps.review import Review
+from core.ledger.maps.review import ReviewTable
 from core.ledger.postgres import PostgresLedger
 from core.postgres import rows
 from core.postgres.pictures.stored import new_object
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from core.postgres.pictures.objects import Objects
 
 
-class PostgresReview(Review):
+class PostgresReview(ReviewTable):
     """The frames of one map stored for review.
 
     They are not part of what a search needs, so writing them does not wait for other writes to the map.

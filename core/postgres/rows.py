@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from sqlalchemy import and_, bindparam, case, column, delete, func, select, table, union, update
 
 from core.errors import UnknownMap
-from core.ledger.database import Connection
+from core.ledger.database import LedgerConnection
 from core.ledger.maps import frames
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.review import FRAMES
@@ -26,7 +26,7 @@ EXPORTING = 7063
 """The kind of the lock of the database that exports share, and that who deletes objects has alone."""
 
 LEFT_SECONDS = 60
-"""What no place names any more is deleted after this time; queries that need it have ended by then."""
+"""Data that no place names any more is deleted after this time; queries that need it have ended by then."""
 
 REMEMBERED_SECONDS = 7 * 24 * 3600
 """How long it is remembered which rows died, so that a service need not read a whole map again."""
@@ -235,12 +235,12 @@ def all_keys(connection: MapConnection) -> list[int]:
     return [key for (key,) in connection.execute(_ALL_KEYS)]
 
 
-def known_keys(connection: Connection, keys: Sequence[int]) -> set[int]:
+def known_keys(connection: LedgerConnection, keys: Sequence[int]) -> set[int]:
     """Those of some keys that are a place's, or were one's a while ago."""
     return {key for (key,) in connection.execute(_KNOWN_KEYS, keys=list(keys))}
 
 
-def last_key(connection: Connection) -> int:
+def last_key(connection: LedgerConnection) -> int:
     """No later key is at most this."""
     return int(connection.execute(_LAST_KEY)[0][0])
 
@@ -287,7 +287,7 @@ def new_object_key(connection: MapConnection) -> tuple[str, int]:
     return folder, int(key)
 
 
-def objects_folder(connection: Connection) -> str:
+def objects_folder(connection: LedgerConnection) -> str:
     """The folder of the database's pictures in an object store, which no other database has."""
     return str(connection.execute(_FOLDER)[0][0])
 
@@ -300,23 +300,23 @@ def dead_objects(connection: PostgresConnection) -> list[str]:
     return [name for (name,) in connection.execute(_DEAD_OBJECTS)]
 
 
-def clear_objects(connection: Connection, names: Sequence[str]) -> None:
+def clear_objects(connection: LedgerConnection, names: Sequence[str]) -> None:
     """Forget dead objects, which are deleted."""
     connection.execute(_CLEAR_OBJECTS, names=list(names))
 
 
-def known_objects(connection: Connection, names: Sequence[str]) -> set[str]:
+def known_objects(connection: LedgerConnection, names: Sequence[str]) -> set[str]:
     """Those of some objects that a row names, or named."""
     return {name for (name,) in connection.execute(_KNOWN_OBJECTS, names=list(names))}
 
 
-def swept_objects(connection: Connection, whole_seconds: float) -> int:
+def swept_objects(connection: LedgerConnection, whole_seconds: float) -> int:
     """The key from which on objects may be litter; 0 if the last full listing is older than ``whole_seconds``."""
     found = connection.execute(_SWEPT, age=whole_seconds)
     return int(found[0][0]) if found else 0
 
 
-def note_swept_objects(connection: Connection, key: int, whole: bool) -> None:
+def note_swept_objects(connection: LedgerConnection, key: int, whole: bool) -> None:
     """Note that there is no litter up to a key, and whether all objects were listed for that."""
     connection.execute(_NOTE_SWEPT, key=key, whole=int(whole))
 

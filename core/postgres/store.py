@@ -51,6 +51,9 @@ MapT = TypeVar("MapT", bound=PostgresMap)
 
 log = logging.getLogger(__name__)
 
+Made = TypeVar("Made", bound=PostgresMap)
+"""The map of an engine."""
+
 
 class PostgresStore(ABC, Generic[MapT]):
     """Maps by id (:class:`core.maps.store.Store`).
@@ -82,7 +85,7 @@ class PostgresStore(ABC, Generic[MapT]):
 
     @abstractmethod
     def _deleting(self, map_: MapT) -> AbstractContextManager[None]:
-        """What an engine does about a map that is deleted in the block."""
+        """A block in which a map is deleted, around which an engine deletes its own data of it."""
 
     @abstractmethod
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:

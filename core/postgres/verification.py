@@ -94,7 +94,7 @@ class _Damaged(NamedTuple):
 
 
 class _Content:
-    """What is stored of the frames of some places."""
+    """The stored data of the frames of some places."""
 
     def __init__(
         self,

@@ -18,7 +18,7 @@ from core.disk.sqlite_file import DURABLE, transaction
 from core.errors import StorageFailure
 from core.ledger import Tables
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.review import METADATA, Review, drop, unsound
+from core.ledger.maps.review import METADATA, ReviewTable, drop, unsound
 from core.ledger.sqlite import file_of
 from core.maps.records import ReviewSetting
 from core.storage.database.schema import connection_of, driver_of
@@ -31,7 +31,7 @@ _SETTINGS = {"auto_vacuum": "INCREMENTAL", **DURABLE, "journal_size_limit": 1 <<
 log = logging.getLogger(__name__)
 
 
-class ReviewFrames(Review):
+class ReviewFrames(ReviewTable):
     """The frames of one map that are stored for review (:class:`core.maps.review.Review`).
 
     Any thread may use it; the file is made with the first frame.  Every method may raise StorageFull and

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, SqliteFile, UnreadVersion, transaction
-from core.ledger import Connection, Statement
+from core.ledger import LedgerConnection, Statement
 from core.ledger.sqlite import SqliteConnection, file_of
 from service.access.key_table import TABLES
 from service.errors.faults import KeysUnreadable
@@ -82,7 +82,7 @@ class KeyFile:
             return SqliteConnection(connection).execute(statement)
 
     @contextmanager
-    def changing(self, announced: bool = True) -> Iterator[Connection]:
+    def changing(self, announced: bool = True) -> Iterator[LedgerConnection]:
         with closing(self._open()) as connection, self._refusals(), transaction(connection):
             yield SqliteConnection(connection)
 

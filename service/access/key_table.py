@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol
 from sqlalchemy import Column, MetaData, Table, column, select, table, update
 
 from core.errors import StorageFailure, StorageFull
-from core.ledger import Connection, Ledger, Statement, Tables
+from core.ledger import Ledger, LedgerConnection, Statement, Tables
 from core.ledger.statements import binary, text
 from service.errors.faults import KeysUnreadable
 
@@ -68,7 +68,7 @@ class KeyPlace(Protocol):
     def execute(self, statement: Statement) -> list[tuple[Any, ...]]:
         """The rows that a statement reads; none if no key was ever created."""
 
-    def changing(self, announced: bool = True) -> AbstractContextManager[Connection]:
+    def changing(self, announced: bool = True) -> AbstractContextManager[LedgerConnection]:
         """A transaction during which nobody else changes keys; it is durable when the context ends.
 
         Args:
@@ -108,7 +108,7 @@ class KeyTable:
             return self._ledger.execute("use the keys", statement)
 
     @contextmanager
-    def changing(self, announced: bool = True) -> Iterator[Connection]:
+    def changing(self, announced: bool = True) -> Iterator[LedgerConnection]:
         with _refusals(), self._ledger.transaction("change the keys") as connection:
             if announced:
                 connection.change(_COUNT)

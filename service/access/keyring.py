@@ -105,6 +105,11 @@ class Keyring:
         """Whether a request needs a key."""
         return self._known.demanded
 
+    @property
+    def state(self) -> str:
+        """ "ok", or why nobody can be let in."""
+        return self._known.broken or "ok"
+
     def start(self) -> None:
         """Read the keys, and start the thread that watches them.
 

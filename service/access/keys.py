@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from sqlalchemy import bindparam, func, select, update
 
-from core.ledger import Connection, Ledger, Statement
+from core.ledger import Ledger, LedgerConnection, Statement
 from core.ledger.statements import greatest
 from core.names import word
 from core.places import check_map_id
@@ -305,7 +305,7 @@ def _unknown(id_or_name: str) -> UnknownKey:
     return UnknownKey(f"There is no such key ({id_or_name[:80]!r}).")
 
 
-def _read(connection: Connection) -> list[Key]:
+def _read(connection: LedgerConnection) -> list[Key]:
     """Every key, the oldest first.
 
     Raises:

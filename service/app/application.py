@@ -246,7 +246,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         with audit_trail(chosen.audit_file) as trail, database or nullcontext(), keyring or nullcontext(), rates:
             app.state.audit_trail = trail
             warn_if_exposed(gate, chosen)
-            runtime = await to_thread.run_sync(Runtime, chosen, metrics, database)
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics, database, keyring)
             runtime.publish(app.state)
             runtime.start()
             try:

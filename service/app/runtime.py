@@ -14,6 +14,7 @@ from starlette.datastructures import State
 
 from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
+from service.access.keyring import Keyring
 from service.app.probe import Probe
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
@@ -54,10 +55,17 @@ class Runtime:
 
     Args:
         database: the one that services share; None: this one keeps its state in its data directory.
+        keyring: of the service; None: no request needs a key.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics, database: SharedDatabase | None = None) -> None:
-        self.settings = settings
+    def __init__(
+        self,
+        settings: Settings,
+        metrics: Metrics,
+        database: SharedDatabase | None = None,
+        keyring: Keyring | None = None,
+    ) -> None:
+        self.settings, self._keyring = settings, keyring
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
             self.shared = None if database is None else _shared_state(settings, database)
@@ -171,6 +179,7 @@ class Runtime:
         checks["disk"] = await self._disk.outcome()
         if self.shared is not None:
             checks["replica"] = self.shared.replica.state
+            checks["keys"] = "ok" if self._keyring is None else self._keyring.state
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]

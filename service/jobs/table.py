@@ -11,7 +11,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from core.ledger import Connection, Ledger, Lock, Statement
+from core.ledger import Ledger, LedgerConnection, Lock, Statement
 from service.errors.faults import JobEnded, JobQueueFull
 from service.jobs import statements
 from service.jobs.job import Job, JobState
@@ -199,7 +199,7 @@ class JobTable:
             self._forget(trimmed)
         return jobs
 
-    def _given(self, connection: Connection, **values: Any) -> dict[str, Any]:
+    def _given(self, connection: LedgerConnection, **values: Any) -> dict[str, Any]:
         return {"service": self._peers.id, "living": self._peers.living_ids(connection), **values}
 
     def _write(self, action: str, statement: Statement, job: Job) -> Job | None:
@@ -207,7 +207,7 @@ class JobTable:
             rows = self._ledger.execute(action, statement, service=self._peers.id, **values_of(job))
             return self._learned(replace(job, cancelling=bool(rows[0][0]))) if rows else None
 
-    def _trim(self, connection: Connection) -> list[str]:
+    def _trim(self, connection: LedgerConnection) -> list[str]:
         return [job_id for (job_id,) in connection.execute(statements.TRIM, history=self._history)]
 
     # What is known without reading

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from core.ledger import Connection
+from core.ledger import LedgerConnection
 from service.peers.peers import Heard
 
 
@@ -28,6 +28,6 @@ class Alone:
         if topic in self._heard:
             self._heard[topic](text)
 
-    def living_ids(self, connection: Connection) -> list[str]:
+    def living_ids(self, connection: LedgerConnection) -> list[str]:
         """The id of this service."""
         return [self.id]

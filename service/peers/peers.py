@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from core.ledger import Connection
+from core.ledger import LedgerConnection
 
 Heard = Callable[[str | None], None]
 """Called with a message; None: the connection was lost for a while, so any message may have been missed."""
@@ -39,5 +39,5 @@ class Peers(Protocol):
             StorageFailure: the database cannot be reached, or refuses.
         """
 
-    def living_ids(self, connection: Connection) -> list[str]:
+    def living_ids(self, connection: LedgerConnection) -> list[str]:
         """The ids of the services that are there, within a transaction of the database that they share."""

@@ -14,7 +14,7 @@ from sqlalchemy import Column, MetaData, Table, bindparam, select, update
 
 from core.disk.files import disk_errors, write_file
 from core.errors import StorageFailure
-from core.ledger import Connection, Statement, Tables
+from core.ledger import LedgerConnection, Statement, Tables
 from core.ledger.postgres import PostgresLedger
 from core.ledger.statements import real, seconds_now, text
 from service.peers.peers import Heard
@@ -141,7 +141,7 @@ class ServiceReplica:
         """Send a message to all services, this one included; it is not stored for those that are not connected."""
         self.database.notify("notify other services", CHANNEL, f"{topic} {text}")
 
-    def living_ids(self, connection: Connection) -> list[str]:
+    def living_ids(self, connection: LedgerConnection) -> list[str]:
         """The ids of the services that are there, within a transaction of the database."""
         return [name for (name,) in connection.execute(_LIVING, gone=GONE_SECONDS)]
 

@@ -16,7 +16,7 @@ from sqlalchemy.sql.elements import ClauseElement, ColumnElement
 
 from core.disk.sqlite_file import DURABLE
 from core.judgement.verdict import Verdict
-from core.ledger import Connection, Ledger, Statement, Tables
+from core.ledger import Ledger, LedgerConnection, Statement, Tables
 from core.ledger.disposable import DisposableLedger
 from core.ledger.rows import given_rows
 from core.ledger.sqlite import file_of
@@ -151,7 +151,7 @@ def statistics_file(directory: Path) -> DisposableLedger:
     return DisposableLedger(file_of(directory / FILE, TABLES, settings, readable, check_whole=False))
 
 
-def add_counts(connection: Connection, key: MapKey, counted: AnswerCounts) -> None:
+def add_counts(connection: LedgerConnection, key: MapKey, counted: AnswerCounts) -> None:
     """Add counts of a map to those of the ledger, and delete those of weeks and hours that are too old."""
     code = _number(connection, key, counted.since)
     places = [(code, place, count.best, count.recognized, count.last) for place, count in counted.places.items()]
@@ -163,24 +163,24 @@ def add_counts(connection: Connection, key: MapKey, counted: AnswerCounts) -> No
     connection.execute(_DELETE_HOURS, code=code, oldest=hour_of(datetime.now(UTC) - timedelta(hours=HOURS)))
 
 
-def delete_maps_beside(connection: Connection, present: Collection[MapKey]) -> None:
+def delete_maps_beside(connection: LedgerConnection, present: Collection[MapKey]) -> None:
     """Delete the counts of all maps but some."""
     found = connection.execute(_ALL_MAPS)
     connection.execute_many(_DELETE_MAP, [{"code": code} for code, *key in found if tuple(key) not in present])
 
 
-def count_places(connection: Connection, key: MapKey) -> int:
+def count_places(connection: LedgerConnection, key: MapKey) -> int:
     """The number of places of a map that have counts."""
     ((count,),) = connection.execute(_COUNT_PLACES, id=key[0], made=key[1])
     return int(count)
 
 
-def delete_places_beside(connection: Connection, key: MapKey, present: Collection[str]) -> None:
+def delete_places_beside(connection: LedgerConnection, key: MapKey, present: Collection[str]) -> None:
     """Delete the counts of all places of a map but some."""
     connection.execute(_DELETE_PLACES, id=key[0], made=key[1], present=list(present))
 
 
-def read_counts(connection: Connection, key: MapKey) -> Statistics:
+def read_counts(connection: LedgerConnection, key: MapKey) -> Statistics:
     """The counts of a map."""
     found = connection.execute(_MAP, id=key[0], made=key[1])
     if not found:
@@ -214,20 +214,20 @@ def read_hours(ledger: Ledger, oldest: int, key: MapKey | None) -> dict[MapKey, 
     return found
 
 
-def put_calibration(connection: Connection, key: MapKey, at: str, report: str, trials: str) -> None:
+def put_calibration(connection: LedgerConnection, key: MapKey, at: str, report: str, trials: str) -> None:
     """Store the measurements of a map's calibration, in place of earlier ones."""
     code = _number(connection, key, at)
     connection.execute(_PUT_CALIBRATION, rows=json.dumps([(code, at, report, trials)]))
 
 
-def read_calibration(connection: Connection, key: MapKey) -> tuple[datetime, str, str] | None:
+def read_calibration(connection: LedgerConnection, key: MapKey) -> tuple[datetime, str, str] | None:
     """When a map was last measured to be calibrated, the report and the trials; None if it was not."""
     for at, report, trials in connection.execute(_CALIBRATION, id=key[0], made=key[1]):
         return datetime.fromisoformat(at), report, trials
     return None
 
 
-def _number(connection: Connection, key: MapKey, since: str) -> int:
+def _number(connection: LedgerConnection, key: MapKey, since: str) -> int:
     """The number of a map in the tables, which it gets if it has none."""
     ((code,),) = connection.execute(_NUMBER, id=key[0], made=key[1], since=since)
     return int(code)

@@ -158,8 +158,8 @@ def _outcome(atlas: Atlas, name: str, allowed: list[State]) -> str:
         return "refused"
     report = atlas.verify(name)
     if read not in allowed and any(read == _without_keypoints(state, read) for state in allowed):
-        named = ("the keypoints of place", "pictures or keypoints of")
-        assert any(name in line for line in report.problems for name in named), report
+        expected = ("the keypoints of place", "pictures or keypoints of")
+        assert any(text in line for line in report.problems for text in expected), report
         return "without keypoints"
     if read not in allowed:
         assert not report.ok, "another answer, and verify finds nothing"

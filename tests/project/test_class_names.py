@@ -10,11 +10,10 @@ from tests.project.sources import FILES, ROOT, module_of, syntax_of
 ROOMS = ("core", "service", "lab", "benchmarks")
 SHARED = {
     **dict.fromkeys(
-        ("Exporter", "Map", "Snapshot"),
-        ("core.maps", "core.storage"),  # an interface, and the class that implements it
+        ("Cameras", "Counterparts", "Plan", "Transfer"),
+        ("core.ledger", "core.maps"),  # the class that implements an interface, and the interface
     ),
-    **dict.fromkeys(("Cameras", "Counterparts", "Plan", "Transfer"), ("core.ledger", "core.maps")),
-    **dict.fromkeys(("Database", "Write"), ("core.milvus", "core.storage")),  # the same part of the two stores
+    **dict.fromkeys(("Exporter", "Map", "Snapshot"), ("core.maps", "core.storage")),  # likewise
 }
 """Names that several modules define, with the packages of those modules."""
 

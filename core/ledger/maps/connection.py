@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-from core.ledger.database import Connection
+from core.ledger.database import LedgerConnection
 from core.ledger.statements import Statement
 
 
@@ -18,7 +18,7 @@ class MapConnection:
         map_number: of the map.
     """
 
-    def __init__(self, connection: Connection, map_number: int) -> None:
+    def __init__(self, connection: LedgerConnection, map_number: int) -> None:
         self.whole, self.map = connection, map_number
 
     def execute(self, statement: Statement, **values: Any) -> list[tuple[Any, ...]]:

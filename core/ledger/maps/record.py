@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import bindparam, delete, func, select, update
 
 from core.errors import MapExists, UnknownMap
-from core.ledger.database import Connection
+from core.ledger.database import LedgerConnection
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import MAPS, PLACES, SEQUENCES
@@ -97,7 +97,7 @@ _HIGHEST = Statement(
 _DELETE = Statement(delete(MAPS).where(MAPS.c.number == bindparam("map")))
 
 
-def create(connection: Connection, record: MapRecord, name: str | None = None, listed: bool = True) -> int:
+def create(connection: LedgerConnection, record: MapRecord, name: str | None = None, listed: bool = True) -> int:
     """Insert a map without places; returns its number.
 
     Args:
@@ -115,19 +115,19 @@ def create(connection: Connection, record: MapRecord, name: str | None = None, l
     return number
 
 
-def taken(connection: Connection, map_id: str) -> MapExists:
+def taken(connection: LedgerConnection, map_id: str) -> MapExists:
     """The error for an id that a map has."""
     found = connection.execute(_IS_LISTED, id=map_id)
     listed = not found or found[0][0]
     return MapExists(f"There is already a map {map_id!r}." if listed else f"A map {map_id!r} is being made.")
 
 
-def is_taken(connection: Connection, map_id: str) -> bool:
+def is_taken(connection: LedgerConnection, map_id: str) -> bool:
     """Whether a map has this id, or is being built to have it."""
     return bool(connection.execute(_IS_LISTED, id=map_id))
 
 
-def publish(connection: Connection, map_number: int, map_id: str) -> None:
+def publish(connection: LedgerConnection, map_number: int, map_id: str) -> None:
     """List a map that was being built, under its id.
 
     Raises:
@@ -141,7 +141,7 @@ def publish(connection: Connection, map_number: int, map_id: str) -> None:
         raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
 
 
-def unlisted(connection: Connection, untouched_seconds: float = 0) -> dict[str, int]:
+def unlisted(connection: LedgerConnection, untouched_seconds: float = 0) -> dict[str, int]:
     """The numbers of the maps that are being built, by the ids that they have meanwhile.
 
     Args:
@@ -150,7 +150,7 @@ def unlisted(connection: Connection, untouched_seconds: float = 0) -> dict[str, 
     return dict(connection.execute(_UNLISTED, untouched_seconds=untouched_seconds))
 
 
-def find(connection: Connection, map_id: str) -> MapState:
+def find(connection: LedgerConnection, map_id: str) -> MapState:
     """The listed map of an id.
 
     Raises:
@@ -193,7 +193,7 @@ def _state(values: tuple[Any, ...]) -> MapState:
     return MapState(number, record, *counters)
 
 
-def records_after(connection: Connection, after: str, limit: int) -> list[MapRecord]:
+def records_after(connection: LedgerConnection, after: str, limit: int) -> list[MapRecord]:
     """Up to ``limit`` records of listed maps by id."""
     return [_state(values).record for values in connection.execute(_RECORDS, after=after, most=limit)]
 
@@ -228,18 +228,18 @@ def delete_map(connection: MapConnection) -> None:
     connection.change(_DELETE)
 
 
-def numbers(connection: Connection) -> list[int]:
+def numbers(connection: LedgerConnection) -> list[int]:
     """The numbers of all maps, also of unlisted ones."""
     return [number for number, _ in connection.execute(_ALL)]
 
 
-def encoders(connection: Connection) -> list[tuple[str, int]]:
+def encoders(connection: LedgerConnection) -> list[tuple[str, int]]:
     """The encoders of all maps, each with the values of its descriptors."""
     found = (MapRecord.model_validate_json(text) for _, text in connection.execute(_ALL))
     return sorted({(record.encoder, record.dimension) for record in found})
 
 
-def used_collections(connection: Connection) -> dict[int, list[str]]:
+def used_collections(connection: LedgerConnection) -> dict[int, list[str]]:
     """Milvus's ids of the collections that have descriptors of maps, and these maps."""
     found: dict[int, list[str]] = {}
     for collection, map_id in connection.execute(_COLLECTIONS):

@@ -102,7 +102,7 @@ _NEXT = Statement(
 )
 
 
-class Review(ABC):
+class ReviewTable(ABC):
     """The frames of one map that are stored for review (:class:`core.maps.review.Review`).  Any thread may use it."""
 
     objects: ObjectReader | None = None

@@ -74,7 +74,7 @@ class FollowedMap:
 
     @property
     def held(self) -> Followed | None:
-        """What is in memory; None before the first use."""
+        """The state in memory; None before the first use."""
         return self._held
 
     def up_to_date(self, connection: MapConnection, state: MapState) -> Followed:

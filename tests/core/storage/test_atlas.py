@@ -262,7 +262,7 @@ def written_anew(folder: Path, **changes: object) -> None:
     connection = sqlite3.connect(folder / "map.sqlite", isolation_level=None)
     ((text,),) = connection.execute("SELECT record FROM maps").fetchall()
     changed = json.dumps({**json.loads(text), **changes})
-    values = (changed, checksum_of([changed]), json.loads(changed)["id"])
+    values = changed, checksum_of([changed]), json.loads(changed)["id"]
     connection.execute("UPDATE maps SET record = ?, seal = ?, id = ?", values)
     connection.close()
 
