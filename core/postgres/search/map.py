@@ -12,6 +12,7 @@ from core.ledger.maps import frames
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
 from core.ledger.postgres import PostgresLedger
+from core.maps.records import COMPACT_FROM
 from core.maps.selection import Selection
 from core.maps.status import IndexStatus, Progress, no_progress
 from core.postgres import rows
@@ -88,11 +89,11 @@ class CodedMap(PostgresMap):
         return [found.get(int(row)) for row in wanted]
 
     def index_status(self) -> IndexStatus:
-        """How the map is searched; this does not wait."""
+        """How the map is searched; a map of few places is read for that."""
         held = self._followed.held
-        if held is None:
+        if held is None and self._state.places >= COMPACT_FROM:
             return unopened(self.record.index, self._state.places)
-        snapshot = held.snapshot
+        snapshot = self.snapshot() if held is None or self._state.places < COMPACT_FROM else held.snapshot
         return IndexStatus(
             setting=self.record.index,
             tier="exact" if snapshot.table is None else "compact",
