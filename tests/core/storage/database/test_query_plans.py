@@ -38,6 +38,7 @@ ACTIONS: dict[str, Callable[[Map], object]] = {
     "a page": lambda lab: lab.places(None, 5),
     "a page of some": lambda lab: lab.places(None, 5, PlaceFilter(ids=("p1", "p2"))),
     "a page of a sequence": lambda lab: lab.places(None, 5, PlaceFilter(sequence="s")),
+    "a page by metadata": lambda lab: lab.places(None, 5, PlaceFilter(metadata={"floor": 1})),
     "names of sequences": lambda lab: lab.unknown_sequences(["s", "u"]),
     "a scope": lambda lab: lab.scope(Selection(Conditions(sequences=("s",), metadata={"floor": 1}), recent=LAST)),
     "cameras": lambda lab: lab.cameras.put("front", None),
