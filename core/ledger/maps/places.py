@@ -365,10 +365,12 @@ def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:
     return replace(stored, place=stored.place.model_copy(update=changes))
 
 
-def insert(connection: MapConnection, stored: StoredPlace) -> None:
-    """Store a new place."""
-    connection.execute(_INSERT, **sealed(_COLUMNS, _columns_of(stored)))
-    _put_tokens(connection, stored.row, _tokens(stored.place.metadata))
+def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
+    """Store new places."""
+    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored)) for stored in new])
+    tokens = [{"token": token, "row": one.row} for one in new for token in _tokens(one.place.metadata)]
+    if tokens:
+        connection.execute_many(_PUT_TOKEN, tokens)
 
 
 def put(connection: MapConnection, stored: StoredPlace, before: StoredPlace) -> None:
@@ -443,8 +445,8 @@ def token_of(key: str, value: Scalar) -> str:
 
 
 def _put_tokens(connection: MapConnection, row: int, tokens: Iterable[str]) -> None:
-    for token in tokens:
-        connection.execute(_PUT_TOKEN, token=token, row=row)
+    if given := [{"token": token, "row": row} for token in tokens]:
+        connection.execute_many(_PUT_TOKEN, given)
 
 
 def _delete_tokens(connection: MapConnection, stored: StoredPlace) -> None:
