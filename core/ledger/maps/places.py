@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import and_, bindparam, delete, func, select, update
+from sqlalchemy import and_, bindparam, delete, exists, func, literal_column, select, update
 
 from core.errors import UnknownPlace
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed, sealed_columns
@@ -278,8 +278,10 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     for name in names:
         query = query.where(all_conditions[name])
     for at in range(values):
-        with_token = select(_T.row).where(_T.map == bindparam("map"), _T.token == bindparam(f"token_{at}"))
-        query = query.where(_P.row.in_(with_token))
+        has_token = exists(literal_column("1")).where(
+            _T.map == bindparam("map"), _T.token == bindparam(f"token_{at}"), _T.row == _P.row
+        )
+        query = query.where(has_token)
     return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 
 

@@ -136,7 +136,7 @@ def test_a_picture_may_be_in_an_object_store(two: MemoryMap) -> None:
     with two._writing() as write:
         frames.delete_frames(write.connection, [0])
         far = StoredObject("objects/1", len(picture), hashlib.sha256(picture).digest())
-        frames.put_picture(write.connection, 0, far)
+        frames.put_pictures(write.connection, {0: far})
         assert frames.pictures_at(write.connection, [0, 1]) == {0: far, 1: b"thumbnail of b"}
         assert frames.stored_pictures_at(write.connection, [0]) == {}
     with pytest.raises(StorageFailure, match="configured without one"):

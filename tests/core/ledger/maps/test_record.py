@@ -8,7 +8,7 @@ import pytest
 
 from core.errors import MapExists, UnknownMap
 from core.ledger import Ledger
-from core.ledger.database import Connection
+from core.ledger.database import LedgerConnection
 from core.ledger.maps import record, sequences
 from core.ledger.maps.connection import MapConnection
 from core.ledger.postgres import PostgresConnection
@@ -17,17 +17,17 @@ from tests.core.storage.frames import frame
 
 
 @pytest.fixture
-def whole(ledger: Ledger) -> Iterator[Connection]:
+def whole(ledger: Ledger) -> Iterator[LedgerConnection]:
     """A connection to a ledger in which there is the map "hall", in one transaction of the test."""
     with ledger.transaction("test") as connection:
         yield connection
 
 
-def names(connection: Connection) -> list[str]:
+def names(connection: LedgerConnection) -> list[str]:
     return [one.id for one in record.records_after(connection, "", 10)]
 
 
-def test_an_id_is_of_one_map(whole: Connection) -> None:
+def test_an_id_is_of_one_map(whole: LedgerConnection) -> None:
     number = record.create(whole, record_of("lab"))
     assert record.find(whole, "lab").number == number and names(whole) == ["hall", "lab"]
     assert record.find(whole, "hall").number != number
@@ -43,7 +43,7 @@ def test_an_id_is_of_one_map(whole: Connection) -> None:
     assert sequences.ends(of_lab) == {None: 0}
 
 
-def test_a_map_that_is_built_is_listed_when_it_is_published(whole: Connection) -> None:
+def test_a_map_that_is_built_is_listed_when_it_is_published(whole: LedgerConnection) -> None:
     number = record.create(whole, record_of("lab"), listed=False)
     assert names(whole) == ["hall"] and record.unlisted(whole) == {"lab": number}
     assert record.unlisted(whole, untouched_seconds=3600) == {}
