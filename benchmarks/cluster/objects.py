@@ -17,9 +17,8 @@ import numpy as np
 import typer
 
 from core.maps import MapSettings
-from core.milvus import open_store
+from core.milvus import ledger, open_store
 from core.milvus.map import MilvusMap
-from core.postgres import rows
 from core.postgres.pictures.objects import Objects
 from core.postgres.pictures.stored import new_object
 from tests.core.milvus.servers import running_servers
@@ -61,15 +60,16 @@ def main(places: int = 320, bytes_: int = typer.Option(8000, "--bytes")) -> None
             read = milliseconds(lambda lab=lab, names=names: lab.picture(next(names)), places)  # type: ignore[misc]
             print(f"{title}: enrolment {one:.1f} ms a place alone, {many:.1f} in 16; a picture {read:.1f} ms")
             if bucket is None:
+                rows = list(range(OF_A_QUERY))
 
-                def frames(lab: MilvusMap = lab) -> None:
+                def frames(lab: MilvusMap = lab, rows: list[int] = rows) -> None:
                     with lab.viewing() as (connection, _):
-                        rows.locals_at(connection, range(OF_A_QUERY))
+                        ledger.of_frames(connection, lab.number, "local", rows)
 
                 print(f"{OF_A_QUERY} frames from PostgreSQL: {milliseconds(frames, 50):.1f} ms")
             else:
                 objects, content = Objects(bucket), os.urandom(bytes_)
-                stored = [new_object("trial", number, content) for number in range(OF_A_QUERY)]
+                stored: list[StoredObject] = [new_object("trial", number, content) for number in range(OF_A_QUERY)]
                 objects.put({one.name: content for one in stored})
                 taken = milliseconds(lambda objects=objects, stored=stored: objects.read(stored), 50)  # type: ignore[misc]
                 print(f"{OF_A_QUERY} objects: {taken:.1f} ms")
