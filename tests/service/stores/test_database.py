@@ -16,7 +16,7 @@ from tests.service.shared.postgres import Postgres
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
 SOON = 20.0
-"""Seconds within which a request of a silent database is answered; without a deadline of its own it takes 75 or more."""
+"""Seconds within which a request is answered while the database is silent; it would be 75 and more without limits."""
 
 
 @pytest.fixture
