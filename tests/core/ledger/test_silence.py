@@ -16,9 +16,9 @@ from core.errors import StoreUnavailable
 from core.ledger import Statement
 from core.ledger import postgres as connections
 from core.ledger.postgres import PostgresLedger
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.postgres, pytest.mark.timeout(120)]
 
 _ONE = Statement(select(1))
 

@@ -19,9 +19,9 @@ from core.postgres.search import following
 from core.postgres.search.cache import RowCache
 from core.postgres.search.map import CodedMap
 from core.postgres.search.store import CodedStore
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
 
 DIMENSION, LOCAL = 64, (4, 8)
 

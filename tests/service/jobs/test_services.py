@@ -21,7 +21,7 @@ from tests.service.jobs.services import Gate, Service, end_of
 from tests.service.jobs.worker import walk
 from tests.service.server import ROOT
 
-pytestmark = [pytest.mark.cluster]
+pytestmark = pytest.mark.postgres
 
 
 @pytest.fixture
