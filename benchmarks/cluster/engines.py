@@ -17,6 +17,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -101,8 +102,9 @@ def filled(stores: Mapping[str, Store], places: int, found: Times) -> NDArray[np
 
 def searched(map_: Map, query: NDArray[np.float32]) -> NDArray[np.int64]:
     """The best rows, of which the cells are read as the second stage reads them."""
-    ((rows, _),) = map_.scope().search(query[np.newaxis])
-    map_.snapshot().locals_at(rows[:30])
+    scope = map_.scope()
+    ((rows, _),) = scope.search(query[np.newaxis])
+    scope.snapshot.locals_at(rows[:30])
     return rows
 
 
@@ -147,12 +149,12 @@ def storage(places: int, found: Times, drives: int) -> None:
                     work = lambda query, name=name: searched(maps[name], query)  # noqa: E731
                     taken = seconds_of(lambda work=work: list(pool.map(work, queries)))  # type: ignore[misc]
                     found[name]["8 at once, searches/s"].append(len(queries) / taken)
-        drive = Drive(9)
-        for number in range(40):
-            (item,) = frames_of(drive.descriptors(1), drive.local, 10**6 + number)
+        other = Drive(9)
+        for number, query in enumerate(queries[:40]):
+            (item,) = frames_of(other.descriptors(1), other.local, 10**6 + number)
             for name in ENGINES:
                 maps[name].enrol([item])
-                taken = seconds_of(lambda name=name: searched(maps[name], queries[number]))  # type: ignore[misc]
+                taken = seconds_of(lambda name=name, query=query: searched(maps[name], query))  # type: ignore[misc]
                 found[name]["search right after a write, ms"].append(1e3 * taken)
 
 
@@ -171,9 +173,7 @@ def services(places: int, found: Times, rounds: int) -> None:
         for first in range(0, places, BATCH):
             for name, client in clients.items():
                 count = min(BATCH, places - first)
-                taken = seconds_of(
-                    lambda client=client, count=count, first=first: enrol(client, "lab", frames, first, count)
-                )  # type: ignore[misc]
+                taken = seconds_of(partial(enrol, client, "lab", frames, first, count))
                 found[name]["enrolment with encoding, places/s"].append(count / taken)
         for turn in range(rounds):
             for name in ENGINES[:: 1 if turn % 2 else -1]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Literal
 
 import psycopg
-from psycopg import Connection, IsolationLevel
+from psycopg import Connection
 from psycopg.conninfo import conninfo_to_dict
 from psycopg_pool import ConnectionPool, PoolTimeout
 
@@ -43,6 +45,9 @@ connection by itself for minutes."""
 PROBE_SECONDS = 2
 """How long it may take to answer to a connection that has not been used for a while, or after an outage."""
 
+CHECKED_SECONDS = 0.5
+"""A connection that has answered within this time is used without a question whether it still does."""
+
 LONG_SECONDS = 600.0
 """The same for statements that may rightly take long: those that wait for a lock, or delete a map."""
 
@@ -55,9 +60,11 @@ class TimedConnection(Connection[Any]):
     """A connection that is given up when a statement gets no answer in time.
 
     seconds: how long each statement may take.
+    answered: when it answered last, by the monotonic clock.
     """
 
     seconds = ANSWER_SECONDS
+    answered = -math.inf
 
     def wait(self, gen: Any, interval: float = 0.1, timeout: float | None = None) -> Any:
         """Wait for the answer to a statement; psycopg calls this for each.
@@ -66,7 +73,9 @@ class TimedConnection(Connection[Any]):
             psycopg.OperationalError: there is none in time; the connection is closed.
         """
         try:
-            return super().wait(gen, interval=interval, timeout=self.seconds if timeout is None else timeout)
+            found = super().wait(gen, interval=interval, timeout=self.seconds if timeout is None else timeout)
+            self.answered = time.monotonic()
+            return found
         except psycopg.errors._WaitTimeout as error:
             self.pgconn.finish()
             raise psycopg.OperationalError(f"it does not answer within {self.seconds:.0f} s") from error
@@ -149,6 +158,7 @@ class Postgres:
         self.address, self._make_tables, self._most = address, make_tables, most_connections
         self._settings, self._configure = {**SETTINGS, **settings}, configure
         self._outage = Outage("PostgreSQL", probe=self._probe)
+        self._lost = -math.inf  # when a connection was lost, by the monotonic clock
         self._opening = threading.Lock()
         self._pool: ConnectionPool[TimedConnection] | None = None
 
@@ -163,7 +173,7 @@ class Postgres:
                 self._pool = ConnectionPool(
                     self.address, connection_class=TimedConnection, min_size=1, max_size=self._most,
                     timeout=PATIENCE_SECONDS, kwargs=self._settings,
-                    configure=self._configure, check=_check, open=True,
+                    configure=self._configure, check=self._check, open=True,
                     reconnect_timeout=_RECONNECTING_SECONDS,
                 )  # fmt: skip
             return self._pool
@@ -179,6 +189,11 @@ class Postgres:
         with postgres_errors(action), TimedConnection.connect(self.address, **self._settings) as connection:
             connection.seconds = seconds
             yield connection
+
+    def _check(self, connection: TimedConnection) -> None:
+        """Raise unless a connection answers; it is not asked if it did a moment ago, and no other was lost since."""
+        if connection.answered < max(self._lost, time.monotonic() - CHECKED_SECONDS):
+            _check(connection)
 
     def _probe(self) -> None:
         """Raise Unreachable unless PostgreSQL answers soon."""
@@ -207,6 +222,9 @@ class Postgres:
                 with self.alone("answer"):  # raises if it cannot be reached
                     pass
                 raise StoreUnavailable("All connections to PostgreSQL are in use.") from error
+            except Unreachable:
+                self._lost = time.monotonic()
+                raise
 
     def close(self) -> None:
         """Close all connections."""
@@ -235,7 +253,7 @@ class PostgresConnection:
         """Execute a statement; the rows that it gives."""
         compiled = statement.compiled("postgresql")
         cursor = self.driver.execute(compiled.text, compiled.values(values))
-        return [] if cursor.description is None else cursor.fetchall()
+        return cursor.fetchall() if compiled.returns else []
 
     def pages(self, statement: Statement, size: int, **values: Any) -> Iterator[list[tuple[Any, ...]]]:
         """Execute a statement within a transaction; the rows that it gives, up to ``size`` at a time."""
@@ -331,16 +349,21 @@ class PostgresLedger(Postgres):
             yield PostgresConnection(connection)
 
     @contextmanager
+    def glancing(self, action: str = "read") -> Iterator[PostgresConnection]:
+        """A connection for single statements, each of which sees its own moment."""
+        with self.connection(action) as connection:
+            yield PostgresConnection(connection)
+
+    @contextmanager
     def reading(self, action: str = "read") -> Iterator[PostgresConnection]:
         """A transaction that sees the moment of its first statement, and writes nothing."""
         with self.connection(action) as connection:
-            connection.isolation_level, connection.read_only = IsolationLevel.REPEATABLE_READ, True
+            connection.execute("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY")
             try:
-                with connection.transaction():
-                    yield PostgresConnection(connection)
+                yield PostgresConnection(connection)
             finally:
-                with suppress(psycopg.Error):  # a lost connection is thrown away
-                    connection.isolation_level, connection.read_only = None, None
+                if not connection.closed:
+                    connection.execute("ROLLBACK")
 
     @contextmanager
     def locked(

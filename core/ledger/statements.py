@@ -41,12 +41,14 @@ _NEVER_STORED = re.compile("[\\x00\\ud800-\\udfff]")
 class Compiled:
     """The text of a statement in one dialect.
 
+    returns: whether it gives rows.
     names: of its parameters in the order of their marks; None where they are bound by name.
     constants: values of parameters that the statement itself gives.
     finds: whether it stores no parameter, so that a text that is never stored is one that it does not find.
     """
 
     text: str
+    returns: bool
     names: tuple[str, ...] | None
     constants: Mapping[str, Any]
     finds: bool
@@ -102,7 +104,9 @@ class Statement:
         assert isinstance(made, SQLCompiler)
         constants = {key: made.params[key] for bind, key in made.bind_names.items() if not bind.required}
         names = None if made.positiontup is None else tuple(made.positiontup)
-        return Compiled(str(made), names, constants, finds=not (made.isinsert or made.isupdate))
+        writes = made.isinsert or made.isupdate
+        returns = bool(made.effective_returning) if writes or made.isdelete else True
+        return Compiled(str(made), returns, names, constants, finds=not writes)
 
 
 class among(ColumnElement[bool]):  # noqa: N801 – an expression, as SQLAlchemy names its own

@@ -40,6 +40,7 @@ class Tables:
             made += [
                 str(CreateIndex(index).compile(dialect=DIALECTS[dialect]))
                 for index in sorted(table.indexes, key=lambda index: str(index.name))
+                if (only := index._ddl_if) is None or only.dialect == dialect
             ]
         return [*made, *self.more.get(dialect, ())]
 

@@ -43,7 +43,7 @@ class MilvusWrite(PostgresWrite):
         if waiting is None:
             if before is not None and before.key is not None:
                 rows.leave_key(self.connection, before.key)
-            stored = replace(stored, key=rows.new_key(self.connection))
+            stored = replace(stored, key=rows.new_key(self._connection))
         self._entities[stored.number] = stored
         return stored
 

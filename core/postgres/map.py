@@ -64,8 +64,8 @@ class PostgresMap(LedgerMap):
 
     @property
     def state(self) -> object:
-        with self.viewing() as (_, state):
-            return state.number, state.revision
+        state = self.latest()
+        return state.number, state.revision
 
     def open(self) -> None:
         """Raise if the map is gone."""
@@ -96,9 +96,20 @@ class PostgresMap(LedgerMap):
         with self.viewing() as (connection, _):
             yield connection
 
+    @contextmanager
+    def _glancing(self) -> Iterator[MapConnection]:
+        with self.database.glancing() as whole:
+            yield MapConnection(whole, self.number)
+
     def count_places(self) -> int:
-        with self.viewing() as (_, state):
-            return state.places
+        return self.latest().places
+
+    def latest(self) -> MapState:
+        """The state of the map at this moment, by one statement."""
+        with self._glancing() as connection:
+            state = record.state_of(connection, self.record.id)
+        self.note(state)
+        return state
 
     def storage_status(self) -> StorageStatus:
         """How much room the map takes in PostgreSQL."""

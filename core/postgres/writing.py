@@ -72,7 +72,7 @@ class PostgresWrite(Write):
         if self._objects is None:
             return picture
         if self._object_key is None:
-            self._object_key = rows.new_object_key(self.connection)
+            self._object_key = rows.new_object_key(self._connection)
         made = new_object(*self._object_key, picture)
         self._pictures[made.name] = picture
         return made
@@ -83,7 +83,7 @@ class PostgresWrite(Write):
         Raises:
             StorageFull, StorageFailure: one of them refuses; nothing counts of what they may have taken.
         """
-        rows.put_descriptors(self.connection, self._new, self._codes())
+        rows.put_descriptors(self.connection, self._new, self._made_codes())
         if self.state != self._before:
             rows.note_revision(self.connection, self.state.revision, self.state.stamp)
         if self._objects is None or not self._pictures:
@@ -96,7 +96,7 @@ class PostgresWrite(Write):
             self._objects.discard(list(self._pictures))
             raise
 
-    def _codes(self) -> dict[int, bytes]:
+    def _made_codes(self) -> dict[int, bytes]:
         """The codes of new rows, if the engine has any."""
         return {}
 

@@ -10,7 +10,7 @@ import logging
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from sqlalchemy import and_, bindparam, delete, exists, func, select, union
 
@@ -138,14 +138,17 @@ def checksum_of(record: bytes, digest: bytes) -> int:
 # Pictures
 
 
-def put_picture(connection: MapConnection, row: int, picture: StoredPicture) -> None:
-    """Store the picture of a frame that has none."""
-    if isinstance(picture, StoredObject):
-        given = {"digest": picture.digest, "size": picture.size, "bytes": None, "object": picture.name}
-    else:
-        digest = hashlib.sha256(picture).digest()
-        given = {"digest": digest, "size": len(picture), "bytes": picture, "object": None}
-    connection.execute(_PUT_PICTURE, row=row, **given)
+def put_pictures(connection: MapConnection, pictures: Mapping[int, StoredPicture]) -> None:
+    """Store the pictures of frames that have none, by row."""
+    given: list[dict[str, Any]] = []
+    for row, picture in pictures.items():
+        if isinstance(picture, StoredObject):
+            columns = {"digest": picture.digest, "size": picture.size, "bytes": None, "object": picture.name}
+        else:
+            digest = hashlib.sha256(picture).digest()
+            columns = {"digest": digest, "size": len(picture), "bytes": picture, "object": None}
+        given.append({"row": row, **columns})
+    connection.execute_many(_PUT_PICTURE, given)
 
 
 def pictures_at(
@@ -249,9 +252,15 @@ def records_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, byte
     return found
 
 
-def put_keypoints(connection: MapConnection, row: int, digest: bytes, record: bytes) -> None:
-    """Store the record of the keypoints of a frame with this digest, in the place of any other."""
-    connection.execute(_PUT_KEYPOINTS, row=row, checksum=checksum_of(record, digest), record=record)
+def put_keypoints(connection: MapConnection, records: Mapping[int, tuple[bytes, bytes]]) -> None:
+    """Store records of keypoints in the place of any others: digest of the frame and record, by row."""
+    connection.execute_many(
+        _PUT_KEYPOINTS,
+        [
+            {"row": row, "checksum": checksum_of(record, digest), "record": record}
+            for row, (digest, record) in records.items()
+        ],
+    )
 
 
 def without_keypoints(connection: MapConnection, after: int, limit: int) -> list[PicturedPlace]:

@@ -70,6 +70,10 @@ class LedgerMap(ABC):
     def _reading(self) -> AbstractContextManager[MapConnection]:
         """A transaction that reads the map, and raises if the map is gone."""
 
+    def _glancing(self) -> AbstractContextManager[MapConnection]:
+        """A connection for single statements about rows, which find nothing if the map is gone."""
+        return self._reading()
+
     @abstractmethod
     def _writing(self) -> AbstractContextManager[Write]:
         """One write, which is stored whole at the end of the block, or not at all."""
@@ -123,7 +127,7 @@ class LedgerMap(ABC):
         return None if stored is None else stored.digest
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        with self._reading() as connection:
+        with self._glancing() as connection:
             found = places.at_rows(connection, [int(row) for row in rows])
         return [None if (stored := found.get(int(row))) is None else stored.place for row in rows]
 
@@ -141,7 +145,7 @@ class LedgerMap(ABC):
             and where the stored ones are damaged, which is logged.
         """
         wanted = [int(row) for row in rows]
-        with self._reading() as connection:
+        with self._glancing() as connection:
             found = frames.keypoints_at(connection, wanted)
         return [found.get(row) for row in wanted]
 
@@ -234,6 +238,7 @@ class LedgerMap(ABC):
             return []
         with self._writing() as write:
             write.expect(len(new))
+            write.look_for([item.id for item in items])
             return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import and_, bindparam, delete, func, select, update
+from sqlalchemy import and_, bindparam, delete, exists, func, literal_column, select, update
 
 from core.errors import UnknownPlace
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed, sealed_columns
@@ -284,8 +284,10 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     for name in names:
         query = query.where(all_conditions[name])
     for at in range(values):
-        with_token = select(_T.row).where(_T.map == bindparam("map"), _T.token == bindparam(f"token_{at}"))
-        query = query.where(_P.row.in_(with_token))
+        has_token = exists(literal_column("1")).where(
+            _T.map == bindparam("map"), _T.token == bindparam(f"token_{at}"), _T.row == _P.row
+        )
+        query = query.where(has_token)
     return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 
 
@@ -363,10 +365,12 @@ def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:
     return replace(stored, place=stored.place.model_copy(update=changes))
 
 
-def insert(connection: MapConnection, stored: StoredPlace) -> None:
-    """Store a new place."""
-    connection.execute(_INSERT, **sealed(_COLUMNS, _columns_of(stored)))
-    _put_tokens(connection, stored.row, _tokens(stored.place.metadata))
+def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
+    """Store new places."""
+    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored)) for stored in new])
+    tokens = [{"token": token, "row": one.row} for one in new for token in _tokens(one.place.metadata)]
+    if tokens:
+        connection.execute_many(_PUT_TOKEN, tokens)
 
 
 def put(connection: MapConnection, stored: StoredPlace, before: StoredPlace) -> None:
@@ -441,8 +445,8 @@ def token_of(key: str, value: Scalar) -> str:
 
 
 def _put_tokens(connection: MapConnection, row: int, tokens: Iterable[str]) -> None:
-    for token in tokens:
-        connection.execute(_PUT_TOKEN, token=token, row=row)
+    if given := [{"token": token, "row": row} for token in tokens]:
+        connection.execute_many(_PUT_TOKEN, given)
 
 
 def _delete_tokens(connection: MapConnection, stored: StoredPlace) -> None:

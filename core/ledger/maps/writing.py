@@ -22,7 +22,7 @@ from core.maps.enrolling import picture_of
 from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import moment_text, same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
-from core.places import Place, PlaceFields, Pose
+from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
 
 Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
 """The descriptor, float32 [D], and the local descriptors, int8 [C, L], of one frame."""
@@ -31,16 +31,46 @@ Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
 class Write(ABC):
     """Collects the changes of one write within a transaction; ``finish`` comes before its COMMIT.
 
-    connection: of the transaction, in which nobody else writes to the map.
+    New places, pictures and keypoints are stored many at a time: when something else is to be read or written, and at
+    the end.
+
     state: of the map, with the changes so far.
     changed: whether anything was changed, the counters apart.
     """
 
     def __init__(self, connection: MapConnection, state: MapState) -> None:
-        self.connection, self.state, self.changed = connection, state, False
+        self._connection, self.state, self.changed = connection, state, False
         self._before = state
+        self._found: dict[str, StoredPlace | None] = {}  # by id, as they are now
+        self._codes: dict[str, int] = {}  # of sequences
+        self._ordinals: dict[int, int] = {}  # the next of each sequence, that is not stored yet
+        self._places: list[StoredPlace] = []
+        self._pictures_by_row: dict[int, StoredPicture] = {}
+        self._keypoints: dict[int, tuple[bytes, bytes]] = {}  # digest of the frame and record, by row
         self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
         self._now = datetime.now(UTC)
+
+    @property
+    def connection(self) -> MapConnection:
+        """The connection of the transaction, in which nobody else writes to the map and all changes so far show."""
+        self._store_waiting()
+        return self._connection
+
+    def _store_waiting(self) -> None:
+        """Store what waits to be stored."""
+        connection = self._connection
+        if self._places:
+            waiting, self._places = self._places, []
+            places.insert(connection, waiting)
+        if self._pictures_by_row:
+            pictures, self._pictures_by_row = self._pictures_by_row, {}
+            frames.put_pictures(connection, pictures)
+        if self._keypoints:
+            keypoints, self._keypoints = self._keypoints, {}
+            frames.put_keypoints(connection, keypoints)
+        ordinals, self._ordinals = self._ordinals, {}
+        for code, following in ordinals.items():
+            sequences.keep_free(connection, code, following)
 
     # An engine of vectors
 
@@ -88,6 +118,16 @@ class Write(ABC):
         """The map's record."""
         return self.state.record
 
+    def look_for(self, place_ids: Sequence[str]) -> None:
+        """Read the places of some ids at once, which are enrolled next."""
+        found = places.of_ids(self.connection, place_ids)
+        self._found.update({place_id: found.get(place_id) for place_id in place_ids})
+
+    def _find(self, place_id: str) -> StoredPlace | None:
+        if place_id not in self._found:
+            self._found[place_id] = places.find(self.connection, place_id)
+        return self._found[place_id]
+
     def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
         """Create a place, replace its frame, or change its fields if the frame is the same.
 
@@ -95,7 +135,7 @@ class Write(ABC):
             keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
-        stored = places.find(self.connection, item.id)
+        stored = self._find(item.id)
         if stored is not None and stored.digest == item.digest:
             if item.keypoints is not None and not frames.has_keypoints(self.connection, stored.row):
                 self._put_keypoints(stored, item.keypoints)
@@ -113,17 +153,17 @@ class Write(ABC):
             made = self._put(self._with_fields(shown, item.fields, look, stored), stored)
             self._leave(stored)
         if picture is not None:
-            frames.put_picture(self.connection, row, self.picture_to_store(picture))
+            self.put_picture(row, picture)
         if item.keypoints is not None:
             self._put_keypoints(made, item.keypoints)
         return made.place, "created" if stored is None else "replaced"
 
     def _create(self, item: Enrolment, values: dict[str, Any], look: Look, ordinal: int | None) -> StoredPlace:
-        code, at = sequences.code_of(self.connection, item.fields.sequence), ordinal
+        code, at = self._code_of(item.fields.sequence), ordinal
         if at is None:
             at = self._position(item.fields.sequence, look)
         if at is None:
-            at = sequences.next_ordinal(self.connection, code)
+            at = self._next_ordinal(code)
         now = moment_text(self._now)
         made = places.placed(
             item.id, item.fields, code, at, number=self.state.numbers, revision=self._revision,
@@ -137,7 +177,8 @@ class Write(ABC):
     def insert(self, stored: StoredPlace) -> StoredPlace:
         """Store a new place, whose row counts already."""
         made = self._prepared(stored, None, True)
-        places.insert(self.connection, made)
+        self._places.append(made)
+        self._found[made.place.id] = made
         self.state = replace(self.state, numbers=made.number + 1, places=self.state.places + 1)
         self._note(made)
         return made
@@ -145,11 +186,32 @@ class Write(ABC):
     def _put(self, stored: StoredPlace, before: StoredPlace, searched: bool = True) -> StoredPlace:
         made = self._prepared(replace(stored, revision=self._revision), before, searched)
         places.put(self.connection, made, before)
+        self._found[made.place.id] = made
         if made.sequence != before.sequence:
-            sequences.drop_if_empty(self.connection, before.sequence)
+            self._drop_if_empty(before.sequence)
         self.changed = True
         self._note(made)
         return made
+
+    def _code_of(self, sequence: str | None) -> int:
+        """The code of a sequence, which is made if there is none."""
+        if sequence is None:
+            return NO_SEQUENCE
+        if sequence not in self._codes:
+            self._codes[sequence] = sequences.code_of(self._connection, sequence)
+        return self._codes[sequence]
+
+    def _next_ordinal(self, code: int) -> int:
+        """The ordinal of the next place of a sequence, which counts as taken."""
+        if code not in self._ordinals:
+            self._ordinals[code] = sequences.next_ordinal(self._connection, code)
+        ordinal = self._ordinals[code]
+        self._ordinals[code] = ordinal + 1
+        return ordinal
+
+    def _drop_if_empty(self, code: int) -> None:
+        sequences.drop_if_empty(self.connection, code)
+        self._codes.clear()
 
     @property
     def _revision(self) -> int:
@@ -197,8 +259,8 @@ class Write(ABC):
         if moves or self._leaves(before, fields, look):
             new_look = look or replace(self._looks([stored.row])[0], pose=fields.pose)
             at = self._position(fields.sequence, new_look)
-            code = sequences.code_of(self.connection, fields.sequence) if moves else stored.sequence
-            at = sequences.next_ordinal(self.connection, code) if at is None else at
+            code = self._code_of(fields.sequence) if moves else stored.sequence
+            at = self._next_ordinal(code) if at is None else at
             changed = replace(changed, sequence=code, ordinal=at)
         self._latest.clear()
         return changed
@@ -217,12 +279,20 @@ class Write(ABC):
 
     def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
         if self.record.verification:
-            frames.put_keypoints(self.connection, stored.row, stored.digest, found.record())
-            self.changed = True
+            self.put_keypoints(stored, found.record())
+
+    def put_picture(self, row: int, picture: bytes) -> None:
+        """Store the picture of a frame that has none."""
+        self._pictures_by_row[row] = self.picture_to_store(picture)
+
+    def put_keypoints(self, stored: StoredPlace, record: bytes) -> None:
+        """Store the record of the keypoints of a place's frame, in the place of any other."""
+        self._keypoints[stored.row] = stored.digest, record
+        self.changed = True
 
     def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
-        stored = places.find(self.connection, frame.id)
+        stored = self._find(frame.id)
         if stored is None or stored.digest != frame.digest or frames.has_keypoints(self.connection, stored.row):
             return False
         self._put_keypoints(stored, found)
@@ -230,7 +300,7 @@ class Write(ABC):
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
-        stored = places.find(self.connection, item.id)
+        stored = self._find(item.id)
         return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
 
     def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
@@ -243,7 +313,8 @@ class Write(ABC):
         """Store a place of another map with its history."""
         self.enrol(item, history.picture, history.ordinal)
         self._latest.clear()
-        stored = places.expect(self.connection, item.id)
+        stored = self._find(item.id)
+        assert stored is not None
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
         changed = replace(places.with_place(stored, **moments), ordinal=ordinal)
@@ -265,7 +336,8 @@ class Write(ABC):
     def forget(self, stored: StoredPlace) -> None:
         """Delete a place."""
         places.remove(self.connection, stored)
-        sequences.drop_if_empty(self.connection, stored.sequence)
+        self._found[stored.place.id] = None
+        self._drop_if_empty(stored.sequence)
         self._latest.clear()
         self.state = replace(self.state, places=self.state.places - 1)
         self._leave(stored)
@@ -274,7 +346,7 @@ class Write(ABC):
         """Replace the map's record, with the next revision."""
         made = changed.model_copy(update={"revision": self.record.revision + 1, "updated_at": self._now})
         self.state = replace(self.state, record=made)
-        record.put_record(self.connection, made)
+        record.put_record(self._connection, made)
 
     def finish(self) -> None:
         """Store the state of the map, after what the engine of vectors has to do; nothing is left out of the COMMIT.
@@ -284,6 +356,7 @@ class Write(ABC):
         """
         if self.changed or self.state != self._before:
             self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8))
+        self._store_waiting()
         self._finish()
         if self.state != self._before:
-            record.put_counters(self.connection, self.state)
+            record.put_counters(self._connection, self.state)

@@ -77,12 +77,16 @@ class FollowedMap:
         """The state in memory; None before the first use."""
         return self._held
 
+    def as_of(self, state: MapState) -> Followed | None:
+        """The snapshot that is held, if it shows this state; else None."""
+        held = self._held
+        return held if held is not None and (held.revision, held.stamp) == (state.revision, state.stamp) else None
+
     def up_to_date(self, connection: MapConnection, state: MapState) -> Followed:
         """The snapshot of a state of the map that was read in this transaction."""
-        held = self._held
-        if held is None or (held.revision, held.stamp) != (state.revision, state.stamp):
+        if (held := self.as_of(state)) is None:
             with self._lock:
-                held = self._advanced(connection, state)
+                held = self.as_of(state) or self._advanced(connection, state)
         return held
 
     def _advanced(self, connection: MapConnection, state: MapState) -> Followed:

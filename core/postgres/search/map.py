@@ -12,13 +12,14 @@ from core.ledger.maps import frames
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
 from core.ledger.postgres import PostgresLedger
+from core.maps.records import COMPACT_FROM
 from core.maps.selection import Selection
 from core.maps.status import IndexStatus, Progress, no_progress
 from core.postgres import rows
 from core.postgres.forms import Form
 from core.postgres.map import PostgresMap
 from core.postgres.search.cache import RowCache
-from core.postgres.search.following import DESCRIPTORS_AT_ONCE, Followed, FollowedMap
+from core.postgres.search.following import DESCRIPTORS_AT_ONCE, FollowedMap
 from core.postgres.writing import PostgresWrite
 from core.storage.search.scopes import Chooser
 from core.storage.search.snapshot import SearchScope, Snapshot
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 class CodedWrite(PostgresWrite):
     """A write that stores the codes of its rows."""
 
-    def _codes(self) -> dict[int, bytes]:
+    def _made_codes(self) -> dict[int, bytes]:
         if not self._new:
             return {}
         descriptors = self._form.descriptors([descriptor for descriptor, _ in self._new.values()])
@@ -59,19 +60,18 @@ class CodedMap(PostgresMap):
         """False: a query asks PostgreSQL for the revision."""
         return False
 
-    def _view(self, connection: MapConnection, state: MapState) -> Followed:
-        return self._followed.up_to_date(connection, state)
-
     def snapshot(self) -> Snapshot:
         """All places at this moment, for searching; later writes do not change the snapshot."""
+        if (held := self._followed.as_of(self.latest())) is not None:
+            return held.snapshot
         with self.viewing() as (connection, state):
-            return self._view(connection, state).snapshot
+            return self._followed.up_to_date(connection, state).snapshot
 
     def scope(self, selection: Selection | None = None) -> SearchScope:
+        if not selection:
+            return SearchScope(self.snapshot())
         with self.viewing() as (connection, state):
-            snapshot = self._view(connection, state).snapshot
-            if not selection:
-                return SearchScope(snapshot)
+            snapshot = self._followed.up_to_date(connection, state).snapshot
             return Chooser(snapshot, lambda: nullcontext(connection)).scope(selection)
 
     def keypoints_at(self, wanted: Sequence[int]) -> list[Keypoints | None]:
@@ -82,18 +82,18 @@ class CodedMap(PostgresMap):
         cached = self._cache.get(list(keys.values()))
         found = {row: keypoints_of(cached[key]) for row, key in keys.items() if key in cached}
         if missing := [row for row in keys if row not in found]:
-            with self._reading() as connection:
+            with self._glancing() as connection:
                 read = frames.keypoints_at(connection, missing)
             self._cache.put({keys[row]: one.record() for row, one in read.items()})
             found |= read
         return [found.get(int(row)) for row in wanted]
 
     def index_status(self) -> IndexStatus:
-        """How the map is searched; this does not wait."""
+        """How the map is searched; a map of few places is read for that."""
         held = self._followed.held
-        if held is None:
+        if held is None and self._state.places >= COMPACT_FROM:
             return unopened(self.record.index, self._state.places)
-        snapshot = held.snapshot
+        snapshot = self.snapshot() if held is None or self._state.places < COMPACT_FROM else held.snapshot
         return IndexStatus(
             setting=self.record.index,
             tier="exact" if snapshot.table is None else "compact",

@@ -31,10 +31,14 @@ class PostgresRows:
     A row belongs to the same frame for ever, so what was read stays right; unless the database is restored to an
     earlier moment, and then another object of this class takes its place, which shares nothing with it in the cache.
 
+    part_rows: rows that are compared by one thread.
+
     Args:
         map_number, record: of the map.
         cache: of all maps.
     """
+
+    part_rows = 128
 
     def __init__(self, database: PostgresLedger, map_number: int, record: MapRecord, cache: RowCache) -> None:
         self._database, self._map, self._cache = database, map_number, cache
@@ -68,7 +72,7 @@ class PostgresRows:
         cached = self._cache.get(list(keys.values()))
         found = {row: cached[key] for row, key in keys.items() if key in cached}
         if missing := [row for row in keys if row not in found]:
-            with self._database.reading() as connection:
+            with self._database.glancing() as connection:
                 read = _READ[kind](MapConnection(connection, self._map), missing)
             self._cache.put({keys[row]: value for row, value in read.items()})
             found |= read

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidArchive, InvalidField
-from core.ledger.maps import frames, places, sequences
+from core.ledger.maps import places, sequences
 from core.ledger.maps.cameras import put_camera
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.frames import StoredPicture
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
@@ -28,14 +27,17 @@ from core.storage.files.segment_files import Layout
 class ImportWrite(Protocol):
     """A write that takes descriptors as an export file has them."""
 
-    connection: MapConnection
     state: MapState
     changed: bool
+
+    @property
+    def connection(self) -> MapConnection: ...
 
     def expect(self, count: int) -> None: ...
     def add_stored(self, frame: NDArray[np.void]) -> int: ...
     def insert(self, stored: StoredPlace) -> StoredPlace: ...
-    def picture_to_store(self, picture: bytes) -> StoredPicture: ...
+    def put_picture(self, row: int, picture: bytes) -> None: ...
+    def put_keypoints(self, stored: StoredPlace, record: bytes) -> None: ...
 
 
 class Importing(Unpacking):
@@ -101,9 +103,9 @@ class Importing(Unpacking):
                 known[line.id] = row = write.state.rows
                 made = write.insert(self._place(write, line, row, write.add_stored(stored[at : at + 1])))
                 if content.picture is not None:
-                    frames.put_picture(write.connection, row, write.picture_to_store(content.picture[0]))
+                    write.put_picture(row, content.picture[0])
                 if content.keypoints is not None:
-                    frames.put_keypoints(write.connection, row, made.digest, content.keypoints)
+                    write.put_keypoints(made, content.keypoints)
 
     def _place(self, write: ImportWrite, line: PlaceLine, row: int, checksum: int) -> StoredPlace:
         code = NO_SEQUENCE if line.sequence is None else self._code(line.sequence, line)

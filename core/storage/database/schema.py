@@ -18,8 +18,28 @@ T = TypeVar("T")
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
 
-_SEGMENTS = Tables("segments", 1, METADATA).create("sqlite")
-TABLES = Tables("map", 10, schema.METADATA, APPLICATION_ID, more={"sqlite": _SEGMENTS})
+# A file has one map.  Without statistics SQLite takes it that few rows of a table are of the same map, and reads all
+# places where it should look up one.  These are of any map; the rows of an index are followed by how many of them have
+# the same first column, the same first two, and so on.
+_STATISTICS = {
+    ("places", "places"): "1000000 1000000 1",
+    ("places", "sqlite_autoindex_places_2"): "1000000 1000000 1",  # by id
+    ("places", "sqlite_autoindex_places_3"): "1000000 1000000 1",  # by row
+    ("places", "places_of_sequence"): "1000000 1000000 5000 1",
+    ("places", "places_in_order"): "1000000 1000000 5000 2",
+    ("sequences", "sequences"): "200 200 1",
+    ("sequences", "sqlite_autoindex_sequences_2"): "200 200 1",  # by name
+    ("tokens", "tokens"): "2000000 2000000 1000 1",
+}
+_MORE = [
+    *Tables("segments", 1, METADATA).create("sqlite"),
+    "ANALYZE sqlite_schema",  # makes the table of statistics
+    *(
+        f"INSERT INTO sqlite_stat1 (tbl, idx, stat) VALUES ('{table}', '{index}', '{numbers}')"
+        for (table, index), numbers in _STATISTICS.items()
+    ),
+]
+TABLES = Tables("map", 10, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
 SCHEMA = Schema(APPLICATION_ID, TABLES.version, TABLES.create("sqlite"))
 
 

@@ -30,7 +30,11 @@ class RowReader:
 
     Every method that reads may raise Damage (a file is missing or too short, or a row does not match its checksum or
     that in SQLite) and OSError (the disk refuses).
+
+    part_rows: rows that are read and compared by one thread.
     """
+
+    part_rows = 25
 
     def __init__(self, folder: Path, layout: Layout) -> None:
         """For the map in ``folder``; no file is opened yet."""

@@ -38,7 +38,6 @@ __all__ = ["SHORTLIST", "Location", "SearchScope", "Segment", "Snapshot"]
 SHORTLIST = 100
 """Places of a map with codes whose descriptors are compared exactly; rankings of such a map hold only these."""
 
-_PART_ROWS = 25  # that a thread reads from disk at a time
 _SHARED_FROM = 512  # rows in memory that one thread compares alone, in a millisecond or two
 
 Part = TypeVar("Part")
@@ -64,6 +63,10 @@ def together(run: Callable[[Part], None], parts: Sequence[Part]) -> None:
 
 class RowSource(Protocol):
     """Reads rows that are not in memory, each checked by the checksum that the ledger has of it."""
+
+    @property
+    def part_rows(self) -> int:
+        """Rows that one thread reads and compares."""
 
     def descriptors(self, rows: NDArray[np.int64], checksums: NDArray[np.uint32]) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D]."""
@@ -242,7 +245,8 @@ class Snapshot:
             products[:, part] = row_reader.inner_products(queries, some, self._checksums(some))
 
         with self.guard():
-            together(compare, [at[start : start + _PART_ROWS] for start in range(0, len(at), _PART_ROWS)])
+            step = row_reader.part_rows
+            together(compare, [at[start : start + step] for start in range(0, len(at), step)])
 
     def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
         """The checksums of rows that SQLite has."""

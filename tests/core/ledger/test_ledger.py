@@ -16,7 +16,7 @@ from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure
 from core.ledger import Ledger, Statement, Tables
 from core.ledger.rows import given_rows
 from core.ledger.sqlite import SqliteLedger, file_of
-from core.ledger.statements import among, binary, greatest, integer, real, seconds_now, text
+from core.ledger.statements import among, binary, greatest, integer, json_list, real, rounded, seconds_now, text
 from tests.core.ledger.conftest import OpenLedger
 
 _METADATA = MetaData()
@@ -198,3 +198,17 @@ def test_many_rows_are_one_parameter(open_ledger: OpenLedger) -> None:
     ledger.execute("put", put, fruit=json.dumps([]))
     ledger.execute("put", put, fruit=json.dumps([("pear", 0.5, 9.0)]))
     assert sorted(ledger.execute("list", read)) == sorted([basket[0], ("pear", 2.5, None)])
+
+
+def test_values_are_rounded_and_listed_as_json(open_ledger: OpenLedger) -> None:
+    ledger = open_ledger(TABLES)
+    columns = select(_FRUIT.c.name, rounded(_FRUIT.c.weight, 3).label("weight"), _FRUIT.c.at)
+    of = columns.where(_FRUIT.c.weight < bindparam("most")).order_by(_FRUIT.c.number).subquery().c
+    listed = Statement(select(json_list(of.name), json_list(of.weight), json_list(of.at)))
+    assert ledger.execute("list", listed, most=9) == [("[]", "[]", "[]")]
+    for name, weight in (("pear", 1.23456), ('Birne "grün"', -2.0), ("plum", 1e9), ("tiny", 0.00049)):
+        _put(ledger, name, weight)
+    ((names, weights, moments),) = ledger.execute("list", listed, most=2e9)
+    assert json.loads(names) == ["pear", 'Birne "grün"', "plum", "tiny"]
+    assert json.loads(weights) == [1.235, -2.0, 1e9, 0.0]
+    assert json.loads(moments) == [None] * 4

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import psycopg
 import pytest
 
-from core.errors import UnknownPlace
+from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
@@ -22,6 +23,8 @@ from core.postgres.search.store import CodedStore
 from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
+
+Answered = TypeVar("Answered")
 
 DIMENSION, LOCAL = 64, (4, 8)
 
@@ -155,6 +158,15 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Coded
     assert stores[0].verify("lab").ok
 
 
+def sent_again(request: Callable[[], Answered]) -> Answered:
+    """The result of a request that is sent again as long as it is refused because a connection was lost."""
+    while True:
+        try:
+            return request()
+        except StoreUnavailable:
+            time.sleep(0.1)
+
+
 def swap_databases(server: Postgres, away: str, back: str) -> None:
     """Put a copy of the database, made before, in its place."""
     with psycopg.connect(server.address.replace("/postgres", "/template1"), autocommit=True) as connection:
@@ -173,15 +185,17 @@ def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(stores: list[C
         query = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'postgres'"
         connection.execute(query)
         connection.execute("CREATE DATABASE earlier TEMPLATE postgres")
-    here.enrol([frame("lost", 5001)])
-    row = there.rows_of(["lost"])[0]
+    sent_again(lambda: here.enrol([frame("lost", 5001)]))
+    row = sent_again(lambda: there.rows_of(["lost"]))[0]
     assert row == 300
     lost = there.snapshot().descriptors_at(np.array([row]))  # cached from now on
     swap_databases(empty, "later", "earlier")
     try:
         # The same number of writes as before: the revision is the same, its stamp is not.
-        here.enrol([frame("other", 5002)])
-        assert there.rows_of(["lost", "other"]) == [None, row]
+        sent_again(lambda: here.enrol([frame("other", 5002)]))
+        for _ in range(5):
+            sent_again(there.count_places)
+        assert sent_again(lambda: there.rows_of(["lost", "other"])) == [None, row]
         found = there.snapshot().descriptors_at(np.array([row]))
         assert not np.allclose(found, lost) and np.allclose(found[0], frame("other", 5002).descriptor, atol=1e-3)
         for service in (here, there):

@@ -29,8 +29,11 @@ def test_an_empty_file_gets_the_tables(connection: sqlite3.Connection) -> None:
     check_schema(connection)
     prepare(connection)
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
-    assert tables == {*METADATA.tables, "segments", "layout"}
+    assert tables == {*METADATA.tables, "segments", "layout", "sqlite_stat1"}
     assert connection.execute("SELECT count(*) FROM sqlite_schema WHERE type = 'trigger'").fetchone() == (0,)
+    indexes = {name for table in tables for _, name, *_ in connection.execute(f"PRAGMA index_list({table})")}
+    known = {name for (name,) in connection.execute("SELECT idx FROM sqlite_stat1")}
+    assert known and known <= indexes | tables and "places_by_revision" not in indexes
 
 
 def test_tables_that_cannot_be_made_leave_the_file_empty(connection: sqlite3.Connection) -> None:
