@@ -15,7 +15,7 @@ from core.postgres.search.store import CodedStore
 from tests.core.maps.contract import MAP, StoreContract
 from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(600)]
 
 
 class TwoServices(StoreContract):

@@ -164,6 +164,7 @@ def listening(server: Server, map_id: str) -> Iterator[list[tuple[str, dict[str,
     yield heard
 
 
+@pytest.mark.thorough
 def test_answers_of_one_service_are_shown_by_the_other(
     tmp_path: Path, postgres: Postgres, database: SharedDatabase
 ) -> None:

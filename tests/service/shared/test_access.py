@@ -17,6 +17,7 @@ from tests.service.wire import eventually
 pytestmark = pytest.mark.postgres
 
 
+@pytest.mark.thorough
 def test_keys_work_at_all_services(tmp_path: Path, postgres: Postgres, database: SharedDatabase) -> None:
     admin = Keys.of(tmp_path, database).create("ops", "admin")[1]
     with two_services(tmp_path, postgres.address, {}, admin) as (one, other):
@@ -47,6 +48,7 @@ def test_keys_work_at_all_services(tmp_path: Path, postgres: Postgres, database:
         assert (revoked, created) == ("delete_key", "create_key") and at_one != at_other
 
 
+@pytest.mark.thorough
 def test_limits_hold_over_services(tmp_path: Path, postgres: Postgres, database: SharedDatabase) -> None:
     limits = {"rate_per_key": 0.01, "rate_burst": 20}
     with two_services(tmp_path, postgres.address, limits) as both:

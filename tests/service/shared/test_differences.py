@@ -26,6 +26,7 @@ def test_all_that_should_be_alike_are_settings() -> None:
 
 
 @pytest.mark.postgres
+@pytest.mark.thorough
 def test_differences_are_reported_until_they_end(database: SharedDatabase, tmp_path: Path) -> None:
     replicas, services = [], []
     for name, rate in (("one", 5.0), ("other", 7.0)):
@@ -53,6 +54,7 @@ def test_differences_are_reported_until_they_end(database: SharedDatabase, tmp_p
 
 
 @pytest.mark.postgres
+@pytest.mark.thorough
 @pytest.mark.skipif(not FAKETIME, reason="libfaketime is not installed")
 def test_a_clock_that_is_five_minutes_slow(postgres: Postgres, tmp_path: Path) -> None:
     postgres.empty()

@@ -68,6 +68,7 @@ def test_services_go_on_with_one_session(services: tuple[Server, Server]) -> Non
         assert_problem(post(server, MAP, twice[0], again(1)), 410, "session-expired")
 
 
+@pytest.mark.thorough
 def test_frames_at_the_same_time(services: tuple[Server, Server]) -> None:
     session = begin(services[0], MAP)
 
@@ -84,6 +85,7 @@ def test_frames_at_the_same_time(services: tuple[Server, Server]) -> None:
     assert last == [25, 26]
 
 
+@pytest.mark.thorough
 def test_a_killed_service_and_a_database_that_is_away(
     services: tuple[Server, Server], postgres: Postgres, tmp_path: Path
 ) -> None:
