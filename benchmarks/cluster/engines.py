@@ -34,7 +34,7 @@ from core.places import PlaceFields
 from core.postgres.search.store import CodedStore
 from core.storage import Atlas
 from core.threads import cores, share_cores
-from tests.service.shared.postgres import running_postgres
+from tests.servers.postgres import running_postgres
 
 DIMENSION, LOCAL = 16_384, (196, 40)
 LIKE = 0.97

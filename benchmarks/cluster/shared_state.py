@@ -27,7 +27,7 @@ from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.shared.database import SharedDatabase
-from tests.service.shared.postgres import running_postgres
+from tests.servers.postgres import running_postgres
 
 BELIEF_BYTES = 8 << 10
 ANSWERS = 400

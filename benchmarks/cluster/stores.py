@@ -15,7 +15,7 @@ import typer
 from core.milvus import open_store
 from core.milvus.store import MilvusStore
 from core.storage import Atlas
-from tests.core.milvus.servers import running_servers
+from tests.servers.milvus import running_servers
 
 MilvusAddress = Annotated[str, typer.Option("--milvus", help="Of a Milvus; empty: one of this machine's own.")]
 PostgresAddress = Annotated[str, typer.Option("--postgres", help="Of its PostgreSQL.")]

@@ -13,7 +13,10 @@ ROOT = Path(__file__).parents[2]
 RUNNABLE = [
     ".ci/run",
     "docker/entrypoint",
-    *(f"scripts/{name}" for name in ("arm64", "fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")),
+    *(
+        f"scripts/{name}"
+        for name in ("arm64", "cluster", "fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")
+    ),
 ]
 
 # Replaces Python: a venv is a copy of this script, what pip installs a line in a log; the rest is real.

@@ -5,19 +5,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import httpx
 import pytest
 
+from tests.servers.postgres import Postgres, running_postgres
 from tests.service.encoders import install_coarse_encoder, install_two_stage_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
-    from tests.service.shared.postgres import Postgres
 
 _numbers = itertools.count()
 
@@ -71,12 +70,10 @@ def store_settings(kind: str) -> Iterator[dict[str, object]]:
         yield {}
         return
     if kind == "postgres":
-        from tests.service.shared.postgres import running_postgres
-
         with running_postgres() as postgres:
             yield {"database": postgres.address}
         return
-    from tests.core.milvus.servers import running_servers  # needs what speaks to them
+    from tests.servers.milvus import running_servers  # needs what speaks to them
 
     with running_servers() as servers:
         yield {"vectors": kind, "milvus": servers.milvus_address, "database": servers.postgres_address}
@@ -108,15 +105,6 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     running = Server(tmp_path_factory.mktemp("strict"), settings=STRICT).wait()
     yield running
     assert running.stop() == 0
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    """A real PostgreSQL."""
-    from tests.service.shared.postgres import running_postgres  # needs what speaks to it
-
-    with running_postgres() as postgres:
-        yield postgres
 
 
 @pytest.fixture
@@ -168,13 +156,3 @@ def traverse(server: Server) -> str:
 def anyio_backend() -> str:
     """Asynchronous tests run on the event loop that the service runs on."""
     return "asyncio"
-
-
-@pytest.fixture(scope="session")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the data of a service that has one map."""
-    from tests.service.shared.services import prepare
-
-    folder = tmp_path_factory.mktemp("prepared")
-    prepare(folder)
-    return folder

@@ -5,25 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import psycopg
 import pytest
 
 from core.disk.sqlite_file import DURABLE
 from core.ledger import Ledger, Tables
 from core.ledger.postgres import PostgresLedger
 from core.ledger.sqlite import SqliteLedger, file_of
-from tests.service.shared.postgres import Postgres, running_postgres
+from tests.servers.postgres import Postgres
 
 OpenLedger = Callable[[Tables], Ledger]
 
 
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    with running_postgres() as server:
-        yield server
-
-
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def open_ledger(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[OpenLedger]:
     """Opens a ledger with some tables; it has what was written before in the same test."""
     opened: list[Ledger] = []
@@ -31,9 +24,7 @@ def open_ledger(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Open
     if request.param == "postgresql":
         server: Postgres = request.getfixturevalue("postgres")
         address = server.address
-        with psycopg.connect(address, autocommit=True) as connection:
-            connection.execute("DROP SCHEMA public CASCADE")
-            connection.execute("CREATE SCHEMA public")
+        server.empty()
 
     def made(tables: Tables) -> Ledger:
         ledger: Ledger

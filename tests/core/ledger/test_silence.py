@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import psycopg
 import pytest
@@ -16,35 +12,18 @@ from core.errors import StoreUnavailable
 from core.ledger import Statement
 from core.ledger import postgres as connections
 from core.ledger.postgres import PostgresLedger
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.postgres, pytest.mark.timeout(120)]
 
 _ONE = Statement(select(1))
 
 
-@contextmanager
-def silenced(server: Postgres) -> Iterator[None]:
-    """Stop all processes of the server that serve connections."""
-    with psycopg.connect(server.address) as connection:
-        query = "SELECT pid FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
-        workers = [pid for (pid,) in connection.execute(query)]
-        ((data,),) = connection.execute("SHOW data_directory").fetchall()
-    with open(os.path.join(data, "postmaster.pid"), encoding="utf-8") as file:
-        every = [int(file.readline()), *workers]
-    try:
-        for pid in every:
-            os.kill(pid, signal.SIGSTOP)
-        yield
-    finally:
-        for pid in every:
-            os.kill(pid, signal.SIGCONT)
-
-
+@pytest.mark.thorough
 def test_a_server_that_stands_still_is_given_up_soon(postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> None:
     ledger = PostgresLedger(postgres.address, [])
     assert ledger.execute("look", _ONE) == [(1,)]
-    with silenced(postgres):
+    with postgres.silenced():
         began = time.monotonic()
         with pytest.raises(StoreUnavailable, match="PostgreSQL"):
             ledger.execute("look", _ONE)

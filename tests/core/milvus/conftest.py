@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from tests.core.milvus.servers import Servers
+    from tests.servers.milvus import Servers
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -18,7 +18,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.fixture(scope="session")
 def servers() -> Iterator[Servers]:
     """A real PostgreSQL and a real Milvus."""
-    from tests.core.milvus.servers import running_servers
+    from tests.servers.milvus import running_servers
 
     with running_servers() as servers:
         yield servers

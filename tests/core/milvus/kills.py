@@ -29,8 +29,8 @@ from core.milvus.map import MilvusMap
 from tests.campaigns import read_arguments
 from tests.core.milvus.clients import Client, ProcessClient
 from tests.core.milvus.parts import PARTS, Part
-from tests.core.milvus.servers import Servers, running_servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of
+from tests.servers.milvus import Servers, running_servers
 
 MOST_SECONDS = 30.0
 """From the start of a server until both clients are served again."""

@@ -19,9 +19,9 @@ from core.ledger.maps.frames import StoredObject
 from core.milvus.collection import collection_name
 from core.postgres.pictures.objects import Objects
 from tests.core.milvus.clients import ProcessClient
-from tests.core.milvus.servers import Servers
-from tests.core.postgres.servers import Server
 from tests.core.storage.frames import DIMENSION, ENCODER
+from tests.servers.milvus import Servers
+from tests.servers.process import Server
 
 AWAY_SECONDS = 1.0
 """Between the kill of a server and its next start."""

@@ -14,7 +14,7 @@ from core.maps import Map
 from core.milvus import Bucket, open_store
 from core.milvus.store import MilvusStore
 from tests.core.maps.contract import MAP, StoreContract
-from tests.core.milvus.servers import Servers
+from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.core.milvus.kills import Campaign
 from tests.core.milvus.parts import PARTS
-from tests.core.milvus.servers import Servers
+from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]
 

@@ -24,8 +24,8 @@ from core.recognition import enrol, recognize
 from core.recognition.question import Question
 from core.storage import Atlas
 from tests.core.maps.writers import check_writers_lose_nothing
-from tests.core.milvus.servers import Servers
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, stored_of
+from tests.servers.milvus import Servers
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
 

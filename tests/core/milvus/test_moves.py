@@ -11,7 +11,7 @@ from core.milvus import open_store
 from core.milvus.store import MilvusStore
 from core.storage.files.row_formats import COMPRESSED
 from tests.core.maps.moves import check_a_refused_import_leaves_nothing, check_moves
-from tests.core.milvus.servers import Servers
+from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 

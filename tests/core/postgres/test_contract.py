@@ -13,9 +13,9 @@ from core.errors import UnknownMap
 from core.maps import Map
 from core.postgres.search.store import CodedStore
 from tests.core.maps.contract import MAP, StoreContract
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(600)]
 
 
 class TwoServices(StoreContract):

@@ -13,16 +13,16 @@ import psycopg
 import pytest
 
 from core.errors import StoreUnavailable, UnknownPlace
-from core.maps.records import Enrolment, MapSettings
+from core.maps.records import COMPACT_FROM, Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
 from core.postgres.search import following
 from core.postgres.search.cache import RowCache
 from core.postgres.search.map import CodedMap
 from core.postgres.search.store import CodedStore
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
 
 Answered = TypeVar("Answered")
 
@@ -63,7 +63,9 @@ def expect_alike(one: CodedMap, address: str) -> None:
     fresh = CodedStore(address)
     try:
         (other,) = maps_of([fresh])
-        held, read = one.snapshot(), other.snapshot()
+        held = one.snapshot()
+        assert other.index_status().state == ("ready" if len(held) < COMPACT_FROM else "unopened")
+        read = other.snapshot()
         assert (len(held), held.rows) == (len(read), read.rows) and (held.alive == read.alive).all()
         rows = np.flatnonzero(read.alive)
         for name, column in vars(read.whereabouts.take(rows)).items():
@@ -84,13 +86,12 @@ def test_each_change_is_seen_by_the_next_search_of_another_service(
 ) -> None:
     here, there = maps_of(stores)
     here.enrol([frame(f"p{number}", number + 1, sequence="walk") for number in range(places)])
-    assert there.index_status().state == ("ready" if places < 256 else "unopened")
     for number in (0, places - 1):
         query = frame("q", number + 1).descriptor[np.newaxis]
         ((rows, _),) = there.scope().search(query)
         found = there.places_at(rows.tolist()[:1])[0]
         assert found is not None and found.id == f"p{number}"
-    assert there.index_status().tier == ("exact" if places < 256 else "compact")
+    assert there.index_status().tier == ("exact" if places < COMPACT_FROM else "compact")
     before = there.snapshot()
     assert there.snapshot() is before  # nothing was written: nothing is read
     there.patch("p3", {"pose": {"x": 1.0, "y": 2.0}})

@@ -24,10 +24,9 @@ from core.postgres.search.store import CodedStore
 from core.storage.files.row_formats import COMPRESSED
 from tests.core.maps.moves import check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
-from tests.core.postgres.object_server import reading_only
-from tests.core.postgres.servers import running_object_store
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
-from tests.service.shared.postgres import Postgres
+from tests.servers.object_store import reading_only, running_object_store
+from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 

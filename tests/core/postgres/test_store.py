@@ -22,9 +22,9 @@ from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
 from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.storage.archives.conftest import filled
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.postgres, pytest.mark.timeout(300)]
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ def file_store(tmp_path: Path) -> Keys:
     return Keys.of(tmp_path)
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Keys:
     """Keys in each of the two databases."""
     return Keys.of(tmp_path, None if request.param == "sqlite" else request.getfixturevalue("database"))
@@ -246,7 +246,7 @@ def traits(key: Key) -> tuple[object, ...]:
     return key.name, key.role, key.maps, key.expires_at, key.revoked_at is None, key.last_used_at
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(STEPS)
 def test_random_changes_do_the_same_in_both_databases(

@@ -78,7 +78,7 @@ def test_what_counts_as_one_caller() -> None:
     assert network_of(None) == network_of("") and network_of("/run/socket") == "/run/socket"
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_what_one_service_lets_through_the_other_holds_back(database: SharedDatabase) -> None:
     one, other = (Buckets(SLOW, 10, kind="request") for _ in range(2))
     assert [one.take("ann") for _ in range(10)] == [0.0] * 10 and one.take("ann") > 0
@@ -96,7 +96,7 @@ def test_what_one_service_lets_through_the_other_holds_back(database: SharedData
     assert [one.take("bob") for _ in range(6)] == [0.0] * 5 + [pytest.approx(1 / SLOW, rel=0.2)]
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_services_exchange_both_limits_by_themselves(database: SharedDatabase) -> None:
     with Rates(SLOW, 5, database) as one, Rates(SLOW, 5, database) as other:
         for _ in range(5):
@@ -107,7 +107,6 @@ def test_services_exchange_both_limits_by_themselves(database: SharedDatabase) -
         assert eventually(lambda: database.execute("list the buckets", _NAMES) == found)
 
 
-@pytest.mark.cluster
 def test_without_the_database_each_service_keeps_to_the_limit_alone() -> None:
     from service.shared.database import SharedDatabase
 

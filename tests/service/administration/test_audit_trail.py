@@ -18,7 +18,7 @@ from service.administration.audit_trail import AuditTable, AuditTrail, audit_tra
 EVE = Asker("eve", "0123456789ab", "prune_map", "a-request", None, "10.0.0.1")
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def ledger(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ledger]:
     """A ledger that has the table, in each of the two databases."""
     if request.param == "postgresql":
@@ -82,7 +82,6 @@ def test_a_table_has_the_lines_of_all_services(ledger: Ledger, monkeypatch: pyte
     assert [(line.fields or {})["replica"] for line in trail.lines(None)] == ["r-2"] * 4 + ["r-1"] * 4
 
 
-@pytest.mark.cluster
 def test_lines_wait_for_a_database_that_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
     from service.shared.database import SharedDatabase
 

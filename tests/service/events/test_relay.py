@@ -22,12 +22,13 @@ from service.events.relay import TABLES, EventRelay
 from service.events.schemas import MapEvent, QueryEvent
 from tests.service.scenes import blank, encoded, jpeg
 from tests.service.server import Server
+from tests.service.shared.services import MAP, fill, two_services
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
-    from tests.service.shared.postgres import Postgres
+    from tests.servers.postgres import Postgres
 
-pytestmark = [pytest.mark.cluster, pytest.mark.anyio]
+pytestmark = [pytest.mark.postgres, pytest.mark.anyio]
 
 SENT = Statement(select(func.count()).select_from(TABLES.metadata.tables["events"]))
 
@@ -163,15 +164,17 @@ def listening(server: Server, map_id: str) -> Iterator[list[tuple[str, dict[str,
     yield heard
 
 
+@pytest.mark.thorough
 def test_answers_of_one_service_are_shown_by_the_other(
-    prepared: Path, tmp_path: Path, postgres: Postgres, database: SharedDatabase
+    tmp_path: Path, postgres: Postgres, database: SharedDatabase
 ) -> None:
-    from tests.service.shared.services import MAP, two_services
-
     def new_session(server: Server) -> str:
         return str(server.client.post(f"/v1/maps/{MAP}/sessions", json={}).json()["id"])
 
-    with two_services(prepared, tmp_path, postgres.address, {}) as (one, other), listening(other, MAP) as heard:
+    with ExitStack() as stack:
+        one, other = stack.enter_context(two_services(tmp_path, postgres.address, {}))
+        fill(one)
+        heard = stack.enter_context(listening(other, MAP))
         soon(lambda: "session" in [kind for kind, _ in heard] or not new_session(one))  # one knows who listens
         asked = [one.query(MAP, jpeg(number)) for number in range(3)]
         blank_one = other.query(MAP, encoded(blank()))

@@ -24,7 +24,7 @@ from service.shared.database import SharedDatabase
 from tests.service.jobs.services import Gate, Kinds, Running, Service, end_of, running_alone
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=[pytest.mark.postgres, pytest.mark.thorough])])
 def running(request: pytest.FixtureRequest) -> Running:
     """Runs the jobs of a service that is alone, or of one that could share them."""
     if request.param == "sqlite":

@@ -21,7 +21,7 @@ from tests.service.jobs.services import Gate, Service, end_of
 from tests.service.jobs.worker import walk
 from tests.service.server import ROOT
 
-pytestmark = [pytest.mark.cluster]
+pytestmark = pytest.mark.postgres
 
 
 @pytest.fixture
@@ -75,6 +75,7 @@ def test_jobs_of_two_services(quick: str, tmp_path: Path) -> None:
         assert [end_of(jobs, job).state for jobs, job in ((one, lab), (other, again))] == ["succeeded"] * 2
 
 
+@pytest.mark.thorough
 def test_a_job_is_taken_over_from_its_checkpoint(quick: str, tmp_path: Path) -> None:
     held, seen = threading.Event(), list[tuple[str, int, object]]()
 
@@ -109,6 +110,7 @@ def test_a_job_is_taken_over_from_its_checkpoint(quick: str, tmp_path: Path) -> 
     other.close()
 
 
+@pytest.mark.thorough
 def test_a_killed_service(database: SharedDatabase, tmp_path: Path) -> None:
     (tmp_path / "killed").mkdir()
     command = [sys.executable, "-m", "tests.service.jobs.worker", database.address, str(tmp_path / "killed")]
@@ -130,6 +132,7 @@ def test_a_killed_service(database: SharedDatabase, tmp_path: Path) -> None:
     service.close()
 
 
+@pytest.mark.thorough
 def test_a_job_whose_files_lie_at_one_service(quick: str, tmp_path: Path) -> None:
     ran: list[str] = []
 

@@ -33,7 +33,7 @@ def test_a_service_alone_hears_itself(tmp_path: Path) -> None:
     ledger.close()
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_services_hear_one_another_until_they_leave(database: SharedDatabase, tmp_path: Path) -> None:
     one, other = (ServiceReplica(database, tmp_path / name) for name in ("one", "other"))
     heard: queue.Queue[tuple[str, str | None]] = queue.Queue()
@@ -57,7 +57,7 @@ def test_services_hear_one_another_until_they_leave(database: SharedDatabase, tm
     assert living_ids() == [] and heard.empty()
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_a_service_that_says_nothing_is_gone(
     database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -68,7 +68,7 @@ def test_a_service_that_says_nothing_is_gone(
         assert service.living_ids(connection) == []
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_a_copy_of_a_data_directory_displaces_the_first_one(database: SharedDatabase, tmp_path: Path) -> None:
     first, copy = ServiceReplica(database, tmp_path), ServiceReplica(database, tmp_path)
     first.beat()

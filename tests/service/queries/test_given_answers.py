@@ -186,12 +186,12 @@ def test_services_share_the_latest_answers_which_are_bounded(
 def test_answers_wait_in_memory_while_the_ledger_refuses(open_ledger: OpenLedger) -> None:
     ledger = open_ledger(TABLES)
     waiting = RecentAnswers(ledger)
-    ledger.execute("remove", REMOVE)
+    ledger.change("remove", REMOVE)
     for number in range(3):
         waiting.add(("lab", "2026"), GivenAnswer.of(ANSWER, QueriedFrame(number=number)))
         with pytest.raises(StorageFailure):
             waiting.flush()
-    ledger.execute("restore", RESTORE)
+    ledger.change("restore", RESTORE)
     assert [answer.frame.number for answer in waiting.of_map(("lab", "2026"))] == [2, 1, 0]
 
 

@@ -25,7 +25,7 @@ from service.queries.count_tables import FILE, MOST_WEEKS, TABLES, statistics_fi
 from service.queries.counts import AnswerCounts, PlaceCount, VerdictCounts
 from service.queries.given_answers import MapKey
 from service.queries.statistics import SPARE_PLACES, QueryStatistics
-from tests.service.shared.postgres import Postgres
+from tests.servers.postgres import Postgres
 
 LAB: MapKey = ("lab", "2026-11-20T09:00:00+00:00")
 HALL: MapKey = ("hall", "2026-11-20T09:00:00+00:00")
@@ -52,7 +52,7 @@ def in_folder(folder: Path, maps: Maps) -> QueryStatistics:
     return QueryStatistics(statistics_file(folder), 3600, lambda: maps.sizes, lambda _: maps.present)
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def counting(request: pytest.FixtureRequest, tmp_path: Path, maps: Maps) -> Iterator[Counting]:
     """Begins to count in a ledger; it has what was counted before in the same test."""
     ledgers: list[Ledger] = []
@@ -265,7 +265,7 @@ def test_statistics_of_an_older_version_are_put_aside_whole(
 # Services that share a ledger
 
 
-@pytest.mark.cluster
+@pytest.mark.postgres
 def test_services_add_their_counts_to_the_same_rows(postgres: Postgres, maps: Maps) -> None:
     postgres.empty()
     with closing(PostgresLedger(postgres.address, [TABLES, recent_answers.TABLES])) as ledger:

@@ -34,7 +34,7 @@ from tests.service.sessions.test_session_table import pass_by as shift
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.cluster)])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=[pytest.mark.postgres, pytest.mark.thorough])])
 def runtime(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Runtime]:
     """A service whose sessions are in its data directory, or in PostgreSQL."""
     install_coarse_encoder(tmp_path / "models")

@@ -12,22 +12,21 @@ from typing import Any
 import pytest
 
 from service.shared.database import SharedDatabase
+from tests.servers.postgres import Postgres
 from tests.service.encoders import COARSE
 from tests.service.server import Server, assert_problem
 from tests.service.sessions.test_sessions import again, begin, post, send
-from tests.service.shared.postgres import Postgres
-from tests.service.shared.services import MAP, two_services
+from tests.service.shared.services import MAP, fill, two_services
 
-pytestmark = [pytest.mark.cluster]
+pytestmark = pytest.mark.postgres
 
 LIMITS = {"max_sessions": 3, "session_expiry": 600}
 
 
 @pytest.fixture
-def services(
-    prepared: Path, tmp_path: Path, postgres: Postgres, database: SharedDatabase
-) -> Iterator[tuple[Server, Server]]:
-    with two_services(prepared, tmp_path, postgres.address, LIMITS) as both:
+def services(tmp_path: Path, postgres: Postgres, database: SharedDatabase) -> Iterator[tuple[Server, Server]]:
+    with two_services(tmp_path, postgres.address, LIMITS) as both:
+        fill(both[0])
         yield both
 
 
@@ -69,6 +68,7 @@ def test_services_go_on_with_one_session(services: tuple[Server, Server]) -> Non
         assert_problem(post(server, MAP, twice[0], again(1)), 410, "session-expired")
 
 
+@pytest.mark.thorough
 def test_frames_at_the_same_time(services: tuple[Server, Server]) -> None:
     session = begin(services[0], MAP)
 
@@ -85,6 +85,7 @@ def test_frames_at_the_same_time(services: tuple[Server, Server]) -> None:
     assert last == [25, 26]
 
 
+@pytest.mark.thorough
 def test_a_killed_service_and_a_database_that_is_away(
     services: tuple[Server, Server], postgres: Postgres, tmp_path: Path
 ) -> None:
@@ -97,15 +98,16 @@ def test_a_killed_service_and_a_database_that_is_away(
     assert send(other, MAP, session, again(4), frame=4)["frames"] == 5
     postgres.server.end(signal.SIGINT)
     try:
-        refused = post(other, MAP, session, again(5), frame=5)
-        assert_problem(refused, 503, "store-unavailable")
-        assert float(refused.headers["retry-after"]) > 0
-        assert other.query(MAP, again(5))["matches"], "queries go on without it for a few seconds"
+        content, headers = again(5), {"Content-Type": "image/jpeg"}
+        asked = other.client.post(f"/v1/maps/{MAP}/query", content=content, headers=headers)
+        for refused in (post(other, MAP, session, content, frame=5), asked):
+            assert_problem(refused, 503, "store-unavailable")
+            assert float(refused.headers["retry-after"]) > 0
         until = time.monotonic() + 60
         while other.client.get("/readyz").status_code == 200:
             assert time.monotonic() < until
             time.sleep(0.2)
-        assert "PostgreSQL" in other.client.get("/readyz").json()["checks"]["replica"]
+        assert "PostgreSQL" in other.client.get("/readyz").json()["checks"]["maps"]
         late = Server(tmp_path / "one", settings={"encoder": COARSE, "database": postgres.address}).wait("/livez")
     finally:
         postgres.server.start()

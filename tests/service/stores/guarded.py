@@ -14,7 +14,7 @@ from pymilvus import MilvusClient, connections
 
 from core.milvus.collection import milvus_errors
 from tests.certificates import certify
-from tests.core.milvus.servers import MILVUS_SETTINGS, Servers
+from tests.servers.milvus import MILVUS_SETTINGS, Servers
 
 ROOT_TOKEN = "root:Milvus"  # Milvus's own at its first start
 

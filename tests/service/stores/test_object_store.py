@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.milvus.servers import Servers
-from tests.core.postgres.object_server import SECRET
+from tests.servers.milvus import Servers
+from tests.servers.object_store import SECRET
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem

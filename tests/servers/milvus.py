@@ -1,10 +1,7 @@
-"""A real PostgreSQL, Milvus and object store on this machine, in folders of their own, for tests and trials.
+"""A real PostgreSQL, Milvus and object store on this machine, in folders of their own.
 
-    scripts/cluster                  # starts them, prints their addresses, and ends them with itself
-
-PostgreSQL is that of the system (Debian: ``apt-get install postgresql``).  Milvus is the server of the package
-``milvus`` in .venv-cluster, an old release; the object store is SeaweedFS, there as well.  All run with lower priority
-than the tests.
+Milvus is the server of the package ``milvus`` in .venv-cluster, an old release; the object store is SeaweedFS, there as
+well.
 """
 
 from __future__ import annotations
@@ -12,20 +9,20 @@ from __future__ import annotations
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import psycopg
 
 from core.milvus.collection import MilvusConnection
-from tests.core.postgres.object_server import PORTS, object_store
-from tests.core.postgres.servers import Missing, Server, fixed_ports, postgres_server
+from tests.servers.object_store import PORTS, object_store
+from tests.servers.postgres import postgres_server
+from tests.servers.process import Missing, Server, fixed_ports
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 MILVUS_PYTHON = ROOT / ".venv-cluster/bin/python"
 
 MILVUS_SETTINGS = {"common.session.ttl": "10", "dataNode.segment.syncPeriod": "30"}
@@ -129,25 +126,3 @@ def running_servers() -> Iterator[Servers]:
             servers.milvus.end()
             servers.postgres.end(signal.SIGINT)
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def main() -> int:
-    """Run the servers until Ctrl+C."""
-    try:
-        with running_servers() as servers:
-            print(f"Milvus {servers.milvus_address}\nPostgreSQL {servers.postgres_address}", flush=True)
-            bucket = servers.bucket
-            print(
-                f"Object store {bucket.address} at {bucket.endpoint}, {bucket.access_key}, {bucket.secret_key}",
-                flush=True,
-            )
-            with suppress(KeyboardInterrupt):
-                signal.pause()
-    except (Missing, TimeoutError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +14,9 @@ import httpx
 from core.errors import StorageFailure
 from core.postgres.pictures.bucket import Bucket
 from core.postgres.pictures.objects import Objects
+from tests.servers.process import Server, fixed_ports
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 WEED = ROOT / ".venv-cluster/bin/weed"
 SECRET = "a-secret-of-objects-to-hide"
 
@@ -67,3 +70,19 @@ def object_store(folder: Path, ports: list[int], *options: str) -> tuple[list[st
 def reading_only(bucket: Bucket) -> Bucket:
     """The bucket as somebody sees it who may not write to it."""
     return replace(bucket, access_key="reader")
+
+
+@contextmanager
+def running_object_store(folder: Path, *options: str) -> Iterator[Bucket]:
+    """The bucket of an object store with its files in a folder, as long as the block runs.
+
+    Args:
+        options: of the server, in the place of those that give it much room.
+    """
+    command, bucket, answers = object_store(folder, fixed_ports(PORTS), *options)
+    server = Server(command, folder, answers)
+    try:
+        server.start()
+        yield bucket
+    finally:
+        server.end(signal.SIGKILL)  # it would take its time

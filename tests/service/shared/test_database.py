@@ -7,32 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.ledger.test_silence import silenced
-from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.servers.postgres import Postgres
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.shared.postgres import Postgres
+from tests.service.shared.services import two_services
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.postgres
 
 SOON = 20.0
-"""Seconds within which a request is answered while the database is silent; it would be 75 and more without limits."""
+"""Seconds within which a request is answered though the database is silent; it would take 75 without a deadline."""
 
 
 @pytest.fixture
 def services(postgres: Postgres, tmp_path: Path) -> Iterator[tuple[Server, Server]]:
     """Two services that are given nothing but the address of the database."""
     postgres.empty()
-    both = []
-    for number in range(2):
-        folder = tmp_path / f"service-{number}"
-        install_coarse_encoder(folder / "models")
-        both.append(Server(folder, {"database": postgres.address, "encoder": COARSE}))
-    for server in both:
-        server.wait()
-    yield both[0], both[1]
-    for server in both:
-        server.stop()
+    with two_services(tmp_path, postgres.address, {}) as both:
+        yield both
 
 
 def best(server: Server, number: int) -> str | None:
@@ -59,12 +50,13 @@ def test_each_service_answers_by_what_the_other_wrote_last(services: tuple[Serve
     assert_problem(there.client.get("/v1/maps/lab"), 404, "unknown-map")
 
 
+@pytest.mark.thorough
 def test_a_database_that_falls_silent_hangs_nobody(services: tuple[Server, Server], postgres: Postgres) -> None:
     server, _ = services
     server.create_map("lab")
     assert server.enrol("lab", "p1", jpeg(1)).status_code == 201
     assert best(server, 1) == "p1"
-    with silenced(postgres):
+    with postgres.silenced():
         # Each has its own deadline, by the client's timeout; how long it took is not compared with anything else.
         asked = server.client.post("/v1/maps/lab/query", content=jpeg(1), timeout=SOON)
         problem = assert_problem(asked, 503, "store-unavailable")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.core.milvus.servers import Servers, running_servers
+from tests.servers.milvus import Servers
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.map_jobs import asked, places
 from tests.service.scenes import jpeg
@@ -18,13 +17,6 @@ from tests.service.sessions.test_sessions import again, begin, send
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]
 
 PLACES = 40
-
-
-@pytest.fixture(scope="module")
-def servers() -> Iterator[Servers]:
-    """A real PostgreSQL and a real Milvus."""
-    with running_servers() as servers:
-        yield servers
 
 
 def test_a_killed_service(servers: Servers, tmp_path: Path) -> None:

@@ -1,0 +1,64 @@
+"""Servers for trials, until Ctrl+C; ``scripts/cluster`` runs this.
+
+    python -m tests.servers            # a PostgreSQL
+    python -m tests.servers --milvus   # with a Milvus and an object store
+
+It prints the settings of a service that uses them, as lines for a shell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+
+from tests.servers.postgres import running_postgres
+from tests.servers.process import Missing
+
+
+@contextmanager
+def _postgres() -> Iterator[Mapping[str, str]]:
+    with running_postgres() as postgres:
+        yield {"DATABASE": postgres.address}
+
+
+@contextmanager
+def _all_servers() -> Iterator[Mapping[str, str]]:
+    from tests.servers.milvus import running_servers  # needs Milvus's client
+
+    with running_servers() as servers:
+        bucket = servers.bucket
+        yield {
+            "DATABASE": servers.postgres_address,
+            "VECTORS": "milvus",
+            "MILVUS": servers.milvus_address,
+            "OBJECTS": bucket.address,
+            "OBJECTS_ENDPOINT": bucket.endpoint or "",
+            "OBJECTS_ACCESS_KEY": bucket.access_key,
+            "OBJECTS_SECRET_KEY": bucket.secret_key,
+        }
+
+
+def main() -> int:
+    """Run the servers until Ctrl+C; the exit status is 1 if one is missing or does not start."""
+    parser = argparse.ArgumentParser(prog="scripts/cluster", description="Start a PostgreSQL for trials.")
+    parser.add_argument("--milvus", action="store_true", help="start a Milvus and an object store as well")
+    started = _all_servers if parser.parse_args().milvus else _postgres
+    try:
+        with started() as settings:
+            print("Paste these lines where a service starts; Ctrl+C here ends the servers.", file=sys.stderr)
+            for name, value in settings.items():
+                print(f"export PLACEREC_{name}={shlex.quote(value)}", flush=True)
+            with suppress(KeyboardInterrupt):
+                signal.pause()
+    except (Missing, TimeoutError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
