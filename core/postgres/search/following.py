@@ -91,8 +91,11 @@ class FollowedMap:
 
     def _advanced(self, connection: MapConnection, state: MapState) -> Followed:
         held = self._held
-        if held is not None and held.revision > state.revision and self._follows(connection, held):
-            return held  # another thread has seen more
+        if held is not None and held.revision > state.revision:
+            with self._database.glancing() as whole:  # this transaction does not see so much
+                if self._follows(MapConnection(whole, self._map), held):
+                    return held  # another thread has seen more
+            held = None
         if held is None or not self._follows(connection, held) or self._tier(state, held) != _tier_of(held.snapshot):
             source = PostgresRows(self._database, self._map, state.record, self._cache)
             snapshot = self._read(connection, state, source)
@@ -109,7 +112,7 @@ class FollowedMap:
             return not held.stamp
         known = rows.stamp_of(connection, held.revision)
         if known != held.stamp:
-            log.warning("Map %d is read anew: the database lacks a revision of it that was there before", self._map)
+            log.warning("Map %d is read anew: its revision %d is not that of the database", self._map, held.revision)
         return known == held.stamp
 
     def _tier(self, state: MapState, held: Followed | None) -> Tier:
