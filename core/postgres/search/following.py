@@ -23,7 +23,7 @@ from core.index.flat import flat_index, vectors
 from core.ledger.maps.columns import read_columns
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
-from core.ledger.postgres import PostgresLedger
+from core.ledger.postgres import PostgresConnection, PostgresLedger
 from core.maps.records import MapRecord
 from core.maps.status import Tier
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
@@ -92,8 +92,9 @@ class FollowedMap:
     def _advanced(self, connection: MapConnection, state: MapState) -> Followed:
         held = self._held
         if held is not None and held.revision > state.revision:
-            with self._database.glancing() as whole:  # this transaction does not see so much
-                if self._follows(MapConnection(whole, self._map), held):
+            # This transaction does not see so much; and others that wait here may hold all connections of the pool.
+            with self._database.alone("read") as fresh:
+                if self._follows(MapConnection(PostgresConnection(fresh), self._map), held):
                     return held  # another thread has seen more
             held = None
         if held is None or not self._follows(connection, held) or self._tier(state, held) != _tier_of(held.snapshot):
