@@ -13,7 +13,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 from tests.servers.postgres import running_postgres
 from tests.servers.process import Missing
@@ -47,17 +47,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="scripts/cluster", description="Start a PostgreSQL for trials.")
     parser.add_argument("--milvus", action="store_true", help="start a Milvus and an object store as well")
     started = _all_servers if parser.parse_args().milvus else _postgres
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl+C does, with the servers
     try:
         with started() as settings:
             print("Paste these lines where a service starts; Ctrl+C here ends the servers.", file=sys.stderr)
             for name, value in settings.items():
                 print(f"export PLACEREC_{name}={shlex.quote(value)}", flush=True)
-            with suppress(KeyboardInterrupt):
-                signal.pause()
+            signal.pause()
     except (Missing, TimeoutError) as error:
         print(error, file=sys.stderr)
         return 1
-    return 0
+    except KeyboardInterrupt:
+        return 0
 
 
 if __name__ == "__main__":
