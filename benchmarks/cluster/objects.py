@@ -12,6 +12,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import typer
@@ -71,8 +72,7 @@ def main(places: int = 320, bytes_: int = typer.Option(8000, "--bytes")) -> None
                 objects, content = Objects(bucket), os.urandom(bytes_)
                 stored = [new_object("trial", number, content) for number in range(OF_A_QUERY)]
                 objects.put({one.name: content for one in stored})
-                taken = milliseconds(lambda objects=objects, stored=stored: objects.read(stored), 50)  # type: ignore[misc]
-                print(f"{OF_A_QUERY} objects: {taken:.1f} ms")
+                print(f"{OF_A_QUERY} objects: {milliseconds(partial(objects.read, stored), 50):.1f} ms")
                 objects.close()
             store.close()
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +17,7 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
 from core.ledger.postgres import PostgresConnection, PostgresLedger, postgres_errors
+from core.maps import moment
 from core.maps.records import MapRecord
 from core.maps.selection import Selection
 from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
@@ -46,6 +49,7 @@ class PostgresMap(LedgerMap):
             objects: where new pictures are put; None: in PostgreSQL.
         """
         self.objects, self.database, self._state = objects, database, state
+        self._noted = (-math.inf, state)  # the last state that was read, and when it was asked for
         self._room: tuple[int, StorageStatus] | None = None
         self._paused = threading.local()
         super().__init__()
@@ -77,10 +81,15 @@ class PostgresMap(LedgerMap):
         """Of the map; never used for another one, also of the same id."""
         return self._state.number
 
-    def note(self, state: MapState) -> None:
-        """Remember a state that was read, unless a later one is known."""
+    def note(self, state: MapState, asked: float = -math.inf) -> None:
+        """Remember a state that was read, unless a later one is known.
+
+        Args:
+            asked: when it was asked for, by the monotonic clock.
+        """
         if state.revision >= self._state.revision:
             self._state = state
+            self._noted = (asked, state)
 
     @contextmanager
     def viewing(self) -> Iterator[tuple[MapConnection, MapState]]:
@@ -105,10 +114,13 @@ class PostgresMap(LedgerMap):
         return self.latest().places
 
     def latest(self) -> MapState:
-        """The state of the map at this moment, by one statement."""
+        """The state of the map at this moment, by one statement, or as it was read since the work began."""
+        noted, began, now = self._noted, moment.began(), time.monotonic()
+        if began is not None and noted[0] >= began:
+            return noted[1]
         with self._glancing() as connection:
             state = record.state_of(connection, self.record.id)
-        self.note(state)
+        self.note(state, now)
         return state
 
     def storage_status(self) -> StorageStatus:

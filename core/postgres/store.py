@@ -186,7 +186,7 @@ class PostgresStore(ABC, Generic[MapT]):
 
     def _map(self, map_id: str, number: int | None) -> MapT:
         self._expect_open()
-        with self.database.reading() as whole:
+        with self.database.glancing() as whole:
             if number is None:
                 state = record.find(whole, map_id)
             else:

@@ -27,6 +27,7 @@ from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.maps import Enrolment, Map
+from core.maps.moment import one_look
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
@@ -235,8 +236,9 @@ def locate(map_: Map, encoder: Encoder, queries: Sequence[Query]) -> list[Answer
     """
     began = time.perf_counter()
     selection = queries[0].question.selection
-    ranked = rank_places(map_, encoder, [query.encoding for query in queries], selection)  # both stages of the search
-    answers = [_answer(map_, encoder, query, candidates) for query, candidates in zip(queries, ranked, strict=True)]
+    with one_look():
+        ranked = rank_places(map_, encoder, [query.encoding for query in queries], selection)  # both stages
+        answers = [_answer(map_, encoder, query, candidates) for query, candidates in zip(queries, ranked, strict=True)]
     verifying = sum(answer.third_stage.milliseconds for answer in answers)
     milliseconds = (1e3 * (time.perf_counter() - began) - verifying) / len(queries)
     return [replace(answer, search=milliseconds) for answer in answers]

@@ -27,15 +27,20 @@ class Missing(Exception):
     """A server is not installed; the text says how it can be."""
 
 
+_given: set[int] = set()  # ports of servers that may not listen yet
+
+
 def fixed_ports(count: int) -> list[int]:
-    """Ports that nobody listens at, and of which the system makes no use."""
-    found: set[int] = set()
+    """Ports that nobody listens at, that were not given before, and of which the system makes no use."""
+    found: list[int] = []
     while len(found) < count:
         port = random.choice(_FIXED_PORTS)
         with socket.socket() as listener, suppress(OSError):
             listener.bind(("127.0.0.1", port))
-            found.add(port)
-    return list(found)
+            if port not in _given:
+                _given.add(port)
+                found.append(port)
+    return found
 
 
 class Server:

@@ -41,11 +41,10 @@ LONGEST_TEXT = 512
 
 _P, _S, _T = PLACES.c, SEQUENCES.c, TOKENS.c
 _COLUMNS = sealed_columns(PLACES)
-_STORED = (
-    select(*(_P[name] for name in _COLUMNS), _P.seal, _S.name)
-    .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
-    .where(_P.map == bindparam("map"))
-)
+# A join might begin with the sequences of the map, and so read all its places.
+_NAME = select(_S.name).where(_S.map == _P.map, _S.code == _P.sequence).scalar_subquery()
+_WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
+_STORED = _WHOLE.where(_P.map == bindparam("map"))
 _NUMBERS = (
     "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision",
 )  # fmt: skip
@@ -53,7 +52,7 @@ _NUMBERS = (
 _BY_ID = Statement(_STORED.where(_P.id == bindparam("id")))
 _BY_IDS = Statement(_STORED.where(among(_P.id, "ids")))
 _BY_ROWS = Statement(_STORED.where(among(_P.row, "rows")))
-_BY_KEYS = Statement(_STORED.where(among(_P.key, "keys")))
+_BY_KEYS = Statement(_WHOLE.where(among(_P.key, "keys")))  # keys are those of one map
 _ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
 _INSERT = Statement(
     lambda insert: insert(PLACES).values({name: bindparam(name) for name in ("map", *_COLUMNS, "seal")})
@@ -157,18 +156,18 @@ def _stored(values: Sequence[Any]) -> StoredPlace:
 def _from_columns(columns: Mapping[str, Any], sequence: str | None) -> StoredPlace:
     pose = {name: columns[name] for name in POSE_VALUES if columns[name] is not None}
     try:
-        place = Place(
+        place = Place.model_construct(  # without validation: these are values of a valid place, and have a checksum
             id=columns["id"],
             pose_of=columns["pose_of"],
             regions=columns["regions"],
             picture=columns["picture"],
             pose=Pose(**pose) if pose else None,
-            timestamp=columns["timestamp"],
+            timestamp=None if columns["timestamp"] is None else datetime.fromisoformat(columns["timestamp"]),
             sequence=sequence,
             camera=columns["camera"],
             metadata=json.loads(columns["metadata"]),
-            created_at=columns["created_at"],
-            updated_at=columns["updated_at"],
+            created_at=datetime.fromisoformat(columns["created_at"]),
+            updated_at=datetime.fromisoformat(columns["updated_at"]),
         )
     except ValueError as error:
         raise DamagedRow(f"the row of place {columns['id']!r} is invalid") from error
@@ -267,16 +266,11 @@ def _values(wanted: PlaceFilter) -> dict[str, Any]:
 @cache
 def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     names, values = conditions
-    query = _STORED
-    if ids_alone:
-        query = (
-            select(_P.id)
-            .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
-            .where(_P.map == bindparam("map"))
-        )
+    query = select(_P.id).where(_P.map == bindparam("map")) if ids_alone else _STORED
+    code = select(_S.code).where(_S.map == bindparam("map"), _S.name == bindparam("sequence_name"))
     all_conditions = {
         "ids": among(_P.id, "ids"),
-        "sequence": _S.name == bindparam("sequence_name"),
+        "sequence": _P.sequence == code.scalar_subquery(),
         "camera": _P.camera == bindparam("camera_name"),
         "after": _P.timestamp >= bindparam("from_moment"),
         "before": _P.timestamp <= bindparam("to_moment"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import bindparam, delete, func, select, update
@@ -185,12 +186,17 @@ def _state(values: tuple[Any, ...]) -> MapState:
     if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
-        record = MapRecord.model_validate_json(text)
+        record = _record(text)
     except ValueError as error:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
     if listed and map_id != record.id:
         raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
     return MapState(number, record, *counters)
+
+
+@lru_cache(1000)
+def _record(text: str) -> MapRecord:
+    return MapRecord.model_validate_json(text)
 
 
 def records_after(connection: LedgerConnection, after: str, limit: int) -> list[MapRecord]:

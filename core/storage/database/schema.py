@@ -26,7 +26,7 @@ _STATISTICS = {
     ("places", "sqlite_autoindex_places_2"): "1000000 1000000 1",  # by id
     ("places", "sqlite_autoindex_places_3"): "1000000 1000000 1",  # by row
     ("places", "places_of_sequence"): "1000000 1000000 5000 1",
-    ("places", "places_in_order"): "1000000 1000000 5000 2",
+    ("places", "places_on_position"): "1000000 1000000 5000 2 1",
     ("sequences", "sequences"): "200 200 1",
     ("sequences", "sqlite_autoindex_sequences_2"): "200 200 1",  # by name
     ("tokens", "tokens"): "2000000 2000000 1000 1",
