@@ -13,7 +13,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from tests.servers.postgres import running_postgres
 from tests.servers.process import Missing
@@ -53,12 +53,14 @@ def main() -> int:
             print("Paste these lines where a service starts; Ctrl+C here ends the servers.", file=sys.stderr)
             for name, value in settings.items():
                 print(f"export PLACEREC_{name}={shlex.quote(value)}", flush=True)
-            signal.pause()
+            with suppress(KeyboardInterrupt):
+                signal.pause()
     except (Missing, TimeoutError) as error:
         print(error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        return 0
+    except KeyboardInterrupt:  # while they start
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
