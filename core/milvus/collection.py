@@ -15,7 +15,7 @@ from typing import Any
 import grpc
 import numpy as np
 from numpy.typing import NDArray
-from pymilvus import CollectionSchema, DataType, FieldSchema, MilvusClient
+from pymilvus import DataType, MilvusClient
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StoreOfAnotherVersion, StoreUnavailable
@@ -190,14 +190,15 @@ class Collection:
             if self._id is not None:
                 return
             chosen = indexing_for(client.get_server_version(timeout=_PATIENCE_SECONDS))
-            schema = _schema(self._encoder, self._dimension, chosen.half)
+            description = f"placerec collection 1 of {self._encoder}"
             if not client.has_collection(self.name, timeout=_PATIENCE_SECONDS):
+                schema = _schema(description, self._dimension, chosen.half)
                 client.create_collection(
                     self.name, schema=schema, timeout=_PATIENCE_SECONDS, consistency_level="Bounded", num_shards=1,
                     num_partitions=PARTITIONS,
                 )  # fmt: skip
             made = client.describe_collection(self.name, timeout=_PATIENCE_SECONDS)
-            if (found := made["description"]) != schema.description:
+            if (found := made["description"]) != description:
                 raise StoreOfAnotherVersion(
                     f"Milvus's collection {self.name} was made by another version: {found[:200]!r}."
                 )
@@ -319,21 +320,18 @@ class Collection:
         }
 
 
-def _schema(encoder: str, dimension: int, half: bool) -> CollectionSchema:
-    return CollectionSchema(
-        [
-            FieldSchema("key", DataType.INT64, is_primary=True),
-            FieldSchema("map", DataType.INT64, is_partition_key=True),
-            FieldSchema("row", DataType.INT64),
-            FieldSchema("kind", DataType.INT8),
-            *(FieldSchema(axis, DataType.DOUBLE) for axis in "xyz"),
-            FieldSchema("heading", DataType.FLOAT),
-            FieldSchema("timestamp", DataType.INT64),
-            FieldSchema("sequence", DataType.INT64),
-            FieldSchema("ordinal", DataType.INT64),
-            FieldSchema("camera", DataType.VARCHAR, max_length=64),
-            FieldSchema("metadata", DataType.JSON),
-            FieldSchema("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension),
-        ],
-        description=f"placerec collection 1 of {encoder}",
-    )
+def _schema(description: str, dimension: int, half: bool) -> Any:
+    """The fields of an entity, as pymilvus's ``CollectionSchema``."""
+    schema = MilvusClient.create_schema(description=description)
+    schema.add_field("key", DataType.INT64, is_primary=True)
+    schema.add_field("map", DataType.INT64, is_partition_key=True)
+    for name in ("row", "timestamp", "sequence", "ordinal"):
+        schema.add_field(name, DataType.INT64)
+    schema.add_field("kind", DataType.INT8)
+    for axis in "xyz":
+        schema.add_field(axis, DataType.DOUBLE)
+    schema.add_field("heading", DataType.FLOAT)
+    schema.add_field("camera", DataType.VARCHAR, max_length=64)
+    schema.add_field("metadata", DataType.JSON)
+    schema.add_field("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension)
+    return schema

@@ -17,7 +17,6 @@ from core.ledger.statements import Statement, seconds_now
 from core.maps.records import MapRecord, validation_message
 from core.places import NO_SEQUENCE
 
-
 RECENT_SECONDS = 15
 """The age of a write up to which Milvus is asked to wait for it; three times the five seconds after which Milvus waits
 for it in any case (:meth:`core.milvus.collection.Collection.search`)."""
