@@ -88,7 +88,7 @@ def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> 
     state = scope.snapshot.state
 
     def alone(query: Array) -> NDArray[np.int64]:
-        ((keys, _),) = milvus.collection.search(query[np.newaxis], f"map == {state.number}", SHORTLIST, state.inserted)
+        ((keys, _),) = milvus.collection.search(query[np.newaxis], f"map == {state.number}", SHORTLIST, state.recent)
         return keys
 
     queried: list[tuple[str, Callable[[Array], NDArray[np.int64]]]] = [

@@ -1,7 +1,4 @@
-"""The collection of Milvus that has the descriptors of one encoder, those of all its maps.
-
-This uses pymilvus's older interface, because the newer one does not say from when on an insertion is seen.
-"""
+"""The collection of Milvus that has the descriptors of one encoder, those of all its maps."""
 
 from __future__ import annotations
 
@@ -9,8 +6,6 @@ import hashlib
 import logging
 import re
 import threading
-import uuid
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,8 +15,7 @@ from typing import Any
 import grpc
 import numpy as np
 from numpy.typing import NDArray
-from pymilvus import Collection as Connected
-from pymilvus import CollectionSchema, DataType, FieldSchema, connections, utility
+from pymilvus import DataType, MilvusClient
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StoreOfAnotherVersion, StoreUnavailable
@@ -30,7 +24,6 @@ from core.milvus.expressions import NO_HEADING
 from core.milvus.indexes import indexing_for, search_settings
 from core.places import Whereabouts
 
-warnings.filterwarnings("ignore", message=".*ORM-style PyMilvus API")
 logging.getLogger("pymilvus").setLevel(logging.CRITICAL)  # what it refuses is raised; it would log it as well
 
 MOST_FOUND = 16_384
@@ -111,18 +104,18 @@ class MilvusConnection:
     """A connection to Milvus, which is made when it is first used.  Any thread may use it."""
 
     def __init__(self, address: str, token: str, database: str, certificate: str | None) -> None:
-        self._given: dict[str, Any] = {"uri": address, "token": token, "db_name": database}
+        # Dedicated: pymilvus would share connections of one address, whatever their certificates.
+        self._given: dict[str, Any] = {"uri": address, "token": token, "db_name": database, "dedicated": True}
         if certificate is not None:
             self._given |= {"server_pem_path": certificate, "secure": True}
-        self._name = f"placerec-{uuid.uuid4().hex}"
         self._making = threading.Lock()
-        self._made = False
+        self._client: MilvusClient | None = None
         # After a kill it takes writes before it searches.
         self._outages = {False: Outage("Milvus", probe=self._probe), True: Outage("Milvus", _SEARCH, self._probe)}
 
     @contextmanager
-    def using(self, action: str, searching: bool = False) -> Iterator[str]:
-        """The name of the connection, by which pymilvus knows it.
+    def using(self, action: str, searching: bool = False) -> Iterator[MilvusClient]:
+        """The client, once it is connected.
 
         Args:
             searching: whether the call needs a loaded collection.
@@ -131,21 +124,19 @@ class MilvusConnection:
             StoreUnavailable: Milvus cannot be reached, or refuses.
         """
         with self._outages[searching].noticed(), milvus_errors(action):
-            if not self._made:
-                self._connect()
-            yield self._name
+            yield self._client or self._connect()
 
     def _probe(self) -> None:
         """Raise Unreachable unless Milvus answers soon; pymilvus repeats every other call for long."""
         with milvus_errors("answer"):
-            if self._made:
-                utility.get_server_version(using=self._name, timeout=_PROBING_SECONDS)
+            if (client := self._client) is not None:
+                client.get_server_version(timeout=_PROBING_SECONDS)
 
-    def _connect(self) -> None:
+    def _connect(self) -> MilvusClient:
         with self._making:
-            if not self._made:
-                connections.connect(self._name, timeout=_CONNECTING_SECONDS, grpc_options=_AGAIN_SOON, **self._given)
-                self._made = True
+            if self._client is None:
+                self._client = MilvusClient(timeout=_CONNECTING_SECONDS, grpc_options=_AGAIN_SOON, **self._given)
+            return self._client
 
     def check(self) -> None:
         """Ask Milvus for its version.
@@ -153,13 +144,13 @@ class MilvusConnection:
         Raises:
             StoreUnavailable: it does not answer, or refuses.
         """
-        with self.using("answer") as name:
-            utility.get_server_version(using=name, timeout=_CONNECTING_SECONDS)
+        with self.using("answer") as client:
+            client.get_server_version(timeout=_CONNECTING_SECONDS)
 
     def close(self) -> None:
         """Close it."""
-        if self._made:
-            connections.disconnect(self._name)
+        if (client := self._client) is not None:
+            client.close()
 
 
 class Collection:
@@ -180,54 +171,56 @@ class Collection:
         self.index_type = "FLAT"
         """How Milvus searches it, as far as it was used."""
         self._making = threading.Lock()
-        self._collection: Connected | None = None
-        self._id = 0
+        self._id: int | None = None  # None: it is to be made, or looked at, first
 
     @contextmanager
-    def _using(self, action: str, searching: bool = True) -> Iterator[Connected]:
+    def _using(self, action: str, searching: bool = True) -> Iterator[MilvusClient]:
         try:
-            with self._connection.using(action, searching) as name:
-                yield self._collection or self._make(name)
+            with self._connection.using(action, searching) as client:
+                if self._id is None:
+                    self._make(client)
+                yield client
         except Unreachable as error:
             if "not found" in str(error):
-                self._collection = None
+                self._id = None
             raise
 
-    def _make(self, connection: str) -> Connected:
+    def _make(self, client: MilvusClient) -> None:
         with self._making:
-            if self._collection is not None:
-                return self._collection
-            chosen = indexing_for(utility.get_server_version(using=connection, timeout=_PATIENCE_SECONDS))
-            schema = _schema(self._encoder, self._dimension, chosen.half)
-            if utility.has_collection(self.name, using=connection, timeout=_PATIENCE_SECONDS):
-                made = Connected(self.name, using=connection)
-                if (found := made.schema.description) != schema.description:
-                    raise StoreOfAnotherVersion(
-                        f"Milvus's collection {self.name} was made by another version: {found[:200]!r}."
-                    )
-            else:
-                made = Connected(
-                    self.name, schema, connection, num_partitions=PARTITIONS, shards_num=1,
-                    consistency_level="Bounded",
+            if self._id is not None:
+                return
+            chosen = indexing_for(client.get_server_version(timeout=_PATIENCE_SECONDS))
+            description = f"placerec collection 1 of {self._encoder}"
+            if not client.has_collection(self.name, timeout=_PATIENCE_SECONDS):
+                schema = _schema(description, self._dimension, chosen.half)
+                client.create_collection(
+                    self.name, schema=schema, timeout=_PATIENCE_SECONDS, consistency_level="Bounded", num_shards=1,
+                    num_partitions=PARTITIONS,
                 )  # fmt: skip
-            if not made.has_index():
-                made.create_index("descriptor", dict(chosen.index), timeout=_PATIENCE_SECONDS)
+            made = client.describe_collection(self.name, timeout=_PATIENCE_SECONDS)
+            if (found := made["description"]) != description:
+                raise StoreOfAnotherVersion(
+                    f"Milvus's collection {self.name} was made by another version: {found[:200]!r}."
+                )
+            if not client.list_indexes(self.name, timeout=_PATIENCE_SECONDS):
+                index = client.prepare_index_params("descriptor", **chosen.index)
+                client.create_index(self.name, index, timeout=_PATIENCE_SECONDS)
             # A collection stays as it was made when its server becomes a newer one.
-            types = {field.name: field.dtype for field in made.schema.fields}
+            types = {field["name"]: field["type"] for field in made["fields"]}
             self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
-            self.index_type = str(made.index().params["index_type"])
-            made.load(timeout=_PATIENCE_SECONDS)
-            self._id = _id_of(made)
-            self._collection = made
-            return made
+            (index_name,) = client.list_indexes(self.name, "descriptor", timeout=_PATIENCE_SECONDS)
+            index = client.describe_index(self.name, index_name, timeout=_PATIENCE_SECONDS)
+            self.index_type = str(index["index_type"])
+            client.load_collection(self.name, timeout=_PATIENCE_SECONDS)
+            self._id = int(made["collection_id"])
 
     @property
     def id(self) -> int:
         """By which Milvus knows it; another one if it is dropped and made again, or in another Milvus or database."""
-        if self._collection is None:
+        if self._id is None:
             with self._using("answer"):
                 pass
-        return self._id
+        return self._id or 0
 
     def expect(self, collection: int) -> None:
         """Raise StoreUnavailable unless this is the collection that a map's descriptors are in; 0: no one has any."""
@@ -237,45 +230,44 @@ class Collection:
                 " and the database of it that have, or rebuild the map's index if they have lost them."
             )
 
-    def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
-        """Insert entities of a map; they are durable when this returns.
-
-        Returns:
-            From which timestamp on a search sees them.
-        """
-        seen_from = 0
-        with self._using("store descriptors", searching=False) as collection:
+    def insert(self, map_number: int, entities: Sequence[Entity]) -> None:
+        """Insert entities of a map; they are durable when this returns."""
+        with self._using("store descriptors", searching=False) as client:
             for start in range(0, len(entities), _AT_ONCE):
                 some = [self._record(map_number, one) for one in entities[start : start + _AT_ONCE]]
-                seen_from = int(collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
-        return seen_from
+                client.insert(self.name, some, timeout=_PATIENCE_SECONDS)
 
     def check(self) -> None:
         """Raise unless the collection can be searched."""
-        with self._using("answer") as collection:
-            self._id = _id_of(collection)
-            collection.query("key == 0", ["key"], timeout=_CONNECTING_SECONDS, consistency_level="Eventually")
+        with self._using("answer") as client:
+            self._id = int(client.describe_collection(self.name, timeout=_CONNECTING_SECONDS)["collection_id"])
+            self._query(client, "key == 0", ["key"], _CONNECTING_SECONDS, "Eventually")
 
     def delete(self, keys: Sequence[int]) -> None:
         """Delete entities."""
-        with self._using("delete descriptors", searching=False) as collection:
-            collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
+        with self._using("delete descriptors", searching=False) as client:
+            client.delete(self.name, filter=f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
 
     def keys_between(self, first: int, end: int) -> list[int]:
         """The keys of all entities from ``first`` on and below ``end``; at most ``MOST_FOUND`` apart."""
-        with self._using("list descriptors") as collection:
-            found = collection.query(
-                f"key >= {first} and key < {end}", ["key"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
-            )
+        with self._using("list descriptors") as client:
+            found = self._query(client, f"key >= {first} and key < {end}", ["key"])
         return [int(one["key"]) for one in found]
 
     def descriptors_of(self, keys: Sequence[int]) -> dict[int, NDArray[np.float32]]:
         """The descriptors of entities by key, float32 [D]; keys that Milvus does not have now are left out."""
-        with self._using("read descriptors") as collection:
-            found = collection.query(
-                f"key in {list(keys)}", ["key", "descriptor"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
-            )
+        with self._using("read descriptors") as client:
+            found = self._query(client, f"key in {list(keys)}", ["key", "descriptor"])
         return {int(one["key"]): self._vector(one["descriptor"]) for one in found}
+
+    def _query(
+        self, client: MilvusClient, expression: str, fields: list[str], seconds: float = _PATIENCE_SECONDS,
+        level: str = "Strong",
+    ) -> list[dict[str, Any]]:  # fmt: skip
+        found: list[dict[str, Any]] = client.query(
+            self.name, expression, fields, timeout=seconds, consistency_level=level
+        )
+        return found
 
     def _vector(self, value: Any) -> NDArray[np.float32]:
         """A descriptor as Milvus returns it: a list, or the bytes of halves."""
@@ -284,31 +276,30 @@ class Collection:
         return stored.astype(np.float32)
 
     def search(
-        self, descriptors: NDArray[np.float32], expression: str, limit: int, seen_from: int
+        self, descriptors: NDArray[np.float32], expression: str, limit: int, recent: bool
     ) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
         """The keys with the largest inner products, int64 [n], and these, float32 [n], for each of the queries.
+
+        Every insertion is seen that ended before its map's state was read, whichever service made it.  Of a map that
+        was written to lately, the search waits until Milvus has taken up everything up to now (``Strong``), by
+        Milvus's own clock alone.  Of others it waits for what is older than five seconds by that clock (``Bounded``,
+        ``common.gracefulTime``), which is there but after a stall.  PostgreSQL's clock alone tells how old the last
+        write is, and notes its moment after the insertion, so clocks of services do not count, nor does a constant
+        difference between PostgreSQL's and Milvus's.  ``RECENT_SECONDS`` are three times the five, so that even a
+        step of a clock by ten seconds between write and search hides nothing.
 
         Args:
             descriptors: float32 [B, D].
             limit: how many at most; at most ``MOST_FOUND``.
-            seen_from: a timestamp of Milvus; rows that were inserted until then are searched.
+            recent: whether the map was written to lately (:attr:`core.ledger.maps.record.MapState.recent`).
         """
-        with self._using("search") as collection:
-            queries, settings = (
-                list(descriptors.astype(self._value, copy=False)),
-                search_settings(self.index_type, limit),
-            )
-            found = collection.search(
-                queries, "descriptor", settings, limit, expression, timeout=_PATIENCE_SECONDS,
-                consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
+        with self._using("search") as client:
+            found = client.search(
+                self.name, list(descriptors.astype(self._value, copy=False)), expression, limit,
+                search_params=search_settings(self.index_type, limit), timeout=_PATIENCE_SECONDS,
+                anns_field="descriptor", consistency_level="Strong" if recent else "Bounded",
             )  # fmt: skip
-        return [
-            (
-                np.array(hits.ids, np.int64),
-                np.array(hits.distances, np.float32),
-            )
-            for hits in found
-        ]
+        return [(np.array(hits.ids, np.int64), np.array(hits.distances, np.float32)) for hits in found]
 
     def _record(self, map_number: int, entity: Entity) -> dict[str, object]:
         where = entity.where
@@ -329,25 +320,18 @@ class Collection:
         }
 
 
-def _id_of(collection: Connected) -> int:
-    return int(collection.describe(timeout=_CONNECTING_SECONDS)["collection_id"])
-
-
-def _schema(encoder: str, dimension: int, half: bool) -> CollectionSchema:
-    return CollectionSchema(
-        [
-            FieldSchema("key", DataType.INT64, is_primary=True),
-            FieldSchema("map", DataType.INT64, is_partition_key=True),
-            FieldSchema("row", DataType.INT64),
-            FieldSchema("kind", DataType.INT8),
-            *(FieldSchema(axis, DataType.DOUBLE) for axis in "xyz"),
-            FieldSchema("heading", DataType.FLOAT),
-            FieldSchema("timestamp", DataType.INT64),
-            FieldSchema("sequence", DataType.INT64),
-            FieldSchema("ordinal", DataType.INT64),
-            FieldSchema("camera", DataType.VARCHAR, max_length=64),
-            FieldSchema("metadata", DataType.JSON),
-            FieldSchema("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension),
-        ],
-        description=f"placerec collection 1 of {encoder}",
-    )
+def _schema(description: str, dimension: int, half: bool) -> Any:
+    """The fields of an entity, as pymilvus's ``CollectionSchema``."""
+    schema = MilvusClient.create_schema(description=description)
+    schema.add_field("key", DataType.INT64, is_primary=True)
+    schema.add_field("map", DataType.INT64, is_partition_key=True)
+    for name in ("row", "timestamp", "sequence", "ordinal"):
+        schema.add_field(name, DataType.INT64)
+    schema.add_field("kind", DataType.INT8)
+    for axis in "xyz":
+        schema.add_field(axis, DataType.DOUBLE)
+    schema.add_field("heading", DataType.FLOAT)
+    schema.add_field("camera", DataType.VARCHAR, max_length=64)
+    schema.add_field("metadata", DataType.JSON)
+    schema.add_field("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension)
+    return schema

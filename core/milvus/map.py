@@ -41,7 +41,7 @@ class MilvusMap(PostgresMap):
         return False
 
     def snapshot(self) -> MilvusSnapshot:
-        """All places at this moment; the same object until the map is written to."""
+        """All places at this moment; the same object until the map is written to, or has not been for a while."""
         with self.viewing() as (connection, state):
             self._last = self._snapshot(connection, state)
             return self._last

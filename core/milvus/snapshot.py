@@ -237,7 +237,7 @@ class MilvusScope:
         limit = min(MOST_FOUND, int(_SPARE * wanted) + 10)
         while True:
             snapshot.collection.expect(snapshot.state.collection)
-            hits = snapshot.collection.search(queries, expression, limit, snapshot.state.inserted)
+            hits = snapshot.collection.search(queries, expression, limit, snapshot.state.recent)
             rankings = self._filtered(hits, keep)
             enough = all(
                 len(keys) < limit or len(ranking[0]) >= wanted

@@ -70,8 +70,7 @@ class MilvusWrite(PostgresWrite):
         if not self._rebuilding:
             self._collection.expect(self.state.collection)
             self.state = replace(self.state, collection=self._collection.id)
-        inserted = self._collection.insert(self.state.number, self._made(list(self._entities.values())))
-        self.state = replace(self.state, inserted=max(self.state.inserted, inserted))
+        self._collection.insert(self.state.number, self._made(list(self._entities.values())))
 
     def _made(self, places: Sequence[StoredPlace]) -> list[Entity]:
         stored = self._stored_at([place.row for place in places])

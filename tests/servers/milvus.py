@@ -25,9 +25,13 @@ from tests.servers.process import Missing, Server, fixed_ports
 ROOT = Path(__file__).parents[2]
 MILVUS_PYTHON = ROOT / ".venv-cluster/bin/python"
 
-MILVUS_SETTINGS = {"common.session.ttl": "10", "dataNode.segment.syncPeriod": "30"}
-"""Other than Milvus's own, as in docker/milvus.yaml.  After a SIGKILL it searches again when what it was has expired,
-in 15 s, not in 34, and when it has read its log again since it last wrote its segments down."""
+MILVUS_SETTINGS = {
+    "common.session.ttl": "40",
+    "dataNode.segment.syncPeriod": "30",
+    "proxy.timeTickInterval": "50",
+}
+"""Other than Milvus's own, as in docker/milvus.yaml.  Its sessions outlive a stall of 20 s.  After a SIGKILL it
+searches again when they have expired, and when it has read its log again since it last wrote its segments down."""
 
 _CONFIGURE = """
 import sys

@@ -89,6 +89,21 @@ class Server:
                     raise TimeoutError(text) from error
                 time.sleep(0.2)
 
+    def stall(self, seconds: float) -> None:
+        """Let it stand still for some seconds."""
+        os.killpg(self.process_id, signal.SIGSTOP)
+        try:
+            time.sleep(seconds)
+        finally:
+            os.killpg(self.process_id, signal.SIGCONT)
+
+    def has_ended(self, within: float) -> bool:
+        """Whether it ends by itself within some seconds."""
+        assert self._process is not None, "it does not run"
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(within)
+        return self._process.poll() is not None
+
     def end(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End it, gently or by SIGKILL, and wait until it has ended."""
         process, self._process = self._process, None

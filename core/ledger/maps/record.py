@@ -17,6 +17,10 @@ from core.ledger.statements import Statement, seconds_now
 from core.maps.records import MapRecord, validation_message
 from core.places import NO_SEQUENCE
 
+RECENT_SECONDS = 15
+"""The age of a write up to which Milvus is asked to wait for it; three times the five seconds after which Milvus waits
+for it in any case (:meth:`core.milvus.collection.Collection.search`)."""
+
 
 @dataclass(frozen=True)
 class MapState:
@@ -27,7 +31,7 @@ class MapState:
     numbers: the number of the next place.
     revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
         and made again is told from the first one.
-    inserted: the timestamp from which on Milvus sees all descriptors that count.
+    recent: whether it was written to in the last ``RECENT_SECONDS`` by the clock of the database.
     collection: Milvus's id of the collection that has them; 0 as long as there are none.
     """
 
@@ -38,13 +42,16 @@ class MapState:
     numbers: int = 1
     revision: int = 0
     stamp: str = ""
-    inserted: int = 0
     collection: int = 0
+    recent: bool = True
 
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
-_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "inserted", "collection")
-_STATE = (MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS))
+_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "collection")
+_STATE = (
+    MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS),
+    (MAPS.c.touched > seconds_now() - RECENT_SECONDS).label("recent"),
+)  # fmt: skip
 
 _CREATE = Statement(
     lambda insert: (
@@ -182,7 +189,7 @@ def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
 
 
 def _state(values: tuple[Any, ...]) -> MapState:
-    number, map_id, listed, text, seal, *counters = values
+    number, map_id, listed, text, seal, *counters, recent = values
     if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
@@ -191,7 +198,7 @@ def _state(values: tuple[Any, ...]) -> MapState:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
     if listed and map_id != record.id:
         raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
-    return MapState(number, record, *counters)
+    return MapState(number, record, *counters, recent=bool(recent))
 
 
 @lru_cache(1000)

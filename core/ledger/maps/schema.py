@@ -45,7 +45,6 @@ MAPS = Table(
     _column("codes", integer(), server_default="0"),  # the code of the next sequence or lost track
     _column("revision", integer(), server_default="0"),  # grows with every write
     _column("stamp", text(), server_default=""),  # drawn at random by the write that made this revision
-    _column("inserted", integer(), server_default="0"),  # Milvus's timestamp of the last insertion that counts
     _column("collection", integer(), server_default="0"),  # Milvus's id of the collection that has its descriptors
     _column("seal", integer()),
     sqlite_strict=True,

@@ -355,7 +355,7 @@ class Write(ABC):
             StorageFull, StorageFailure, OSError, sqlite3.Error: one of them refuses.
         """
         if self.changed or self.state != self._before:
-            self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8))
+            self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8), recent=True)
         self._store_waiting()
         self._finish()
         if self.state != self._before:

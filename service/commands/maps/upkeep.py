@@ -8,9 +8,21 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, CommandTarget, DataDir, MapId, Url, ask, path_of
-from service.commands.console import number, remark, say, show, show_json, table
-from service.commands.jobs import Wait, show_outcome, submit
+from service.commands.connection.client import (
+    AsJson,
+    CommandTarget,
+    DataDir,
+    MapId,
+    Refused,
+    Service,
+    Url,
+    ask,
+    open_service,
+    path_of,
+    run,
+)
+from service.commands.console import Failure, number, remark, say, show, show_json, table
+from service.commands.jobs import Wait, followed, show_outcome, submit
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do it; otherwise the command only reports what it would do.")]
 
@@ -81,10 +93,62 @@ def reencode(
 
 
 def rebuild(
-    map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
+    map_id: Annotated[str | None, typer.Argument(metavar="[MAP]", help="The map's id.", show_default=False)] = None,
+    all_: Annotated[
+        bool, typer.Option("--all", help="Instead: the indexes of all maps, one after another, as for a lost Milvus.")
+    ] = False,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
 ) -> None:
     """Rebuild the search index of a large map from its descriptors, while it is searched."""
-    show_outcome(submit(CommandTarget(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+    target = CommandTarget(url, data_dir)
+    if (map_id is None) is not all_:
+        raise typer.BadParameter("Name a map, or give --all.")
+    if map_id is not None:
+        show_outcome(submit(target, path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+        return
+    if not wait:
+        raise typer.BadParameter("--all waits for each map before it begins the next.")
+    _show_rebuilt(_rebuild_all(target), as_json)
+
+
+def _rebuild_all(target: CommandTarget) -> dict[str, dict[str, Any]]:
+    """Rebuild the indexes of all maps; returns, by map, the job, or ``detail`` alone of a map that is refused."""
+
+    async def work() -> dict[str, dict[str, Any]]:
+        async with open_service(target) as service:
+            pages = [page async for page in service.pages(path_of("maps"))]
+            maps = {one["id"] for page in pages for one in (*page["items"], *page["quarantined"])}
+            return {map_id: await _rebuilt(service, map_id) for map_id in sorted(maps)}
+
+    return run(work())
+
+
+async def _rebuilt(service: Service, map_id: str) -> dict[str, Any]:
+    try:
+        submitted = await service.request("POST", path_of("maps", map_id, "rebuild"), json={})
+        return await followed(service, submitted.json())
+    except Refused as error:
+        return {"state": "refused", "problem": {"detail": str(error)}}
+
+
+def _show_rebuilt(found: dict[str, dict[str, Any]], as_json: bool) -> None:
+    """Show the outcome of each map.
+
+    Raises:
+        Failure: the index of a map was not rebuilt.
+    """
+    if as_json:
+        show_json(found)
+    else:
+        shown = table("map", "state", "why")
+        for map_id, job in found.items():
+            shown.add_row(map_id, job["state"], (job["problem"] or {}).get("detail", ""))
+        show(shown)
+    if failed := [map_id for map_id, job in found.items() if job["state"] != "succeeded"]:
+        raise Failure(f"Not rebuilt: {', '.join(failed)}.")
 
 
 def keypoints(

@@ -32,7 +32,7 @@ from tests.core.milvus.parts import PARTS, Part
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of
 from tests.servers.milvus import Servers, running_servers
 
-MOST_SECONDS = 30.0
+MOST_SECONDS = 60.0
 """From the start of a server until both clients are served again."""
 IDS = 12
 SERVED = 5

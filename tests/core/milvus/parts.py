@@ -5,18 +5,16 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing
 from hashlib import sha256
 from typing import Protocol
 
-import grpc
 import numpy as np
-from pymilvus import Collection, connections
-from pymilvus.exceptions import MilvusException
+from pymilvus import MilvusClient
 
 from core.errors import StorageFailure
 from core.ledger.maps.frames import StoredObject
-from core.milvus.collection import collection_name
+from core.milvus.collection import collection_name, milvus_errors
 from core.postgres.pictures.objects import Objects
 from tests.core.milvus.clients import ProcessClient
 from tests.core.storage.frames import DIMENSION, ENCODER
@@ -86,16 +84,9 @@ class Milvus(_OfServer):
         self._address = servers.milvus_address
 
     def ask(self) -> None:
-        try:
-            connections.connect("asking", uri=self._address, timeout=1)
-            collection = Collection(collection_name(ENCODER, DIMENSION), using="asking")
-            query = [np.ones(DIMENSION, np.float32)]
-            collection.search(query, "descriptor", {"metric_type": "IP"}, 1, timeout=2, consistency_level="Strong")
-        except (MilvusException, grpc.RpcError) as error:
-            raise StorageFailure(str(error)) from error
-        finally:
-            with suppress(MilvusException):
-                connections.remove_connection("asking")
+        name, query = collection_name(ENCODER, DIMENSION), [np.ones(DIMENSION, np.float32)]
+        with milvus_errors("answer"), closing(MilvusClient(self._address, timeout=1, dedicated=True)) as client:
+            client.search(name, query, limit=1, timeout=2, anns_field="descriptor", consistency_level="Strong")
 
 
 class ObjectStore(_OfServer):

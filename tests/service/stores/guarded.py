@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import psycopg
-from pymilvus import MilvusClient, connections
+from pymilvus import MilvusClient
 
 from core.milvus.collection import milvus_errors
 from tests.certificates import certify
@@ -64,16 +64,15 @@ class Guarded(Servers):
 
     def administrator(self) -> MilvusClient:
         """A client with all rights in Milvus."""
-        return MilvusClient(self.milvus_address, token=ROOT_TOKEN, server_pem_path=str(self.authority))
+        given = {"token": ROOT_TOKEN, "server_pem_path": str(self.authority), "dedicated": True}
+        return MilvusClient(self.milvus_address, timeout=2, **given)
 
     def _ask_postgres(self) -> None:
         self.execute("SELECT 1")
 
     def _ask_milvus(self) -> None:
         with milvus_errors("answer"):
-            given = {"uri": self.milvus_address, "token": ROOT_TOKEN, "server_pem_path": str(self.authority)}
-            connections.connect("asking", timeout=2, **given)
-            connections.disconnect("asking")
+            self.administrator().close()
 
 
 @contextmanager

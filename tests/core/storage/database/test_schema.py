@@ -25,7 +25,7 @@ def version(connection: sqlite3.Connection) -> int:
 
 def test_an_empty_file_gets_the_tables(connection: sqlite3.Connection) -> None:
     prepare(connection, create=True)
-    assert version(connection) == SCHEMA.version == 10
+    assert version(connection) == SCHEMA.version == 11
     check_schema(connection)
     prepare(connection)
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}

@@ -110,3 +110,26 @@ def test_a_job_that_fails_ends_in_a_sentence(placerec: Placerec, where: list[str
 
 def test_without_a_service_jobs_are_waited_for(placerec: Placerec) -> None:
     assert "--url" in placerec("maps", "prune", "lab", "--no-wait", status=1).stderr
+
+
+def test_rebuilding_all_maps(placerec: Placerec, tmp_path: Path) -> None:
+    """One map that cannot be read keeps no other one from being rebuilt."""
+    install_coarse_encoder(tmp_path / "models")
+    for name in ("attic", "lab", "yard"):
+        placerec("maps", "create", name, "--encoder", COARSE)
+    rebuilt = json.loads(placerec("maps", "rebuild", "--all", "--json").stdout)
+    assert {name: (job["kind"], job["state"]) for name, job in rebuilt.items()} == {
+        name: ("rebuild", "succeeded") for name in ("attic", "lab", "yard")
+    }
+    jobs = list(rebuilt.values())
+    assert all(job["ended_at"] <= later["started_at"] for job, later in zip(jobs, jobs[1:], strict=False))
+
+    (tmp_path / "data/maps/lab/map.sqlite").write_bytes(b"damaged")
+    failed = placerec("maps", "rebuild", "--all", status=1)
+    assert re.findall(r"^(\w+) +(succeeded|refused|failed)", failed.stdout, re.MULTILINE) == [
+        ("attic", "succeeded"), ("lab", "refused"), ("yard", "succeeded"),
+    ]  # fmt: skip
+    assert "Not rebuilt: lab." in failed.stderr
+    placerec("maps", "rebuild", status=2)
+    placerec("maps", "rebuild", "lab", "--all", status=2)
+    placerec("maps", "rebuild", "--all", "--no-wait", status=2)
