@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -342,6 +343,12 @@ class Settings(BaseSettings):
             raise ValueError(f"{PREFIX}MAX_BATCH_BYTES is less than {PREFIX}MAX_IMAGE_BYTES")
         if self.max_upload_memory < self.max_batch_bytes:
             raise ValueError(f"{PREFIX}MAX_UPLOAD_MEMORY is less than {PREFIX}MAX_BATCH_BYTES")
+        return self
+
+    @model_validator(mode="after")
+    def _database_is_an_address(self) -> Settings:
+        if self.database is not None and not re.match(r"postgres(ql)?://|\w+ *=", self.database.get_secret_value()):
+            raise ValueError(f"{PREFIX}DATABASE is not an address such as postgresql://placerec:password@db/placerec")
         return self
 
     @model_validator(mode="after")

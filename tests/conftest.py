@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first; tests of PostgreSQL are skipped where it is not installed."""
     if why := _why_no_postgres():
         for item in items:
-            if "postgres" in item.keywords and item.get_closest_marker("postgres"):
+            if item.get_closest_marker("postgres"):
                 item.add_marker(pytest.mark.skip(reason=why))
     items.sort(key=lambda item: next((rank for rank, name in enumerate(LONGEST) if item.nodeid.startswith(name)), 99))
 

@@ -69,11 +69,17 @@ class TimedConnection(Connection[Any]):
     def wait(self, gen: Any, interval: float = 0.1, timeout: float | None = None) -> Any:
         """Wait for the answer to a statement; psycopg calls this for each.
 
+        Args:
+            timeout: of a caller that knows what to do when it is over, as one that waits for notices; the connection
+                stays then.
+
         Raises:
             psycopg.OperationalError: there is none in time; the connection is closed.
         """
+        if timeout is not None:
+            return super().wait(gen, interval=interval, timeout=timeout)
         try:
-            found = super().wait(gen, interval=interval, timeout=self.seconds if timeout is None else timeout)
+            found = super().wait(gen, interval=interval, timeout=self.seconds)
             self.answered = time.monotonic()
             return found
         except psycopg.errors._WaitTimeout as error:
@@ -280,7 +286,7 @@ def prepare(connection: Connection[Any], tables: Sequence[Tables]) -> None:
     """Make the tables of some parts that are missing, and bring those of earlier versions up to date.
 
     Raises:
-        StoreOfAnotherVersion: tables are of a version that is not read; all are as they were.
+        StoreOfAnotherVersion: tables are of a version that is not read, or another program's; all are as they were.
     """
     connection.execute("SELECT pg_advisory_xact_lock(%s)", (Lock.TABLES,))
     connection.execute("CREATE TABLE IF NOT EXISTS placerec_tables (part text PRIMARY KEY, version integer NOT NULL)")
@@ -296,8 +302,14 @@ def prepare(connection: Connection[Any], tables: Sequence[Tables]) -> None:
                 f" read; it reads version {part.version}. They are left as they are: go on with the version that made"
                 " them, or begin anew in another database."
             )
-        for statement in statements:
-            connection.execute(statement)
+        try:
+            for statement in statements:
+                connection.execute(statement)
+        except (psycopg.errors.DuplicateTable, psycopg.errors.DuplicateObject) as error:
+            raise StoreOfAnotherVersion(
+                f"PostgreSQL's database has something that another program has made where placerec keeps its {part.name}:"
+                f" {_in_one_line(error)}. It is left as it is: name an empty database."
+            ) from error
         query = (
             "INSERT INTO placerec_tables VALUES (%s, %s) ON CONFLICT (part) DO UPDATE SET version = excluded.version"
         )

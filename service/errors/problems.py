@@ -204,6 +204,7 @@ RETRY_LATER = (
     faults.DeadlineExceeded,
     faults.NotReady,
     errors.StoreUnavailable,
+    faults.KeysUnreadable,
     faults.JobQueueFull,
     faults.StagingFull,
     faults.TooManyExports,

@@ -145,8 +145,7 @@ _CALIBRATION = Statement(select(*_CALIBRATIONS.columns[1:]).join_from(_CALIBRATI
 
 def statistics_file(directory: Path) -> DisposableLedger:
     """The ledger of one data directory, which this process holds; a damaged file is put aside and made anew."""
-    # A crash may lose the last counts, but never damages the file.
-    settings = {**DURABLE, "synchronous": "NORMAL", "foreign_keys": "ON", "journal_size_limit": 1 << 20}
+    settings = {**DURABLE, "foreign_keys": "ON", "journal_size_limit": 1 << 20}
     readable = ["SELECT last FROM place_counts LIMIT 0"]
     return DisposableLedger(file_of(directory / FILE, TABLES, settings, readable, check_whole=False))
 

@@ -21,11 +21,13 @@ from compose_spec import PyCompose
 
 from service.settings import Settings
 from tests.project.test_container import seconds, service
-from tests.service.balancer import balanced
+from tests.service.balancer import balanced, nginx_with
+from tests.service.server import free_port
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
 COMPOSE = DOCKER / "compose.cluster.yaml"
+GUIDE = ROOT / "docs/how-to/run-a-cluster.md"
 MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
 VERSION = "1.31"
 """Of Kubernetes, the oldest that the manifests are meant for."""
@@ -232,3 +234,33 @@ def test_a_query_outlives_a_replica_and_a_write_is_not_sent_twice(
     refused = robot.post("/v1/maps/lab/merge", content=frame)
     assert refused.status_code == 502
     assert len(one.asked + other.asked) == 1  # type: ignore[attr-defined]
+
+
+@pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed")
+def test_robots_of_a_map_come_to_the_same_replica(replicas: list[ThreadingHTTPServer], tmp_path: Path) -> None:
+    """By the lines that the guide puts into the configuration."""
+    chosen, of_map = re.findall(r"^```nginx\n(.*?)^```$", GUIDE.read_text(), re.DOTALL | re.MULTILINE)
+    one, other = (f"127.0.0.1:{replica.server_port}" for replica in replicas)
+    port = free_port()
+    changes = {
+        "upstream placerec {": f"{of_map}upstream placerec {{",
+        "least_conn; # queries differ in what they cost": chosen,
+        "placerec-1:8000": one,
+        "placerec-2:8000": other,
+        "listen 8000": f"listen 127.0.0.1:{port}",
+    }
+    names = [f"hall-{number}" for number in range(20)]
+    with (
+        nginx_with("cluster.conf", changes, tmp_path, port),
+        httpx.Client(base_url=f"http://127.0.0.1:{port}") as robot,
+    ):
+        for name in names:
+            for path in ("query?k=3", "query:batch", "sessions", "places"):
+                assert robot.post(f"/v1/maps/{name}/{path}", content=b"frame").status_code == 200
+        asked = [{path.split("/")[3] for path in replica.asked} for replica in replicas]  # type: ignore[attr-defined]
+        assert all(asked) and asked[0].isdisjoint(asked[1]) and asked[0] | asked[1] == set(names)
+        for replica in replicas:
+            replica.asked.clear()  # type: ignore[attr-defined]
+        for _ in range(20):
+            robot.post("/v1/query", content=b"frames")
+        assert all(replica.asked for replica in replicas)  # type: ignore[attr-defined]

@@ -111,14 +111,18 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py"}
 """What runs in .venv-ros, whose packages are not here."""
 
 EXTRAS = {
+    "core/ledger/postgres": {"cluster"},
     "core/milvus": {"milvus"},
+    "core/postgres": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
     "lab": {"lab"},
+    "service/peers/differences": {"cluster"},
+    "service/peers/replica": {"cluster"},
     "service/ray_serve": {"ray"},
-    "service/shared": {"milvus"},
+    "service/shared": {"cluster"},
 }
-"""Folders that may import what an extra brings; tests and benchmarks may import all."""
+"""Folders and modules that may import what an extra brings; tests and benchmarks may import all."""
 
 
 def allowed(path: Path) -> set[str]:
@@ -127,7 +131,8 @@ def allowed(path: Path) -> set[str]:
         texts = [*CLIENT_PROJECT["dependencies"], *CLIENT_PROJECT["optional-dependencies"]["stream"], *FOR_TYPES]
         return {canonicalize_name(Requirement(text).name) for text in texts}
     extras = PROJECT["optional-dependencies"]
-    folders = {str(parent.relative_to(ROOT)) for parent in path.parents if parent.is_relative_to(ROOT)}
+    within = [path.with_suffix(""), *path.parents]
+    folders = {str(one.relative_to(ROOT)) for one in within if one.is_relative_to(ROOT)}
     chosen = (
         set(extras) if folders & {"benchmarks", "tests"} else set().union(*(EXTRAS.get(one, ()) for one in folders))
     )

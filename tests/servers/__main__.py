@@ -47,6 +47,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="scripts/cluster", description="Start a PostgreSQL for trials.")
     parser.add_argument("--milvus", action="store_true", help="start a Milvus and an object store as well")
     started = _all_servers if parser.parse_args().milvus else _postgres
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl+C does, with the servers
     try:
         with started() as settings:
             print("Paste these lines where a service starts; Ctrl+C here ends the servers.", file=sys.stderr)
@@ -56,6 +57,8 @@ def main() -> int:
                 signal.pause()
     except (Missing, TimeoutError) as error:
         print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:  # while they start
         return 1
     return 0
 

@@ -94,3 +94,17 @@ def test_limits_of_map_files(monkeypatch: pytest.MonkeyPatch, name: str, bad: st
     monkeypatch.setenv(f"PLACEREC_{name}", bad)
     with pytest.raises(SettingsError, match=f"^PLACEREC_{name}: "):
         read_settings()
+
+
+@pytest.mark.parametrize("address", ["", "mysql://u:p@h/d", "postgres//x", "db"])
+def test_addresses_of_no_database(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setenv("PLACEREC_DATABASE", address)
+    with pytest.raises(SettingsError, match="PLACEREC_DATABASE is not an address such as postgresql://") as refused:
+        read_settings()
+    assert "u:p" not in str(refused.value)
+
+
+@pytest.mark.parametrize("address", ["postgresql://placerec:word@db/placerec", "host=db dbname=placerec"])
+def test_addresses_of_a_database(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setenv("PLACEREC_DATABASE", address)
+    assert read_settings().engine == "postgres"

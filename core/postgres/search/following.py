@@ -23,7 +23,7 @@ from core.index.flat import flat_index, vectors
 from core.ledger.maps.columns import read_columns
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
-from core.ledger.postgres import PostgresLedger
+from core.ledger.postgres import PostgresConnection, PostgresLedger
 from core.maps.records import MapRecord
 from core.maps.status import Tier
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
@@ -91,8 +91,12 @@ class FollowedMap:
 
     def _advanced(self, connection: MapConnection, state: MapState) -> Followed:
         held = self._held
-        if held is not None and held.revision > state.revision and self._follows(connection, held):
-            return held  # another thread has seen more
+        if held is not None and held.revision > state.revision:
+            # This transaction does not see so much; and others that wait here may hold all connections of the pool.
+            with self._database.alone("read") as fresh:
+                if self._follows(MapConnection(PostgresConnection(fresh), self._map), held):
+                    return held  # another thread has seen more
+            held = None
         if held is None or not self._follows(connection, held) or self._tier(state, held) != _tier_of(held.snapshot):
             source = PostgresRows(self._database, self._map, state.record, self._cache)
             snapshot = self._read(connection, state, source)
@@ -109,7 +113,7 @@ class FollowedMap:
             return not held.stamp
         known = rows.stamp_of(connection, held.revision)
         if known != held.stamp:
-            log.warning("Map %d is read anew: the database lacks a revision of it that was there before", self._map)
+            log.warning("Map %d is read anew: its revision %d is not that of the database", self._map, held.revision)
         return known == held.stamp
 
     def _tier(self, state: MapState, held: Followed | None) -> Tier:

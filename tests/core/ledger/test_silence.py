@@ -6,17 +6,20 @@ import time
 
 import psycopg
 import pytest
-from sqlalchemy import select
+from sqlalchemy import Column, MetaData, Table, select
 
-from core.errors import StoreUnavailable
-from core.ledger import Statement
+from core.errors import StoreOfAnotherVersion, StoreUnavailable
+from core.ledger import Statement, Tables
 from core.ledger import postgres as connections
 from core.ledger.postgres import PostgresLedger
+from core.ledger.statements import text
 from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(120)]
 
 _ONE = Statement(select(1))
+_METADATA = MetaData()
+Table("fruit", _METADATA, Column("name", text(), primary_key=True))
 
 
 @pytest.mark.thorough
@@ -52,4 +55,27 @@ def test_a_statement_without_an_answer_ends_its_connection(postgres: Postgres, m
     silent = pytest.raises(StoreUnavailable, match="PostgreSQL cannot be reached: it does not answer")
     with silent, ledger.connection("look", 0.5) as connection:
         connection.execute("SELECT pg_sleep(60)")
+    ledger.close()
+
+
+def test_one_who_listens_stays_connected_while_nobody_speaks(postgres: Postgres) -> None:
+    ledger = PostgresLedger(postgres.address, [])
+    with ledger.listening("placerec_test") as heard:
+        for _ in range(3):
+            assert list(heard(0.05)) == []
+        ledger.notify("speak", "placerec_test", "there")
+        assert next(iter(heard(30.0))) == "there"
+    ledger.close()
+
+
+def test_another_programs_tables_are_refused_and_left_alone(postgres: Postgres) -> None:
+    postgres.empty()
+    ledger = PostgresLedger(postgres.address, [Tables("fruit", 1, _METADATA)])
+    with psycopg.connect(postgres.address, autocommit=True) as other:
+        other.execute("CREATE TABLE fruit (apple text)")
+        with pytest.raises(StoreOfAnotherVersion, match="another program"):
+            ledger.check()
+        assert other.execute("SELECT to_regclass('placerec_tables')").fetchone() == (None,)
+        other.execute("DROP TABLE fruit")
+        ledger.check()
     ledger.close()

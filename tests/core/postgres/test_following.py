@@ -157,6 +157,18 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Coded
     assert stores[0].verify("lab").ok
 
 
+def test_a_reading_that_began_earlier_does_not_set_back_what_is_held(stores: list[CodedStore]) -> None:
+    here, there = maps_of(stores)
+    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
+    there.snapshot()
+    with there.viewing() as (connection, state):
+        here.enrol([frame("later", 5001)])
+        newest = there.snapshot()
+        assert len(newest) == 301
+        assert there._followed.up_to_date(connection, state).snapshot is newest
+    assert there.snapshot() is newest
+
+
 def sent_again(request: Callable[[], Answered]) -> Answered:
     """The result of a request that is sent again as long as it is refused because a connection was lost."""
     while True:

@@ -6,9 +6,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+import httpx
+
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
-from tests.service.server import Server
+from tests.service.server import Server, assert_problem
 
 MAP = "lab"
 PLACES = 8
@@ -20,6 +22,12 @@ def fill(service: Server) -> None:
     for number in range(PLACES):
         response = service.enrol(MAP, f"p{number}", jpeg(number), x=2 * number, y=0, sequence="monday")
         assert response.status_code == 201, response.text
+
+
+def expect_away(response: httpx.Response) -> None:
+    """A request is refused because PostgreSQL is away; a while after that has begun, nobody's key is known any more."""
+    slug = "keys-unreadable" if "keys-unreadable" in response.text else "store-unavailable"
+    assert "PostgreSQL" in assert_problem(response, 503, slug)["detail"]
 
 
 @contextmanager
