@@ -76,8 +76,8 @@ def milvus_errors(action: str) -> Iterator[None]:
 
 def _reason(error: MilvusException | grpc.RpcError, action: str) -> str:
     """The text that follows the name of Milvus in an error."""
-    said = error if isinstance(error, grpc.RpcError) else error.__cause__
-    if not isinstance(said, grpc.RpcError):
+    said = _call_of(error)
+    if said is None:
         return f"refuses to {action}: {_in_one_line(str(getattr(error, 'message', error)))}"
     code, details = said.code(), _in_one_line((said.details() or "").rpartition("last error: ")[2])
     if code == grpc.StatusCode.UNAUTHENTICATED:
@@ -94,6 +94,14 @@ def _reason(error: MilvusException | grpc.RpcError, action: str) -> str:
         return f"closes the connection, as one does that wants TLS (https) or is ending: {details}"
     verdict = "cannot be reached" if code == grpc.StatusCode.UNAVAILABLE else f"refuses to {action}"
     return f"{verdict}: {details or code}"
+
+
+def _call_of(error: BaseException) -> grpc.RpcError | None:
+    """The error of gRPC in one of pymilvus, which also names errors as their own causes; None if it has none."""
+    before: BaseException | None = error
+    while isinstance(before, MilvusException):
+        before = before.__cause__ if before.__cause__ is not before and before.__cause__ else before.__context__
+    return before if isinstance(before, grpc.RpcError) else None
 
 
 def _in_one_line(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from core.errors import StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
+from core.ledger.maps.record import RECENT_SECONDS
 from core.maps import Map, MapSettings, Selection
 from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions
@@ -28,6 +30,7 @@ from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descripto
 from tests.servers.milvus import Servers
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
+from tests.service.stores.door import Door
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
@@ -141,3 +144,37 @@ def test_a_milvus_that_is_gone(servers: Servers, store: MilvusStore) -> None:
     with pytest.raises(StoreUnavailable, match="Milvus"):
         without_milvus.check_writable()
     without_milvus.close()
+
+
+def test_a_milvus_that_goes_away_and_comes_back(servers: Servers, store: MilvusStore) -> None:
+    made(store).enrol([frame("a")])
+    door = Door(servers.milvus_address)
+    door.open()
+    other = open_store(door.address, servers.postgres_address)
+    query, scope = descriptor_of("a")[np.newaxis], other.get("lab").scope()
+    assert len(scope.search(query)[0][0]) == 1
+    door.shut()
+    for _ in range(2):
+        with pytest.raises(StoreUnavailable, match="Milvus cannot be reached"):
+            scope.search(query)
+    door.open()
+    until = time.monotonic() + 30
+    while True:
+        try:
+            assert len(scope.search(query)[0][0]) == 1
+            break
+        except StoreUnavailable:
+            assert time.monotonic() < until
+            time.sleep(0.1)
+    other.close()
+
+
+def test_a_write_is_seen_at_once_and_when_it_is_old(store: MilvusStore) -> None:
+    lab = made(store)
+    lab.enrol([frame("a")])
+    assert lab.latest().recent and len(lab.scope().search(descriptor_of("a")[np.newaxis])[0][0]) == 1
+    with lab.database.transaction("age the map") as whole:
+        whole.driver.execute("UPDATE maps SET touched = touched - %s", (RECENT_SECONDS,))
+    assert not lab.latest().recent and len(lab.scope().search(descriptor_of("a")[np.newaxis])[0][0]) == 1
+    lab.enrol([frame("b")])
+    assert lab.latest().recent and len(lab.scope().search(descriptor_of("a")[np.newaxis])[0][0]) == 2

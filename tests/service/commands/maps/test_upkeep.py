@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -118,11 +119,9 @@ def test_rebuilding_all_maps(placerec: Placerec, tmp_path: Path) -> None:
     for name in ("attic", "lab", "yard"):
         placerec("maps", "create", name, "--encoder", COARSE)
     rebuilt = json.loads(placerec("maps", "rebuild", "--all", "--json").stdout)
-    assert {name: (job["kind"], job["state"]) for name, job in rebuilt.items()} == {
-        name: ("rebuild", "succeeded") for name in ("attic", "lab", "yard")
-    }
-    jobs = list(rebuilt.values())
-    assert all(job["ended_at"] <= later["started_at"] for job, later in zip(jobs, jobs[1:], strict=False))
+    every = {name: (job["kind"], job["state"]) for name, job in rebuilt.items()}
+    assert every == dict.fromkeys(("attic", "lab", "yard"), ("rebuild", "succeeded"))
+    assert all(job["ended_at"] <= later["started_at"] for job, later in pairwise(rebuilt.values()))
 
     (tmp_path / "data/maps/lab/map.sqlite").write_bytes(b"damaged")
     failed = placerec("maps", "rebuild", "--all", status=1)
