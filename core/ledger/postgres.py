@@ -307,7 +307,7 @@ def prepare(connection: Connection[Any], tables: Sequence[Tables]) -> None:
                 connection.execute(statement)
         except (psycopg.errors.DuplicateTable, psycopg.errors.DuplicateObject) as error:
             raise StoreOfAnotherVersion(
-                f"PostgreSQL's database has something that another program has made where placerec keeps its {part.name}:"
+                f"PostgreSQL's database has something that another program has made where placerec has its {part.name}:"
                 f" {_in_one_line(error)}. It is left as it is: name an empty database."
             ) from error
         query = (
