@@ -189,7 +189,7 @@ def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:
 
 
 def _state(values: tuple[Any, ...]) -> MapState:
-    number, map_id, listed, text, seal, *counters, recent = values
+    number, map_id, listed, text, seal, *counters = values
     if not is_sound((text,), seal):
         raise DamagedRow("the map's own record cannot be read: it does not match its checksum")
     try:
@@ -198,7 +198,7 @@ def _state(values: tuple[Any, ...]) -> MapState:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
     if listed and map_id != record.id:
         raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
-    return MapState(number, record, *counters, bool(recent))
+    return MapState(number, record, *counters)
 
 
 @lru_cache(1000)
