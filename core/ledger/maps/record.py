@@ -198,7 +198,7 @@ def _state(values: tuple[Any, ...]) -> MapState:
         raise DamagedRow(f"the map's own record cannot be read: {validation_message(error)}") from error
     if listed and map_id != record.id:
         raise DamagedRow(f"the map's own record cannot be read: it is that of {record.id!r}, not of {map_id!r}")
-    return MapState(number, record, *counters, bool(recent))
+    return MapState(number, record, *(*counters, bool(recent)))
 
 
 @lru_cache(1000)
