@@ -289,12 +289,12 @@ class Collection:
         """The keys with the largest inner products, int64 [n], and these, float32 [n], for each of the queries.
 
         Every insertion is seen that ended before its map's state was read, whichever service made it.  Of a map that
-        was written to lately, the search waits until Milvus has taken up everything up to now (``Strong``), by
-        Milvus's own clock alone.  Of others it waits for what is older than five seconds by that clock (``Bounded``,
-        ``common.gracefulTime``), which is there but after a stall.  PostgreSQL's clock alone tells how old the last
-        write is, and notes its moment after the insertion, so clocks of services do not count, nor does a constant
-        difference between PostgreSQL's and Milvus's.  ``RECENT_SECONDS`` are three times the five, so that even a
-        step of a clock by ten seconds between write and search hides nothing.
+        was written to lately, a search waits until Milvus has taken up everything up to now (``Strong``), by Milvus's
+        own clock alone.  Of others it waits for what is older than five seconds by that clock (``Bounded``,
+        ``common.gracefulTime``), which is seldom anything.  The age of a write is measured by PostgreSQL's clock
+        alone, from a moment after the insertion: clocks of services do not count, nor does a constant difference
+        between PostgreSQL's and Milvus's.  ``RECENT_SECONDS`` are three times the five, so either clock may be set by
+        ten seconds between write and search.
 
         Args:
             descriptors: float32 [B, D].

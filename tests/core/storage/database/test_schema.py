@@ -62,7 +62,7 @@ def test_an_older_file_is_refused_and_not_touched(connection: sqlite3.Connection
     with pytest.raises(DataDirectoryTooOld) as error:
         prepare(connection, "maps/lab/map.sqlite")
     assert str(error.value) == (
-        f"maps/lab/map.sqlite was written before the first release of placerec (schema {older}, this one knows 10) and "
+        f"maps/lab/map.sqlite was written before the first release of placerec (schema {older}, this one knows 11) and "
         "is left as it is: enrol again in a new data directory, or go on with the version that wrote it."
     )
     assert (version(connection), list(connection.iterdump())) == (older, before)
