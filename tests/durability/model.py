@@ -209,7 +209,8 @@ class MapModel:
         """Put places to the stations of others, and give places the poses of others; pairs of ids."""
         before = {place_id: copy.copy(place) for place_id, place in self.places.items()}
         for place_id, other in stations:
-            self.places[place_id].track = before[other].station
+            place, station = self.places[place_id], before[other].station
+            place.track = None if station == (place.sequence, place.ordinal) else station
         for place_id, other in poses:
             place, pose = self.places[place_id], before[other].fields["pose"]
             if canonical(place.fields)["pose"] != canonical({"pose": pose})["pose"]:
