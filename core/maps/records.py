@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -97,6 +97,36 @@ class MapRecord(MapSettings):
     revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
     created_at: Timestamp
     updated_at: Timestamp
+
+    @classmethod
+    def new(
+        cls,
+        map_id: str,
+        encoder_identity: str,
+        dimension: int,
+        local_shape: tuple[int, int],
+        precision: Precision,
+        settings: MapSettings | None,
+    ) -> MapRecord:
+        """The record of a map that is made now.
+
+        Args:
+            dimension, local_shape: of the encoder's descriptors, D and (C, L).
+            settings: that its owner chose; None: the default ones.
+        """
+        now = datetime.now(UTC)
+        return cls(
+            id=map_id,
+            encoder=encoder_identity,
+            dimension=dimension,
+            local_cells=local_shape[0],
+            local_values=local_shape[1],
+            precision=precision,
+            revision=1,
+            created_at=now,
+            updated_at=now,
+            **(settings or MapSettings()).model_dump(),
+        )
 
     @property
     def local_shape(self) -> tuple[int, int]:

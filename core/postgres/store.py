@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from core.errors import MapExists, StorageFailure, UnknownMap
@@ -48,11 +47,9 @@ SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
 """Between two sweeps, and after one that the servers refused."""
 
 MapT = TypeVar("MapT", bound=PostgresMap)
+"""The map of an engine."""
 
 log = logging.getLogger(__name__)
-
-Made = TypeVar("Made", bound=PostgresMap)
-"""The map of an engine."""
 
 
 class PostgresStore(ABC, Generic[MapT]):
@@ -121,19 +118,7 @@ class PostgresStore(ABC, Generic[MapT]):
         """
         check_map_id(map_id)
         self._expect_open()
-        now = datetime.now(UTC)
-        made = MapRecord(
-            id=map_id,
-            encoder=encoder_identity,
-            dimension=dimension,
-            local_cells=local_shape[0],
-            local_values=local_shape[1],
-            precision=precision,
-            revision=1,
-            created_at=now,
-            updated_at=now,
-            **(settings or MapSettings()).model_dump(),
-        )
+        made = MapRecord.new(map_id, encoder_identity, dimension, local_shape, precision, settings)
         with self.database.transaction(f"create map {map_id!r}", Lock.MAPS) as connection:
             number = record.create(connection, made, listed=not unlisted)
         return self._map(map_id, number)

@@ -17,7 +17,6 @@ import shutil
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
@@ -144,19 +143,7 @@ class Atlas:
         check_map_id(map_id)
         # Raises ValueError for values that no segment file can hold.
         Layout(dimension, encoder_identity, self._rows_per_segment, local_shape, precision)
-        now = datetime.now(UTC)
-        record = MapRecord(
-            id=map_id,
-            encoder=encoder_identity,
-            dimension=dimension,
-            local_cells=local_shape[0],
-            local_values=local_shape[1],
-            precision=precision,
-            revision=1,
-            created_at=now,
-            updated_at=now,
-            **(settings or MapSettings()).model_dump(),
-        )
+        record = MapRecord.new(map_id, encoder_identity, dimension, local_shape, precision, settings)
         with self._making, disk_errors(f"create map {map_id!r}"):
             self._expect_open()
             self._expect_free(map_id)

@@ -29,7 +29,7 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
 from core.maps.records import MapRecord, validation_message
 from core.maps.status import Tier
-from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
+from core.places import Whereabouts
 from core.storage.database.connections import FILE, Database, connect
 from core.storage.database.schema import (
     check_schema,
@@ -224,14 +224,7 @@ def read_snapshot(
     if (state.rows, state.places) != (total, len(columns.rows)):
         counted = f"{state.places} places in {state.rows} rows"
         raise Damage(f"{FILE}: its record counts {counted}, but there are {len(columns.rows)} in {total}")
-    whereabouts = Whereabouts(
-        np.full(total, NO_POSE, np.int8),
-        np.zeros((total, 3)),
-        np.full(total, NO_SEQUENCE, np.int32),
-        np.zeros(total, np.int64),
-    )
-    for name, column in vars(columns.whereabouts).items():
-        getattr(whereabouts, name)[columns.rows] = column
+    whereabouts = columns.by_row(total)
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
     # The index that a map had before is not known, but the number of its places allows it to be as it was.

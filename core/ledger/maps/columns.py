@@ -13,7 +13,7 @@ from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import PLACES
 from core.ledger.statements import Statement
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts
 
 _P = PLACES.c
 _AT_ONCE = 65_536
@@ -39,6 +39,22 @@ class Columns:
     rows: NDArray[np.int64]
     checksums: NDArray[np.uint32]
     whereabouts: Whereabouts
+
+    def by_row(self, total: int) -> Whereabouts:
+        """Where the frames of all rows of a map are; those of rows without a place are nowhere.
+
+        Args:
+            total: how many rows the map has.
+        """
+        found = Whereabouts(
+            np.full(total, NO_POSE, np.int8),
+            np.zeros((total, 3)),
+            np.full(total, NO_SEQUENCE, np.int32),
+            np.zeros(total, np.int64),
+        )
+        for name, column in vars(self.whereabouts).items():
+            getattr(found, name)[self.rows] = column
+        return found
 
 
 def read_columns(connection: MapConnection, rows: int, after: int | None = None) -> Columns:

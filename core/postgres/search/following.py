@@ -97,7 +97,7 @@ class FollowedMap:
                 if self._follows(MapConnection(PostgresConnection(fresh), self._map), held):
                     return held  # another thread has seen more
             held = None
-        if held is None or not self._follows(connection, held) or self._tier(state, held) != _tier_of(held.snapshot):
+        if held is None or not self._follows(connection, held) or self._tier(state, held) != tier_of(held.snapshot):
             source = PostgresRows(self._database, self._map, state.record, self._cache)
             snapshot = self._read(connection, state, source)
         else:
@@ -117,7 +117,7 @@ class FollowedMap:
         return known == held.stamp
 
     def _tier(self, state: MapState, held: Followed | None) -> Tier:
-        present: Tier = "exact" if held is None else _tier_of(held.snapshot)
+        present: Tier = "exact" if held is None else tier_of(held.snapshot)
         return tier_for(state.record.index, state.places, present)
 
     # Reading all
@@ -126,14 +126,7 @@ class FollowedMap:
         columns, total = read_columns(connection, state.rows), state.rows
         if len(columns.rows) != state.places:
             raise StorageFailure(f"The map has {len(columns.rows)} places, but its record counts {state.places}.")
-        whereabouts = Whereabouts(
-            np.full(total, NO_POSE, np.int8),
-            np.zeros((total, 3)),
-            np.full(total, NO_SEQUENCE, np.int32),
-            np.zeros(total, np.int64),
-        )
-        for name, column in vars(columns.whereabouts).items():
-            getattr(whereabouts, name)[columns.rows] = column
+        whereabouts = columns.by_row(total)
         alive = np.zeros(total, np.bool_)
         alive[columns.rows] = True
         record, exact = state.record, self._tier(state, None) == "exact"
@@ -255,7 +248,8 @@ class FollowedMap:
             self._joining.release()
 
 
-def _tier_of(snapshot: Snapshot) -> Tier:
+def tier_of(snapshot: Snapshot) -> Tier:
+    """How a snapshot is searched."""
     return "exact" if snapshot.table is None else "compact"
 
 

@@ -19,7 +19,7 @@ from core.postgres import rows
 from core.postgres.forms import Form
 from core.postgres.map import PostgresMap
 from core.postgres.search.cache import RowCache
-from core.postgres.search.following import DESCRIPTORS_AT_ONCE, FollowedMap
+from core.postgres.search.following import DESCRIPTORS_AT_ONCE, FollowedMap, tier_of
 from core.postgres.writing import PostgresWrite
 from core.storage.search.scopes import Chooser
 from core.storage.search.snapshot import SearchScope, Snapshot
@@ -96,8 +96,8 @@ class CodedMap(PostgresMap):
         snapshot = self.snapshot() if held is None or self._state.places < COMPACT_FROM else held.snapshot
         return IndexStatus(
             setting=self.record.index,
-            tier="exact" if snapshot.table is None else "compact",
-            wanted=tier_for(self.record.index, len(snapshot), "exact" if snapshot.table is None else "compact"),
+            tier=tier_of(snapshot),
+            wanted=tier_for(self.record.index, len(snapshot), tier_of(snapshot)),
             state="ready",
             progress=1,
             rows_indexed=snapshot.coded,
