@@ -37,6 +37,9 @@ LOOK_BACK = 1000
 
 RETENTION_SECONDS = 30
 
+NOT_YET = -1
+"""The number of the last event that was received, before anybody has listened here."""
+
 log = logging.getLogger("placerec.shared")
 
 
@@ -76,7 +79,7 @@ _SEND = Statement(
     .values(replica=bindparam("replica"), map=bindparam("map"), event=bindparam("event"), at=seconds_now())
     .inline()
 )
-_LAST = Statement(select(func.coalesce(func.max(_EVENTS.c.number), 0)))
+_LATEST = Statement(select(_EVENTS.c.number).order_by(_EVENTS.c.number.desc()).limit(LOOK_BACK))
 _RECEIVE = Statement(
     select(_EVENTS.c.number, _EVENTS.c.map, _EVENTS.c.event)
     .where(_EVENTS.c.number > bindparam("after"), _EVENTS.c.replica != bindparam("replica"))
@@ -114,7 +117,7 @@ class EventRelay:
         self._said: dict[str, bool] = {}  # the maps that are listened to here, as the others know it
         self._outbox: deque[tuple[str, FeedEvent | None]] = deque(maxlen=MOST_WAITING)
         self._something, self._ending = threading.Event(), False
-        self._reached, self._received = -1, deque[int](maxlen=4 * LOOK_BACK)
+        self._reached, self._received = NOT_YET, deque[int](maxlen=4 * LOOK_BACK)
         self._sender = threading.Thread(target=self._send_on, name="events", daemon=True)
 
     def serve(self, feeds: Feeds) -> None:
@@ -173,6 +176,10 @@ class EventRelay:
             return
         rows = [{"replica": replica, "map": map_id, "pictures": int(pictures)} for map_id, pictures in now.items()]
         with self._ledger.transaction("say who listens") as connection:
+            if self._reached == NOT_YET:  # before others know of it, and thus before they send anything
+                latest = [number for (number,) in connection.execute(_LATEST)]
+                self._received.extend(latest)
+                self._reached = max(latest, default=0)
             connection.execute(_SILENCE, replica=replica)
             connection.execute_many(_LISTEN, rows)
         self._peers.say(LISTENING)
@@ -193,8 +200,7 @@ class EventRelay:
 
     def _receive(self, _said: str | None) -> None:
         assert self._feeds is not None
-        if self._reached < 0:  # whoever listens here does so from now on
-            ((self._reached,),) = self._ledger.execute("read events", _LAST)
+        if self._reached == NOT_YET:
             return
         found = self._ledger.execute(
             "read events", _RECEIVE, after=self._reached - LOOK_BACK, replica=self._peers.id,

@@ -126,6 +126,26 @@ async def test_a_picture_is_made_where_the_frame_is_for_listeners_elsewhere(
             assert event.picture is not None and event.verdict == "unknown" and event.maps == {"lab"}
 
 
+async def test_events_are_received_although_the_service_hears_of_them_late(
+    database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.peers.replica import ServiceReplica
+
+    connected, listen = threading.Event(), ServiceReplica._listen
+
+    def listen_late(replica: ServiceReplica) -> None:
+        connected.wait(20)
+        listen(replica)
+
+    monkeypatch.setattr(ServiceReplica, "_listen", listen_late)
+    with two_relays(database, tmp_path) as (one, other), other.listening("lab") as listener:
+        await until(lambda: one.heard("lab"))  # as it looks at each beat
+        one.publish(edited(1))
+        await until(lambda: database.execute("count", SENT) == [(1,)])
+        connected.set()
+        assert revisions(await some(listener, 1)) == [1]
+
+
 async def test_services_stop_sending_a_while_after_the_last_listener_has_left(
     database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
