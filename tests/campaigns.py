@@ -8,10 +8,20 @@ from collections.abc import Collection, Sequence
 
 
 def read_arguments(
-    arguments: Sequence[str], name: str, description: str | None, parts: Collection[str], kills: int
+    arguments: Sequence[str],
+    name: str,
+    description: str | None,
+    parts: Collection[str],
+    kills: int,
+    others: argparse.ArgumentParser | None = None,
 ) -> argparse.Namespace:
-    """The ``kills``, ``seed``, ``minutes`` and ``parts`` of a campaign; its seed, which may be drawn, is printed."""
-    parser = argparse.ArgumentParser(prog=f"scripts/soak {name}", description=description)
+    """The ``kills``, ``seed``, ``minutes`` and ``parts`` of a campaign; its seed, which may be drawn, is printed.
+
+    Args:
+        others: reads its other options.
+    """
+    parents = [] if others is None else [others]
+    parser = argparse.ArgumentParser(prog=f"scripts/soak {name}", description=description, parents=parents)
     parser.add_argument("--kills", type=int, default=kills)
     parser.add_argument("--seed", default=None)
     parser.add_argument("--minutes", type=float, default=None, help="begin no further kill after so long")

@@ -63,20 +63,6 @@ class Postgres:
             connection.execute("DROP SCHEMA public CASCADE")
             connection.execute("CREATE SCHEMA public")
 
-    @contextmanager
-    def silenced(self) -> Iterator[None]:
-        """Let all its processes stand still, so that it answers nobody, as long as the block runs."""
-        with psycopg.connect(self.address) as connection:
-            query = "SELECT pid FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
-            processes = [self.server.process_id, *(pid for (pid,) in connection.execute(query))]
-        try:
-            for process in processes:
-                os.kill(process, signal.SIGSTOP)
-            yield
-        finally:
-            for process in processes:
-                os.kill(process, signal.SIGCONT)
-
 
 @contextmanager
 def running_postgres() -> Iterator[Postgres]:

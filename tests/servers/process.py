@@ -8,8 +8,8 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psycopg
@@ -89,13 +89,34 @@ class Server:
                     raise TimeoutError(text) from error
                 time.sleep(0.2)
 
+    @contextmanager
+    def silenced(self) -> Iterator[Sequence[int]]:
+        """Let all its processes, whose ids are given, stand still as long as the block runs."""
+        processes = [self.process_id]
+        try:
+            for process in processes:  # it grows meanwhile; whoever stands still starts no other
+                _stop(process)
+                processes += _children(process)
+            yield processes
+        finally:
+            for process in processes:
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGCONT)
+
     def stall(self, seconds: float) -> None:
         """Let it stand still for some seconds."""
-        os.killpg(self.process_id, signal.SIGSTOP)
-        try:
+        with self.silenced():
             time.sleep(seconds)
-        finally:
-            os.killpg(self.process_id, signal.SIGCONT)
+
+    def kill(self) -> None:
+        """End all its processes by SIGKILL at once, those too that have a group of their own, as PostgreSQL's."""
+        with self.silenced() as processes:
+            for process in reversed(processes):
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
+            while any(_state(process)[0] not in "XZ" for process in processes):
+                time.sleep(0.001)
+        self.end(signal.SIGKILL)
 
     def has_ended(self, within: float) -> bool:
         """Whether it ends by itself within some seconds."""
@@ -116,3 +137,25 @@ class Server:
         with suppress(ProcessLookupError):  # what Milvus's own starter leaves behind
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+
+
+def _stop(process: int) -> None:
+    """Let a process stand still, and wait until it does, or is gone."""
+    with suppress(ProcessLookupError):
+        os.kill(process, signal.SIGSTOP)
+    while _state(process)[0] not in "TXZ":
+        time.sleep(0.001)
+
+
+def _children(process: int) -> list[int]:
+    """The processes that one has started and that have not ended."""
+    found = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+    return [one for one in found if (state := _state(one))[0] != "Z" and int(state[1]) == process]
+
+
+def _state(process: int) -> tuple[str, str]:
+    """The letter of a process's state, X if it is gone, and the id of the one that started it."""
+    with suppress(OSError):
+        state, parent = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[:2]
+        return state, parent
+    return "X", "0"

@@ -26,7 +26,7 @@ Table("fruit", _METADATA, Column("name", text(), primary_key=True))
 def test_a_server_that_stands_still_is_given_up_soon(postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> None:
     ledger = PostgresLedger(postgres.address, [])
     assert ledger.execute("look", _ONE) == [(1,)]
-    with postgres.silenced():
+    with postgres.server.silenced():
         began = time.monotonic()
         with pytest.raises(StoreUnavailable, match="PostgreSQL"):
             ledger.execute("look", _ONE)

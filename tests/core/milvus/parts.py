@@ -1,13 +1,9 @@
-"""The parts of a cluster that a campaign kills.  Another part is a class here and a line in ``PARTS``."""
+"""The parts that a campaign kills of a cluster with a Milvus and an object store."""
 
 from __future__ import annotations
 
-import signal
-import time
-from collections.abc import Callable, Mapping
 from contextlib import closing
 from hashlib import sha256
-from typing import Protocol
 
 import numpy as np
 from pymilvus import MilvusClient
@@ -16,61 +12,13 @@ from core.errors import StorageFailure
 from core.ledger.maps.frames import StoredObject
 from core.milvus.collection import collection_name, milvus_errors
 from core.postgres.pictures.objects import Objects
-from tests.core.milvus.clients import ProcessClient
+from tests.core.cluster.clients import Addresses
+from tests.core.cluster.parts import KillableCluster, KilledClient, KilledPostgres, KilledServer, SilentPostgres
 from tests.core.storage.frames import DIMENSION, ENCODER
-from tests.servers.milvus import Servers
-from tests.servers.process import Server
-
-AWAY_SECONDS = 1.0
-"""Between the kill of a server and its next start."""
+from tests.servers.milvus import Servers, running_servers
 
 
-class Part(Protocol):
-    """What is killed and started again."""
-
-    is_server: bool
-    """Whether the bar on recovery is about it."""
-
-    lives: float
-    """Seconds for which it serves before it is killed again."""
-
-    def kill(self) -> None:
-        """End it by SIGKILL."""
-
-    def start(self) -> None:
-        """Start it, and wait until it answers at all."""
-
-    def ask(self) -> None:
-        """Ask it for what its clients need of it, past everything that the store does to spare it.
-
-        Raises:
-            StorageFailure: it does not do it yet.
-        """
-
-
-class _OfServer:
-    is_server, lives = True, 0.0
-
-    def __init__(self, server: Server) -> None:
-        self._server = server
-
-    def kill(self) -> None:
-        self._server.end(signal.SIGKILL)
-        time.sleep(AWAY_SECONDS)
-
-    def start(self) -> None:
-        self._server.start()
-
-
-class Postgres(_OfServer):
-    def __init__(self, servers: Servers, _: ProcessClient) -> None:
-        super().__init__(servers.postgres)
-
-    def ask(self) -> None:
-        """It answered at its start; it does all or nothing."""
-
-
-class Milvus(_OfServer):
+class KilledMilvus(KilledServer):
     """Asked for a search that sees all that was written, which is the last thing that it can do again.
 
     When it has read its log, Milvus notes once a minute from where it would have to read it again; 2.3 has no setting
@@ -79,7 +27,7 @@ class Milvus(_OfServer):
 
     lives = 75.0
 
-    def __init__(self, servers: Servers, _: ProcessClient) -> None:
+    def __init__(self, servers: Servers) -> None:
         super().__init__(servers.milvus)
         self._address = servers.milvus_address
 
@@ -89,10 +37,10 @@ class Milvus(_OfServer):
             client.search(name, query, limit=1, timeout=2, anns_field="descriptor", consistency_level="Strong")
 
 
-class ObjectStore(_OfServer):
+class KilledObjectStore(KilledServer):
     """Asked to write an object and to read it."""
 
-    def __init__(self, servers: Servers, _: ProcessClient) -> None:
+    def __init__(self, servers: Servers) -> None:
         super().__init__(servers.objects)
         self._bucket = servers.bucket
 
@@ -108,27 +56,14 @@ class ObjectStore(_OfServer):
             objects.close()
 
 
-class Client:
-    """A client in a process of its own; it takes as long as Python does to start."""
-
-    is_server, lives = False, 0.0
-
-    def __init__(self, _: Servers, client: ProcessClient) -> None:
-        self._client = client
-
-    def kill(self) -> None:
-        self._client.kill()
-
-    def start(self) -> None:
-        self._client.start()
-
-    def ask(self) -> None:
-        """Its answers are what is waited for anyway."""
-
-
-PARTS: Mapping[str, Callable[[Servers, ProcessClient], Part]] = {
-    "milvus": Milvus,
-    "postgres": Postgres,
-    "objects": ObjectStore,
-    "client": Client,
-}
+MILVUS = KillableCluster(
+    running_servers,
+    lambda servers: Addresses(servers.postgres_address, servers.milvus_address, servers.bucket),
+    {
+        "milvus": lambda servers, _: KilledMilvus(servers),
+        "postgres": lambda servers, _: KilledPostgres(servers.postgres),
+        "silence": lambda servers, _: SilentPostgres(servers.postgres),
+        "objects": lambda servers, _: KilledObjectStore(servers),
+        "client": lambda _, client: KilledClient(client),
+    },
+)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.milvus.kills import Campaign
-from tests.core.milvus.parts import PARTS
+from tests.core.cluster.kills import ClusterKills
+from tests.core.milvus.parts import MILVUS
 from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]
@@ -13,9 +13,9 @@ pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]
 ROUNDS = 3
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", MILVUS.parts)
 def test_kills(servers: Servers, part: str) -> None:
-    campaign = Campaign(servers, part)
+    campaign = ClusterKills(MILVUS, servers, part)
     try:
         for _ in range(ROUNDS):
             campaign.kill(part)

@@ -56,7 +56,7 @@ def test_a_database_that_falls_silent_hangs_nobody(services: tuple[Server, Serve
     server.create_map("lab")
     assert server.enrol("lab", "p1", jpeg(1)).status_code == 201
     assert best(server, 1) == "p1"
-    with postgres.silenced():
+    with postgres.server.silenced():
         # Each has its own deadline, by the client's timeout; how long it took is not compared with anything else.
         asked = server.client.post("/v1/maps/lab/query", content=jpeg(1), timeout=SOON)
         problem = assert_problem(asked, 503, "store-unavailable")

@@ -1,6 +1,6 @@
-"""Clients of the store that do what a load asks: in this process, and in one of their own that may be killed.
+"""Clients of a store that do what a load asks: in this process, and in one of their own that may be killed.
 
-python -m tests.core.milvus.clients MILVUS POSTGRES BUCKET   # a line of JSON for each request, and one for each answer
+python -m tests.core.cluster.clients ADDRESSES   # a line of JSON for each request, and one for each answer
 """
 
 from __future__ import annotations
@@ -10,54 +10,89 @@ import logging
 import subprocess
 import sys
 import threading
-from dataclasses import asdict
+import traceback
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from core.errors import StorageFailure, UnknownPlace
-from core.milvus import Bucket, open_store
-from core.milvus.store import MilvusStore
+from core.milvus import open_store
+from core.postgres import Bucket, open_database
+from core.postgres.map import PostgresMap
+from core.postgres.store import PostgresStore
 from tests.core.storage.frames import descriptor_of, frame
 
 ROOT = Path(__file__).parents[3]
 
 
-class Client:
+@dataclass(frozen=True)
+class Addresses:
+    """Where a cluster's servers are; without a Milvus its maps are in PostgreSQL alone."""
+
+    postgres: str
+    milvus: str | None = None
+    bucket: Bucket | None = None
+
+    def open(self) -> PostgresStore[Any]:
+        """The store of all its maps."""
+        if self.milvus is None:
+            return open_database(self.postgres, self.bucket)
+        return open_store(self.milvus, self.postgres, bucket=self.bucket)
+
+    def written(self) -> str:
+        """As one word of a command line."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def read(cls, written: str) -> Addresses:
+        """The addresses that were written as one word."""
+        values = json.loads(written)
+        bucket = values.pop("bucket")
+        return cls(**values, bucket=None if bucket is None else Bucket(**bucket))
+
+
+class StoreClient:
     """Writes to and asks the map ``lab``."""
 
-    def __init__(self, store: MilvusStore) -> None:
+    def __init__(self, store: PostgresStore[Any]) -> None:
         self._store = store
+
+    @property
+    def _lab(self) -> PostgresMap:
+        lab: PostgresMap = self._store.get("lab")
+        return lab
 
     def enrol(self, names: list[str], picture: str) -> None:
         """Places of these names, all with one picture, in one batch."""
-        self._store.get("lab").enrol([frame(name, picture) for name in names])
+        self._lab.enrol([frame(name, picture) for name in names])
 
     def forget(self, name: str) -> None:
         """Delete a place."""
-        self._store.get("lab").forget(name)
+        self._lab.forget(name)
 
     def first(self, picture: str) -> list[str]:
         """The places that a query with a picture finds first and second."""
-        lab = self._store.get("lab")
+        lab = self._lab
         ((rows, _),) = lab.scope().search(descriptor_of(picture)[np.newaxis])
         return [place.id for place in lab.places_at(rows[:2].tolist()) if place is not None]
 
-    def picture(self, name: str) -> str:
-        """What is kept of a place's frame."""
-        return (self._store.get("lab").picture(name) or b"").decode()
+    def digests(self) -> dict[str, str]:
+        """The digest of each place's picture, all at one moment."""
+        return {place.id: place.digest.hex() for place in self._lab.transfer.outline()}
 
-    def close(self) -> None:
-        """Leave the store to whoever opened it."""
+    def picture(self, name: str) -> str:
+        """The picture that is kept of a place, as text."""
+        return (self._lab.picture(name) or b"").decode()
 
 
 class ProcessClient:
     """The same in a process of its own, which is started when it is asked and not there.  One call at a time."""
 
-    def __init__(self, milvus: str, postgres: str, bucket: Bucket) -> None:
-        where = [milvus, postgres, json.dumps(asdict(bucket))]
-        self._command = [sys.executable, "-W", "ignore", "-m", "tests.core.milvus.clients", *where]
+    def __init__(self, addresses: Addresses) -> None:
+        program = ["-m", "tests.core.cluster.clients", addresses.written()]
+        self._command = [sys.executable, "-W", "ignore", *program]
         self._process: subprocess.Popen[str] | None = None
         self._starting = threading.Lock()
 
@@ -69,6 +104,10 @@ class ProcessClient:
 
     def first(self, picture: str) -> list[str]:
         found: list[str] = self._call("first", picture)
+        return found
+
+    def digests(self) -> dict[str, str]:
+        found: dict[str, str] = self._call("digests")
         return found
 
     def picture(self, name: str) -> str:
@@ -112,22 +151,25 @@ class ProcessClient:
             raise UnknownPlace(answer)
         if kind == "refused":
             raise StorageFailure(answer)
+        assert kind == "done", answer
         return answer
 
 
-def main(milvus: str, postgres: str, bucket: str) -> None:
+def main(addresses: str) -> None:
     """Serve until there are no more requests."""
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
-    client: Client | None = None
+    client: StoreClient | None = None
     for line in sys.stdin:
         method, *arguments = json.loads(line)
         try:
-            client = client or Client(open_store(milvus, postgres, bucket=Bucket(**json.loads(bucket))))
+            client = client or StoreClient(Addresses.read(addresses).open())
             answer = ["done", getattr(client, method)(*arguments)]
         except UnknownPlace as error:
             answer = ["unknown", str(error)]
         except StorageFailure as error:
             answer = ["refused", str(error)]
+        except Exception:  # a defect, which must not look like a kill
+            answer = ["failed", traceback.format_exc()]
         print(json.dumps(answer), flush=True)
 
 

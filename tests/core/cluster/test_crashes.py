@@ -1,0 +1,22 @@
+"""Parts of a cluster without Milvus that are killed, or stand still, under a load: nothing acknowledged is lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.core.cluster.kills import ClusterKills
+from tests.core.cluster.parts import POSTGRES
+from tests.servers.postgres import Postgres
+
+pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(600)]
+
+
+@pytest.mark.parametrize(("part", "times"), [("postgres", 3), ("silence", 1), ("client", 3)])
+def test_kills(postgres: Postgres, part: str, times: int) -> None:
+    campaign = ClusterKills(POSTGRES, postgres, part)
+    try:
+        for _ in range(times):
+            campaign.kill(part)
+    finally:
+        campaign.close()
+    print(campaign.tally)
