@@ -114,7 +114,7 @@ class Server:
             for process in reversed(processes):
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
-            while any(_state(process)[0] not in "XZ" for process in processes):
+            while any(state_of(process)[0] not in "XZ" for process in processes):
                 time.sleep(0.001)
         self.end(signal.SIGKILL)
 
@@ -143,17 +143,17 @@ def _stop(process: int) -> None:
     """Let a process stand still, and wait until it does, or is gone."""
     with suppress(ProcessLookupError):
         os.kill(process, signal.SIGSTOP)
-    while _state(process)[0] not in "TXZ":
+    while state_of(process)[0] not in "TXZ":
         time.sleep(0.001)
 
 
 def _children(process: int) -> list[int]:
     """The processes that one has started and that have not ended."""
     found = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
-    return [one for one in found if (state := _state(one))[0] != "Z" and int(state[1]) == process]
+    return [one for one in found if (state := state_of(one))[0] != "Z" and int(state[1]) == process]
 
 
-def _state(process: int) -> tuple[str, str]:
+def state_of(process: int) -> tuple[str, str]:
     """The letter of a process's state, X if it is gone, and the id of the one that started it."""
     with suppress(OSError):
         state, parent = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[:2]

@@ -5,17 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from tests.servers.process import Server
+from tests.servers.process import Server, state_of
 
 WITH_ANOTHER_GROUP = ["sh", "-c", "setsid sleep 999 & wait"]
-
-
-def state(process: int) -> str:
-    """The letter of its state; X if it is gone."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return "X"
 
 
 def test_no_process_of_a_server_is_forgotten(tmp_path: Path) -> None:
@@ -24,9 +16,9 @@ def test_no_process_of_a_server_is_forgotten(tmp_path: Path) -> None:
     groups: set[int] = set()
     while len(groups) < 2:  # the other one may not have been started yet, or not have left the first one's group
         with server.silenced() as processes:
-            assert {state(process) for process in processes} == {"T"}
+            assert {state_of(process)[0] for process in processes} == {"T"}
             groups = {os.getpgid(process) for process in processes}
-    while "T" in {state(process) for process in processes}:  # it goes on
+    while "T" in {state_of(process)[0] for process in processes}:  # it goes on
         os.sched_yield()
     server.kill()
-    assert {state(process) for process in processes} <= {"X", "Z"}
+    assert {state_of(process)[0] for process in processes} <= {"X", "Z"}

@@ -184,7 +184,7 @@ def cluster_of(vectors: str) -> KillableCluster[Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
-    engine = argparse.ArgumentParser(add_help=False)
+    engine = argparse.ArgumentParser(prog="scripts/soak cluster", add_help=False)
     told = "what searches the maps; milvus: with an object store besides (default: %(default)s)"
     engine.add_argument("--vectors", choices=("postgres", "milvus"), default="postgres", help=told)
     cluster = cluster_of(engine.parse_known_args(arguments)[0].vectors)
@@ -192,18 +192,14 @@ def main(arguments: Sequence[str]) -> int:
     seed = chosen.seed
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
     draw, began = random.Random(seed), time.monotonic()
-    with cluster.running() as servers:
-        campaign = ClusterKills(cluster, servers, seed)
-        try:
-            for number in range(1, chosen.kills + 1):
-                part = draw.choice(chosen.parts)
-                print(number, part, campaign.kill(part), flush=True)
-                if number % 5 == 0:
-                    print(campaign.tally, flush=True)
-                if chosen.minutes is not None and time.monotonic() - began > 60 * chosen.minutes:
-                    break
-        finally:
-            campaign.close()
+    with cluster.running() as servers, closing(ClusterKills(cluster, servers, seed)) as campaign:
+        for number in range(1, chosen.kills + 1):
+            part = draw.choice(chosen.parts)
+            print(number, part, campaign.kill(part), flush=True)
+            if number % 5 == 0:
+                print(campaign.tally, flush=True)
+            if chosen.minutes is not None and time.monotonic() - began > 60 * chosen.minutes:
+                break
     of_servers = [these for part, these in campaign.tally.recoveries.items() if campaign.parts[part].is_server]
     slowest = max((one.served for these in of_servers for one in these), default=0.0)
     kept = "kept" if slowest <= MOST_SECONDS else "MISSED"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import pytest
 
 from tests.core.cluster.kills import ClusterKills
@@ -13,10 +15,6 @@ pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(60
 
 @pytest.mark.parametrize(("part", "times"), [("postgres", 3), ("silence", 1), ("client", 3)])
 def test_kills(postgres: Postgres, part: str, times: int) -> None:
-    campaign = ClusterKills(POSTGRES, postgres, part)
-    try:
+    with closing(ClusterKills(POSTGRES, postgres, part)) as campaign:
         for _ in range(times):
-            campaign.kill(part)
-    finally:
-        campaign.close()
-    print(campaign.tally)
+            print(campaign.kill(part))

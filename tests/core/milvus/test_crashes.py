@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import pytest
 
 from tests.core.cluster.kills import ClusterKills
@@ -15,10 +17,6 @@ ROUNDS = 3
 
 @pytest.mark.parametrize("part", MILVUS.parts)
 def test_kills(servers: Servers, part: str) -> None:
-    campaign = ClusterKills(MILVUS, servers, part)
-    try:
+    with closing(ClusterKills(MILVUS, servers, part)) as campaign:
         for _ in range(ROUNDS):
-            campaign.kill(part)
-    finally:
-        campaign.close()
-    print(campaign.tally)
+            print(campaign.kill(part))
