@@ -24,7 +24,8 @@ from core.frames.preprocessing import Pixels, second_look
 from core.frames.traverses import SUPPORTED_SUFFIXES
 from core.geometry.detection import find_keypoints, shown_size
 from core.geometry.keypoints import MOST, record_bytes
-from core.geometry.verification import fitting_plane, fitting_scene, mutual_matches, verify
+from core.geometry.matching import mutual_matches
+from core.geometry.verification import fitting_plane, fitting_scene, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
 from core.threads import cores, each, share_cores

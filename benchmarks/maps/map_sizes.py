@@ -36,6 +36,7 @@ from core.judgement.reliability import reliability
 from core.judgement.verdict import Calibration
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.recognition.question import Verify
 from core.threads import share_cores
 from lab.evaluation.map_sizes import balanced_error
 from lab.training.map_sizes import (
@@ -43,7 +44,6 @@ from lab.training.map_sizes import (
     Cut,
     Judged,
     ScoredTraverse,
-    Verify,
     corridor_and_lip6,
     fitting_traverses,
     keypoints_of_frames,
@@ -99,7 +99,7 @@ def with_pairs(made: dict[str, ScoredTraverse], datasets: Path, cache: Path | No
                     [keypoints_of(record.tobytes()) for record in np.split(read[side], read[f"{side}_ends"])]
                     for side in ("queries", "references")
                 )
-                pairs = Pairs(queries, references, read["evidence"], read["share"])
+                pairs = Pairs(queries, references)
         else:
             pairs = Pairs(keypoints_of_frames(task.queries), keypoints_of_frames(task.references))
         found[name] = replace(made[name], pairs=pairs)
@@ -107,7 +107,7 @@ def with_pairs(made: dict[str, ScoredTraverse], datasets: Path, cache: Path | No
 
 
 def keep_pairs(made: dict[str, ScoredTraverse], cache: Path) -> None:
-    """Write keypoints, and what was found of their pairs."""
+    """Write keypoints."""
     for name, pairs in ((name, traverse.pairs) for name, traverse in made.items()):
         if pairs is not None:
             sides = {"queries": pairs.queries, "references": pairs.references}
@@ -117,8 +117,6 @@ def keep_pairs(made: dict[str, ScoredTraverse], cache: Path) -> None:
                 allow_pickle=False,
                 **{side: np.concatenate(some) for side, some in records.items()},
                 **{f"{side}_ends": np.cumsum([len(one) for one in some])[:-1] for side, some in records.items()},
-                evidence=pairs.evidence,
-                share=pairs.share,
             )
 
 

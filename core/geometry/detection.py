@@ -19,7 +19,7 @@ from core.frames.preprocessing import Pixels
 from core.geometry.keypoints import MOST, RESOLUTION, SHARES, Keypoints
 from core.networks.xfeat import CELL, MULTIPLE, XFeat
 
-LONGEST_SIDE = 480
+LONGEST_SIDE = 320
 """Pixels of the longer side of the network's input; a smaller frame is enlarged, so that it gives keypoints, too."""
 LEAST_HEAT = 0.05
 """The heat from which on a pixel is a keypoint: the authors' choice."""

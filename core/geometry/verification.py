@@ -1,8 +1,7 @@
 """Geometric verification: which matches of two pictures' keypoints fit one rigid scene, and whether by chance.
 
-Two keypoints match if each is the other's nearest neighbour by the cosine of their descriptors.  If both pictures show
-one rigid scene, the matches x, x' fit a fundamental matrix, x'^T F x = 0; a robust estimator finds the one that most of
-them fit, its inliers.
+If both pictures show one rigid scene, the matches x, x' of their keypoints (``matching.py``) fit a fundamental matrix,
+x'^T F x = 0; a robust estimator finds the one that most of them fit, its inliers.
 
 A camera that stands or only turns, and a scene that is a plane, leave F open: x' ~ H x with one homography H, and each
 F = [e]x H fits, for any epipole e (Hartley and Zisserman, Multiple View Geometry, section 11.9).  The estimator,
@@ -42,12 +41,11 @@ import torch
 from numpy.typing import NDArray
 
 from core.geometry.detection import LONGEST_SIDE
-from core.geometry.keypoints import RESOLUTION, Keypoints
+from core.geometry.keypoints import Keypoints
+from core.geometry.matching import mutual_matches
 from core.threads import each
 
-LEAST_COSINE = 0.75
-"""Of two descriptors that can match."""
-THRESHOLD = 1.5
+THRESHOLD = 1.0
 """Pixels by which an inlier may miss its epipolar line, where the longer side of the picture is LONGEST_SIDE."""
 CONFIDENCE, ITERATIONS = 0.999, 300
 PLANE_THRESHOLD = 2 * THRESHOLD
@@ -96,26 +94,6 @@ def verify(query: Keypoints, candidates: Sequence[Keypoints]) -> list[Verificati
     queried = query.descriptors.astype(np.float32)
     shown = points_of(query)
     return each(lambda candidate: _verify(query, queried, shown, candidate), candidates, torch.get_num_threads())
-
-
-def mutual_matches(query: NDArray[np.float32], candidate: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The mutual nearest neighbours of quantized descriptors whose cosine is over LEAST_COSINE.
-
-    Products of whole numbers are exact in float32 here: 64 · 127² < 2^24.  So every processor finds the same matches.
-
-    Args:
-        query, candidate: float32 [n, 64] and [m, 64], whole numbers from -127 to 127.
-
-    Returns:
-        int64 [k, 2], numbers of the query's and of the candidate's, ascending in the query's; ties to the lower one.
-    """
-    if not len(query) or not len(candidate):
-        return np.zeros((0, 2), np.int64)
-    products = query @ candidate.T
-    there, back = products.argmax(axis=1), products.argmax(axis=0)
-    numbers = np.arange(len(query))
-    chosen = (back[there] == numbers) & (products[numbers, there] > LEAST_COSINE * RESOLUTION**2)
-    return np.stack([numbers[chosen], there[chosen]], axis=1)
 
 
 def fitting(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArray[np.bool_]:

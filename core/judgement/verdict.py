@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.background import FULL, GUARD_FACTOR, TOP_PLACES, Background, Environment, background, unrelated
-from core.judgement.geometry import Geometry, GeometryTerms, final_values
+from core.judgement.geometry import Geometry, GeometryTerms
 from core.judgement.probability import Curve, sigmoid
 from core.places import Neighborhood, Whereabouts
 
@@ -132,7 +132,7 @@ class Judgement:
 
     score: of the best match.
     decision: the decision value.
-    margin: the lead over the best rival; in the order of three stages if both were verified, else in scores.
+    margin: the lead over the best rival; by three stages if others than the best match were verified, else by two.
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
@@ -326,14 +326,13 @@ class _Ranking:
     def leads(self, places: Positions) -> NDArray[np.float64]:
         """By how much the best match is ahead of some places, int64 [k]; float64 [k].
 
-        Two places that were verified are compared in the order of three stages, others in the scores of two.
+        They are compared by the values of three stages.  As long as the best match alone was verified, they are by the
+        scores of two: nobody knows yet how well the others fit.
         """
-        ahead = float(self.scores[0]) - self.scores[places].astype(np.float64)
-        if self.geometry is None or self.evidence is None:
-            return ahead
-        values = final_values(self.scores, self.geometry.share)
-        verified = ~np.isnan(self.geometry.evidence[places])
-        return np.where(verified, values[0] - values[places], ahead)
+        if self.geometry is None or self.evidence is None or np.isnan(self.geometry.evidence[1:]).all():
+            return float(self.scores[0]) - self.scores[places].astype(np.float64)
+        values = self.scores + self.geometry.gain
+        return np.asarray(values[0] - values[places], np.float64)
 
     def background(self, left_out: NDArray[np.bool_] | None = None) -> Background:
         """The background without some places, bool [n]."""

@@ -237,6 +237,9 @@ class Map(Protocol):
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
         """The keypoints of those places; None also where none are stored."""
 
+    def glances_at(self, rows: Sequence[int]) -> NDArray[np.int8]:
+        """The best keypoints of those places, int8 [n, 64, 64] (``core.geometry.matching``); zeros where are none."""
+
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
 

@@ -258,12 +258,12 @@ def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -
             candidates.geometry,
         )
 
-    k, verifier = query.question.k, query.verifier
-    ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
+    k = query.question.k
+    ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
     attempt = 1
     while None in (places := _places(map_, ranked, k)) and attempt < ATTEMPTS:
         (candidates,) = rank_places(map_, encoder, [query.encoding], query.question.selection)
-        ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
+        ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
         attempt += 1
     if None in places:  # places are being deleted all the time: go on without those that are gone
         present = np.ones(len(ranked.rows), np.bool_)
@@ -289,7 +289,7 @@ def _put_together(
 ) -> Answer:
     """The answer by the judged candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
-    matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
+    matches = [(float(score), place) for score, place in zip(candidates.final_scores, places, strict=False)]
     if matches:
         judgement = replace(judgement, score=matches[0][0])
     log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
@@ -310,5 +310,5 @@ def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[Ri
         places = map_.places_at(candidates.rows[list(group.positions)].tolist())
         ids = tuple(place.id for place in places if place is not None)
         if ids:
-            groups.append(RivalPlaces(ids, float(candidates.scores[group.positions[0]]), group.same_place))
+            groups.append(RivalPlaces(ids, float(candidates.final_scores[group.positions[0]]), group.same_place))
     return tuple(groups)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from core.errors import UnknownPlace
 from core.geometry.verification import Verification
 from core.judgement.background import FULL
-from core.judgement.geometry import Geometry, final_values
+from core.judgement.geometry import Geometry
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
 from core.maps import Map, MapSettings, Ranking, Scope, Selection
@@ -75,9 +75,30 @@ class Candidates:
     verifications: tuple[Verification | None, ...] = ()
 
     @property
+    def agreement(self) -> Array | None:
+        """The second stage's part of the scores, float32 [n]; None where it took no part, or is not known."""
+        return None if self.first is None or not self.examined.any() else self.scores - self.first
+
+    @property
     def values(self) -> NDArray[np.floating]:
-        """The values by which the places are in their order, float [n]: ``ordered``, and the share of inliers."""
-        return self.ordered if self.geometry is None else final_values(self.ordered, self.geometry.share)
+        """The values by which the places are in their order, float [n]: ``ordered``, and the gains by geometry."""
+        return self.ordered if self.geometry is None else self.ordered + self.geometry.gain
+
+    @property
+    def final_scores(self) -> NDArray[np.floating]:
+        """The scores of all stages, float [n], without a prior."""
+        return self.scores if self.geometry is None else self.scores + self.geometry.gain
+
+    def examined_further(self, positions: Positions, gains: Array) -> Candidates:
+        """The candidates in the same order, after the second stage has raised the scores at some positions.
+
+        Args:
+            positions: int64 [k], not examined before.
+            gains: float32 [k].
+        """
+        raised, examined = np.zeros(len(self.rows), np.float32), self.examined.copy()
+        raised[positions], examined[positions] = gains, True
+        return replace(self, scores=self.scores + raised, ordered=self.ordered + raised, examined=examined)
 
     def with_geometry(self, geometry: Geometry, verifications: tuple[Verification | None, ...]) -> Candidates:
         """The candidates, which are in the order of three stages, with the results of their verification."""

@@ -10,16 +10,18 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
-from core.geometry import detection, keypoints, verification
+from core.geometry import detection, keypoints, matching
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints, keypoints_of
+from core.geometry.pairs import Pairs
 from core.geometry.verification import verify
-from core.judgement.geometry import WEIGHT
+from core.judgement.geometry import AGREEMENT, INLIERS, SIMILARITY
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder
 from core.method.features import FeatureExtractor
@@ -68,9 +70,11 @@ def about_verified(about: About, verify: Verify = "always") -> About:
         "verify": verify,
         "keypoints": keypoints.MOST,
         "longest_side": detection.LONGEST_SIDE,
-        "least_cosine": verification.LEAST_COSINE,
+        "least_cosine": matching.LEAST_COSINE,
         "candidates": CANDIDATES,
-        "weight": WEIGHT,
+        "similarity": SIMILARITY,
+        "agreement": AGREEMENT,
+        "inliers": INLIERS,
     }
     return replace(
         about,
@@ -107,8 +111,7 @@ class VerifiedSystem(EncoderSystem):
 class ThreeStages:
     """The references as the places of one map, which is queried as by the service.
 
-    The score of a place is the value by which the service orders it (``core.judgement.geometry``): of two stages and,
-    where it was verified, with ``WEIGHT`` times the share of its keypoints that are inliers.
+    The score of a place is the value by which the service orders it (``core.judgement.geometry``).
     """
 
     encoder: Encoder
@@ -123,13 +126,22 @@ class ThreeStages:
 
     def score(self, queries: Sequence[Description]) -> Array:
         products = InnerProducts(self.vectors).score(queries)
-        scores = np.empty_like(products)
-        ranked = traverse_candidates(self.encoder, products, local_of(queries), self.local)
-        for row, query, candidates in zip(scores, queries, ranked, strict=True):
-            verifier = Verifier(self.verify, lambda query=query: keypoints_in(query))  # type: ignore[misc]
-            calibration = self.encoder.calibration
-            found, _, _ = verify_candidates(candidates, self._judged, verifier, calibration, self._keypoints_at)
-            row[found.rows] = found.values
+        scores, cells = np.empty_like(products), local_of(queries)
+        pairs = Pairs([keypoints_in(one) for one in queries], [keypoints_in(one) for one in self.references])
+        ranked = traverse_candidates(self.encoder, products, cells, self.local)
+        for number, candidates in enumerate(ranked):
+
+            def agreements(rows: Sequence[int], number: int = number) -> Array:
+                return self.encoder.agreement(cells[number], self.local[list(rows)])
+
+            found, _, _ = verify_candidates(
+                candidates,
+                self._judged,
+                Verifier(self.verify, partial(pairs.queries.__getitem__, number)),
+                self.encoder.calibration,
+                pairs.comparison(number, agreements),
+            )
+            scores[number, found.rows] = found.values
         return scores
 
     def _judged(self, candidates: Candidates) -> Judgement:
@@ -147,14 +159,10 @@ class ThreeStages:
             candidates.geometry,
         )
 
-    def _keypoints_at(self, rows: list[int]) -> list[Keypoints | None]:
-        return [keypoints_in(self.references[row]) for row in rows]
-
 
 def verified_gains(query: Keypoints, places: Sequence[Keypoints]) -> NDArray[np.float32]:
-    """The gain of the scores of k places by verification, float32 [k]: ``WEIGHT`` times the share of the keypoints that
-    are inliers, of the picture that has fewer."""
-    return WEIGHT * np.array([one.inlier_share for one in verify(query, places)], np.float32)
+    """The gain of the scores of k places by the share of their keypoints that are inliers, float32 [k]."""
+    return INLIERS * np.array([one.inlier_share for one in verify(query, places)], np.float32)
 
 
 def keypoints_in(description: Description) -> Keypoints:

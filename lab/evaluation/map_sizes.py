@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.geometry.pairs import Pairs
-from core.judgement.geometry import Geometry, final_order
 from core.judgement.reliability import BINS
 from core.judgement.verdict import Judgement, judge
 from core.maps import MapSettings
 from core.networks.xfeat import load_xfeat
 from core.places import Neighborhood, Whereabouts
-from core.recognition.stages import examine, second_stage
+from core.recognition.question import Verifier
+from core.recognition.stages import Candidates, examine, second_stage
+from core.recognition.verification import CANDIDATES, verify_candidates
 from lab.baselines.encoders import EncoderSystem, local_of
 from lab.baselines.system import stack
 from lab.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
@@ -44,9 +45,6 @@ MAPS = 6
 
 MOST_QUERIES = 20
 """The largest number of queries of either kind on a map; they are drawn at random."""
-
-CANDIDATES = 10
-"""Places that are verified."""
 
 
 def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[SizePoint]:
@@ -143,23 +141,36 @@ class _Maps:
 
         stage = second_stage(encoder, self.queried[query], lambda at: self.local[rows[at]])
         seen = examine(scores[order], places, self.neighborhood, *stage)
-        ranked, places = rows[seen.order], places.take(seen.order)
-        judged = judge(seen.scores, places, encoder.calibration, self.neighborhood, seen.examined)
-        found = [(judged, int(self.retained[ranked[0]]))]
-        if self.pairs is not None:
-            evidence, share = self.pairs.verified(query, ranked[:CANDIDATES])
-            behind = np.full(len(ranked) - len(share), np.nan)
-            geometry = Geometry(np.append(evidence, behind), np.append(share, behind))
-            best = final_order(seen.scores, geometry.share)
-            judged = judge(
-                seen.scores[best],
-                places.take(best),
+        ranked = rows[seen.order]
+        candidates = Candidates(
+            ranked, seen.scores, scores[order][seen.order], places.take(seen.order), seen.examined, None, seen.scores,
+            len(rows),
+        )  # fmt: skip
+
+        def judged(candidates: Candidates) -> Judgement:
+            return judge(
+                candidates.ordered,
+                candidates.whereabouts,
                 encoder.calibration,
                 self.neighborhood,
-                seen.examined[best],
-                geometry=geometry.take(best),
+                candidates.examined,
+                geometry=candidates.geometry,
             )
-            found.append((judged, int(self.retained[ranked[best[0]]])))
+
+        found = [(judged(candidates), int(self.retained[ranked[0]]))]
+        if (pairs := self.pairs) is not None:
+
+            def agreements(places: Sequence[int]) -> NDArray[np.float32]:
+                return encoder.agreement(self.queried[query], self.local[list(places)])
+
+            final, judgement, _ = verify_candidates(
+                candidates,
+                judged,
+                Verifier("always", lambda: pairs.queries[query]),
+                encoder.calibration,
+                pairs.comparison(query, agreements),
+            )
+            found.append((judgement, int(self.retained[final.rows[0]])))
         return found
 
 

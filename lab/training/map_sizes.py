@@ -31,15 +31,17 @@ from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.geometry.pairs import Pairs
 from core.judgement.background import Environment
-from core.judgement.geometry import Geometry, GeometryTerms, final_order
+from core.judgement.geometry import GeometryTerms
 from core.judgement.probability import Curve, sigmoid
 from core.judgement.trials import Trial, Trials, gathered
-from core.judgement.verdict import Calibration, Judgement, judge, worth_verifying
+from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
 from core.places import NO_POSE, Neighborhood, Whereabouts
-from core.recognition.stages import CellComparison, examine
+from core.recognition.question import Verifier, Verify
+from core.recognition.stages import Candidates, CellComparison, examine
+from core.recognition.verification import verify_candidates
 from core.threads import cores, each, share_cores
 from lab.training.photographs import find_photographs, read
 from lab.training.validation import Encodings, TraverseTask, describe, load_traverses, with_corrected_truth
@@ -48,7 +50,6 @@ Array = NDArray[np.float32]
 Positions = NDArray[np.int64]
 Values = NDArray[np.float64]
 Cut = Literal["run", "spread"]
-Verify = Literal["never", "auto", "always"]
 
 APART = 8
 """A stranger's true references are more than this number of frames from every place of the map."""
@@ -70,9 +71,6 @@ STRETCHES = ((300, 700), (2200, 2600))
 MOST_QUERIES = 60
 """The largest number of frames of either kind that query a map."""
 
-
-CANDIDATES = 10
-"""Places that are verified at most."""
 
 SUPPORT = 0.5
 """Weight of the log odds of two stages beside evidence.  Camvid does not determine it: evidence alone is nearly always
@@ -148,38 +146,40 @@ class ScoredTraverse:
 
         stage = CellComparison(self.candidates, gains, self.screened, promise)
         seen = examine(self.first[query, rows], places, NEIGHBORHOOD, *stage)
-        ranked, places = rows[seen.order], places.take(seen.order)
+        ranked, found = rows[seen.order], seen.scores
+        candidates = Candidates(
+            ranked, found, self.first[query, ranked], places.take(seen.order), seen.examined, None, found, count
+        )
 
-        def of_three_stages(candidates: int) -> tuple[Judgement, int]:
-            geometry, best = None, np.arange(count)
-            if candidates and self.pairs is not None:
-                evidence, share = self.pairs.verified(query, ranked[:candidates])
-                behind = np.full(count - len(share), np.nan)
-                geometry = Geometry(np.append(evidence, behind), np.append(share, behind))
-                best = final_order(seen.scores, geometry.share)
-                geometry = geometry.take(best)
-
+        def judged(candidates: Candidates) -> Judgement:
             def likeness(at: Positions) -> Array:
-                return np.asarray(self.among[ranked[best[0]], ranked[best[at]]])
+                return np.asarray(self.among[candidates.rows[0], candidates.rows[at]])
 
-            judgement = judge(
-                seen.scores[best],
-                places.take(best),
+            return judge(
+                candidates.ordered,
+                candidates.whereabouts,
                 calibration,
                 NEIGHBORHOOD,
-                seen.examined[best],
+                candidates.examined,
                 likeness,
-                geometry,
+                candidates.geometry,
             )
-            return judgement, int(ranked[best[0]])
 
-        verified, most = 0, min(CANDIDATES, count)
-        judgement, place = of_three_stages(0)
-        for more in {"never": (), "auto": (1, most), "always": (most,)}[verify]:
-            if more > verified and (verify == "always" or worth_verifying(judgement, calibration)):
-                verified = more
-                judgement, place = of_three_stages(verified)
-        return Judged(judgement, place, verified)
+        if self.pairs is None:
+            return Judged(judged(candidates), int(ranked[0]), 0)
+        pairs = self.pairs
+
+        def agreements(references: Sequence[int]) -> Array:
+            return np.asarray(self.both[query, list(references)] - self.first[query, list(references)])
+
+        final, judgement, _ = verify_candidates(
+            candidates,
+            judged,
+            Verifier(verify, lambda: pairs.queries[query]),
+            calibration,
+            pairs.comparison(query, agreements),
+        )
+        return Judged(judgement, int(final.rows[0]), sum(one is not None for one in final.verifications))
 
 
 def scored(

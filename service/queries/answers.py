@@ -73,9 +73,11 @@ def score_parts(candidates: Candidates, at: int) -> ScoreParts | None:
         return None
     verified = candidates.verifications[at] if at < len(candidates.verifications) else None
     similarity, score = float(candidates.first[at]), float(candidates.scores[at])
+    geometry = None if candidates.geometry is None else float(candidates.geometry.gain[at])
     return ScoreParts(
         similarity=similarity,
         agreement=score - similarity,
+        geometry=geometry,
         inliers=None if verified is None else verified.inlier_count,
         keypoints=None if verified is None else min(verified.keypoints),
         evidence=None if verified is None else verified.evidence,

@@ -87,7 +87,7 @@ class MatchExplanation(ExplanationView):
 
 
 class ScoreParts(BaseModel):
-    """The parts of a match's score: it is the sum of `similarity` and `agreement`."""
+    """The parts of a match's score: it is the sum of `similarity`, `agreement` and, if not null, `geometry`."""
 
     similarity: float = Field(
         description="J / V, or the cosine of descriptors that are normalized as a whole; weighted by 1 - `share` if "
@@ -95,6 +95,12 @@ class ScoreParts(BaseModel):
     )
     agreement: float = Field(
         description="`share` times the agreement of cells; 0 for a place that the second stage has not examined."
+    )
+    geometry: float | None = Field(
+        default=None,
+        description="If any candidate was verified: 0.75 times the share of inliers (`inliers` / `keypoints`) and, for "
+        "an encoder with a second stage, `similarity` less half of `agreement`, for geometry says better what cells on "
+        "a grid say. Null if none was.",
     )
     inliers: int | None = Field(
         description="Keypoints of both frames that match and fit one rigid scene; null if the match was not verified."
@@ -113,8 +119,8 @@ class Match(BaseModel):
     score: float = Field(
         description="J / V, or the cosine of descriptors that are normalized as a whole. If the encoder has a "
         "second stage (`agreement` in its definition), this is weighted by 1 - `share`, and `share` times the "
-        "agreement of cells is added to the scores of the best `candidates`. Where matches were verified, the order is "
-        "that of the score plus 0.7 times the share of inliers."
+        "agreement of cells is added to the scores of the best `candidates`. Where candidates were verified, geometry "
+        "changes it (see `parts`). Without soft parameters the matches are in the order of their scores."
     )
     parts: ScoreParts | None = Field(default=None, description="Null where several frames were judged as one.")
     weight: float | None = Field(
@@ -263,13 +269,10 @@ class QueryAnswer(BaseModel):
     )
     pose: EstimatedPose | None = Field(description="Null unless recognized, or if the place has no pose.")
     score: float | None = Field(description="Score of the best match (see its `score`); null if there is none.")
-    margin: float | None = Field(
-        description="Best score minus that of the best rival, with 0.7 times the shares of inliers where the best "
-        "match was verified; null without a rival."
-    )
+    margin: float | None = Field(description="Best score minus that of the best rival; null without a rival.")
     decision: float | None = Field(
         description="By how much the best match stands out from the rest of the map: the geometric mean of its score "
-        "and its lead; less than 0 where it is behind the expectation for a small map."
+        "by the first two stages and its lead in it; less than 0 where it is behind the expectation for a small map."
     )
     threshold: float = Field(
         description="The least decision value at which the best match can be recognized. A match that was verified is "

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, overload
 
+import numpy as np
+from numpy.typing import NDArray
+
 from core.errors import (
     InvalidImage,
     NoThumbnail,
@@ -23,6 +26,7 @@ from core.ledger.maps.cameras import Cameras
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.counterparts import Counterparts
 from core.ledger.maps.frames import ObjectReader, read_pictures
+from core.ledger.maps.glances import Glances
 from core.ledger.maps.plan import Plan
 from core.ledger.maps.transfer import Transfer
 from core.ledger.maps.writing import Write
@@ -52,6 +56,7 @@ class LedgerMap(ABC):
         self.cameras = Cameras(self._reading, self._writing, lambda: self.state)
         self.counterparts = Counterparts(self._reading, self._writing)
         self.plan = Plan(self._reading)
+        self._glances = Glances(self.keypoints_at)
         self.transfer = Transfer(self._reading, self._writing, self.paused_writes)
 
     # Of the store
@@ -148,6 +153,9 @@ class LedgerMap(ABC):
         with self._glancing() as connection:
             found = frames.keypoints_at(connection, wanted)
         return [found.get(row) for row in wanted]
+
+    def glances_at(self, rows: Sequence[int]) -> NDArray[np.int8]:
+        return self._glances.at([int(row) for row in rows])
 
     def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
         with self._reading() as connection:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from core.errors import InvalidArchive
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.geometry.keypoints import MOST
+from core.geometry.keypoints import MOST_STORED
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
@@ -81,7 +81,7 @@ class PlaceLine(_Line):
     regions: Number
     digest: Digest
     picture: Picture | None
-    keypoints: Annotated[int, Field(ge=0, le=MOST, strict=True)] | None
+    keypoints: Annotated[int, Field(ge=0, le=MOST_STORED, strict=True)] | None
     created_at: Timestamp
     updated_at: Timestamp
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidArchive, InvalidImage, InvalidKeypoints
-from core.geometry.keypoints import MOST, keypoints_of, record_bytes
+from core.geometry.keypoints import MOST_STORED, keypoints_of, record_bytes
 from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.maps.archives.manifest import ArchivePart, Manifest
 from core.maps.archives.reading import Archive, PartReader
@@ -70,7 +70,7 @@ def check_sizes(manifest: Manifest) -> None:
         _, part, _, keypoints = manifest.group(number)
         if part.bytes != part.rows * width:
             raise InvalidArchive(f"{part.name} has {part.bytes} bytes, not {part.rows} times {width} bytes.")
-        if keypoints.bytes > keypoints.rows * record_bytes(MOST):
+        if keypoints.bytes > keypoints.rows * record_bytes(MOST_STORED):
             raise InvalidArchive(f"{keypoints.name} has more bytes than the keypoints of {keypoints.rows} places.")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.errors import InvalidKeypoints
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints, shown_size
-from core.geometry.keypoints import LENGTH, MOST, RESOLUTION, SHARES, Keypoints, keypoints_of, record_bytes
+from core.geometry.keypoints import LENGTH, MOST, MOST_STORED, RESOLUTION, SHARES, Keypoints, keypoints_of, record_bytes
 from core.networks.xfeat import XFeat, load_xfeat
 from service.commands.timing.samples import sample_frame
 
@@ -28,7 +28,7 @@ def found(network: XFeat) -> Keypoints:
 
 
 def test_a_place_takes_at_most_40_kb() -> None:
-    assert record_bytes(MOST) <= 40_000
+    assert record_bytes(MOST) <= 27_000
 
 
 def test_a_frame_has_keypoints_with_descriptors_of_unit_length(found: Keypoints) -> None:
@@ -41,7 +41,7 @@ def test_a_frame_has_keypoints_with_descriptors_of_unit_length(found: Keypoints)
 
 
 def test_keypoints_lie_on_the_corners_of_what_is_drawn(network: XFeat) -> None:
-    """A pixel of the network is 1.3 wide here; there is no offset to one side."""
+    """A pixel of the network is two wide here; there is no offset to one side."""
     frame = np.full((480, 640, 3), 40, np.uint8)
     corners = []
     for left in (30, 190, 350, 510):
@@ -51,22 +51,22 @@ def test_keypoints_lie_on_the_corners_of_what_is_drawn(network: XFeat) -> None:
     pixels = find_keypoints(network, cv2.GaussianBlur(frame, (0, 0), 1).astype(np.uint8)).pixels()
     offsets = pixels[None] - np.array(corners)[:, None]
     nearest = offsets[np.arange(len(corners)), np.linalg.norm(offsets, axis=2).argmin(axis=1)]
-    assert np.median(np.linalg.norm(nearest, axis=1)) < 5
-    assert np.abs(nearest.mean(axis=0)).max() < 1.3
+    assert np.median(np.linalg.norm(nearest, axis=1)) < 7.5
+    assert np.abs(nearest.mean(axis=0)).max() < 2
 
 
 @pytest.mark.parametrize(
     ("width", "height", "shown"),
     [
-        (640, 480, (480, 352)),
-        (160, 120, (480, 352)),
-        (240, 192, (480, 384)),
-        (480, 640, (352, 480)),
-        (4000, 20, (480, 32)),
-        (16, 16, (480, 480)),
+        (640, 480, (320, 256)),
+        (160, 120, (320, 256)),
+        (240, 192, (320, 256)),
+        (480, 640, (256, 320)),
+        (4000, 20, (320, 32)),
+        (16, 16, (320, 320)),
     ],
 )
-def test_the_network_sees_a_side_of_480(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
+def test_the_network_sees_a_side_of_320(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
     assert shown_size(width, height) == shown
     made = find_keypoints(network, sample_frame(1, width, height))
     assert (made.width, made.height) == (width, height)
@@ -131,7 +131,7 @@ def test_a_damaged_record_is_refused(found: Keypoints, damage: Callable[[bytearr
 
 def test_more_keypoints_than_a_frame_has_are_refused() -> None:
     with pytest.raises(InvalidKeypoints):
-        keypoints_of(bytes([1, 0, 0, 0] * 2 + [65, 2, 0, 0]) + b"\1" * (68 * (MOST + 1)))
+        keypoints_of(bytes([1, 0, 0, 0] * 2 + [65, 2, 0, 0]) + b"\1" * (68 * (MOST_STORED + 1)))
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_more_keypoints_than_a_frame_has_are_refused() -> None:
         (np.zeros((3, 3), np.uint16), np.zeros((3, LENGTH), np.int8)),
         (np.zeros((3, 2), np.float32), np.zeros((3, LENGTH), np.int8)),
         (np.zeros((3, 2), np.uint16), np.zeros((3, LENGTH), np.uint8)),
-        (np.zeros((MOST + 1, 2), np.uint16), np.zeros((MOST + 1, LENGTH), np.int8)),
+        (np.zeros((MOST_STORED + 1, 2), np.uint16), np.zeros((MOST_STORED + 1, LENGTH), np.int8)),
     ],
 )
 def test_arrays_that_are_no_keypoints_are_refused(positions: NDArray[np.uint16], descriptors: NDArray[np.int8]) -> None:

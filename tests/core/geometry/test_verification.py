@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels, second_look
 from core.geometry.detection import find_keypoints
-from core.geometry.keypoints import RESOLUTION, Keypoints
-from core.geometry.verification import Verification, evidence, fitting, mutual_matches, verify
-from core.networks.xfeat import LENGTH, XFeat, load_xfeat
+from core.geometry.keypoints import Keypoints
+from core.geometry.verification import Verification, evidence, fitting, verify
+from core.networks.xfeat import XFeat, load_xfeat
 from core.threads import use_threads
 from service.commands.timing.samples import sample_frame
 
@@ -68,7 +68,8 @@ def test_inliers_lie_where_a_known_change_has_put_them(network: XFeat, change: P
     missed = np.linalg.norm(wanted - theirs, axis=1)[found.inliers]
     assert found.inlier_count > least * len(found.matches) and found.evidence > 60
     # A flat scene leaves the epipolar lines free, so that some wrong matches fit by chance.
-    assert np.median(missed) < 2 and (missed < 4).mean() > 0.7
+    # A pixel of the network is two wide here.
+    assert np.median(missed) < 3 and (missed < 6).mean() > 0.7
     assert found.spread > 0.25
 
 
@@ -118,14 +119,6 @@ def test_threads_and_repetitions_change_nothing(network: XFeat) -> None:
     for one, other in zip(once, again, strict=True):
         assert np.array_equal(one.matches, other.matches) and np.array_equal(one.inliers, other.inliers)
         assert one.evidence == other.evidence
-
-
-def test_matches_are_mutual_and_ties_go_to_the_lower_number() -> None:
-    units = (np.eye(4, LENGTH) * RESOLUTION // 2).astype(np.float32)
-    near = 1.6 * units  # the cosine of near[i] and near[i] is 0.64, of units[i] and 2 * units[i] 0.5
-    query = np.stack([2 * units[0], 2 * units[0], 2 * units[1], near[2]])
-    candidate = np.stack([2 * units[3], 2 * units[1], 2 * units[0], 2 * units[0], near[2]])
-    assert mutual_matches(query, candidate).tolist() == [[0, 2], [2, 1]]
 
 
 SQUARE = np.array([(x * 40.0 + 7 * (y % 3), y * 40.0 + 5 * (x % 2)) for x in range(5) for y in range(5)])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from core.judgement.background import Environment
 from core.judgement.calibration import Target, fit_encoder_calibration, fit_map_calibration
-from core.judgement.geometry import TERMS, WEIGHT, Geometry, final_order, final_values
+from core.judgement.geometry import AGREEMENT, INLIERS, SIMILARITY, TERMS, Geometry, final_gains, final_order
 from core.judgement.probability import Curve
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration, Judgement, Rivals, judge, worth_verifying
@@ -39,7 +39,7 @@ def found(count: int, *evidence: float) -> Geometry:
     """Evidence of the first candidates, with shares of inliers that go with it."""
     whole = np.full(count, np.nan)
     whole[: len(evidence)] = evidence
-    return Geometry(whole, whole / 1000)
+    return Geometry(whole, np.nan_to_num(whole) / 1000)
 
 
 def judged(scores: NDArray[np.float32], *evidence: float, calibration: Calibration = CALIBRATION) -> Judgement:
@@ -53,18 +53,23 @@ def full(*best: float) -> NDArray[np.float32]:
 
 
 def test_candidates_are_ordered_by_score_and_share_of_inliers() -> None:
-    scores, share = np.array([0.3, 0.29, 0.28, 0.27], np.float32), np.array([0.0, 0.1, NOT, 0.02])
-    assert final_values(scores, share) == pytest.approx([0.3, 0.29 + 0.1 * WEIGHT, 0.28, 0.27 + 0.02 * WEIGHT])
-    assert final_order(scores, share).tolist() == [1, 0, 3, 2]
-    assert final_order(np.full(3, 0.2, np.float32), np.full(3, np.nan)).tolist() == [0, 1, 2], "ties keep their order"
+    scores, share = np.array([0.3, 0.29, 0.28, 0.27], np.float32), np.array([0.0, 0.1, 0.0, 0.02])
+    gains = final_gains(share)
+    assert gains == pytest.approx(INLIERS * share)
+    assert final_order(scores, gains).tolist() == [1, 0, 3, 2]
+    assert final_order(np.full(3, 0.2, np.float32), np.zeros(3)).tolist() == [0, 1, 2], "ties keep their order"
 
 
-@pytest.mark.parametrize(
-    ("evidence", "share"), [([1.0, 2.0], [0.1]), ([1.0, NOT], [0.1, 0.2]), ([1.0, 2.0], [NOT, 0.2])]
-)
-def test_evidence_and_share_are_of_the_same_candidates(evidence: list[float], share: list[float]) -> None:
+def test_cells_lose_a_part_of_their_say_to_the_first_stage() -> None:
+    similarity, agreement = np.array([0.2, 0.25], np.float32), np.array([0.12, 0.05], np.float32)
+    gains = final_gains(np.array([0.1, 0.1]), similarity, agreement)
+    assert gains == pytest.approx(INLIERS * 0.1 + SIMILARITY * similarity - AGREEMENT * agreement)
+    assert final_order(similarity + agreement, gains).tolist() == [1, 0]
+
+
+def test_evidence_and_gain_are_of_the_same_candidates() -> None:
     with pytest.raises(ValueError, match="same candidates"):
-        Geometry(np.array(evidence), np.array(share))
+        Geometry(np.array([1.0, 2.0]), np.array([0.1]))
 
 
 @pytest.mark.parametrize("scores", [full(0.3), full(0.13), full(0.3, 0.299), np.array([0.2], np.float32)])
@@ -105,7 +110,7 @@ def test_two_places_of_one_picture_stay_ambiguous_however_much_evidence_both_hav
     assert twins.rivals == (Rivals((1,), False),)
 
 
-def test_a_rival_that_was_not_verified_is_compared_in_score() -> None:
+def test_a_best_match_that_was_verified_alone_is_compared_in_score() -> None:
     """The best candidate alone was verified: its share of inliers gives it no lead over its twin."""
     first = judged(np.array([0.6, 0.6], np.float32), 900.0)
     assert (first.verdict, first.margin) == ("ambiguous", 0.0)
@@ -117,7 +122,7 @@ def test_a_best_match_that_fits_needs_no_lead_in_score_over_rivals_that_do_not()
     assert judged(scores).verdict == "ambiguous"
     verified = judged(scores, 300.0, 0.0)
     assert verified.verdict == "recognized" and verified.rivals == ()
-    assert verified.margin == pytest.approx(0.3 - 0.12, abs=1e-6), "over the street, which was not verified"
+    assert verified.margin == pytest.approx(0.6 - 0.299, abs=1e-6), "by three stages"
 
 
 def test_another_order_leaves_the_background_the_same() -> None:
