@@ -81,7 +81,7 @@ class GeometryTerms(BaseModel):
         return np.asarray(self.support * before + self.slope * np.log1p(found) + self.intercept, np.float64)
 
 
-TERMS = GeometryTerms(support=0.5, slope=1.563, intercept=-5.505)
+TERMS = GeometryTerms(support=0.5, slope=1.463, intercept=-4.954)
 """Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m lab.training.map_sizes``)."""
 
 

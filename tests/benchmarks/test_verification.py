@@ -2,63 +2,63 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from benchmarks.geometry.verification import (
-    FORMS,
-    SHARES,
-    Pictures,
-    Task,
-    Verified,
-    chosen_weight,
-    figures_of,
-    with_share,
-)
+from benchmarks.geometry.tasks import Pictures, Task, from_elsewhere, relit
+from benchmarks.geometry.verification import BEFORE, OURS, SHIPPED, WAYS, Ranked, Weights, best_weights, recall
 from lab.training.validation import Encodings
+from service.commands.timing.samples import sample_frame
 
 NOTHING = Pictures(Encodings(np.zeros((0, 1), np.float32), np.zeros((0, 1, 1), np.int8)), [])
+TASK = Task("made up", NOTHING, NOTHING, np.zeros((2, 2), np.bool_), 0, "made up", True)
 
 
-def candidates(fitted: bool = True) -> Verified:
-    """Two queries with two candidates each: the second's true one is behind, by 0.1, and has half of the keypoints."""
-    zeros = np.zeros((2, 2))
-    return Verified(
-        task=Task("made up", NOTHING, NOTHING, np.zeros((2, 2), np.bool_), 0, fitted),
-        reference=np.array([[0, 1], [1, 0]]),
-        score=np.array([[0.5, 0.2], [0.4, 0.3]]),
-        lead=np.array([0.3, 0.1]),
-        matches=zeros,
-        inliers=np.array([[10.0, 0.0], [0.0, 50.0]]),
-        evidence=zeros,
-        spread=zeros,
-        share=np.array([[0.1, 0.0], [0.0, 0.5]]),
-        true=np.array([[True, False], [False, True]]),
-        known=np.array([True, True]),
+def ranked(true: int, glance: int = 2) -> Ranked:
+    """Three candidates: the best by cells, the best by its descriptor, and the one that keypoints fit."""
+    return Ranked(
+        similarity=np.array([0.1, 0.2, 0.12]),
+        agreement=np.array([0.2, 0.05, 0.0]),
+        by_similarity=np.array([2.0, 0.0, 1.0]),
+        by_glance=np.argsort(np.argsort(-(np.arange(3) == glance), kind="stable")).astype(np.float64),
+        share=np.array([0.0, 0.0, 0.5]),
+        true=np.arange(3) == true,
     )
 
 
 @pytest.mark.parametrize(
-    ("form", "count", "recall"),
+    ("weights", "counts", "true"),
     [
-        (FORMS["two stages"], 2, 0.5),
-        (FORMS["inliers alone"], 2, 1.0),
-        (with_share(0.1), 2, 0.5),
-        (with_share(0.25), 2, 1.0),
-        (with_share(0.25), 1, 0.5),
+        ((1.0, 1.0, 0.0), (3, 0, 0), 0),
+        ((2.0, 0.5, 0.0), (3, 0, 0), 1),
+        (SHIPPED, (3, 0, 0), 2),
+        (SHIPPED, (1, 1, 0), 1),
+        (SHIPPED, (1, 0, 1), 2),
     ],
 )
-def test_a_form_orders_the_candidates(form: object, count: int, recall: float) -> None:
-    assert figures_of(candidates(), form, count)[0] == recall  # type: ignore[arg-type]
+def test_weights_and_sources_decide_which_place_is_first(
+    weights: Weights, counts: tuple[int, int, int], true: int
+) -> None:
+    assert recall([ranked(true)], weights, counts) == 1.0
+    assert recall([ranked(true), ranked((true + 1) % 3)], weights, counts) == 0.5
 
 
-def test_the_weight_is_the_least_that_is_enough_on_the_tasks_to_fit_on() -> None:
-    slow = replace(candidates(fitted=False), share=np.zeros((2, 2)))
-    assert chosen_weight([candidates(), slow]) == SHARES[1]
+def test_sources_do_not_choose_a_place_twice() -> None:
+    assert ranked(0, glance=0).chosen(1, 1, 1).tolist() == [True, True, True]
+    assert ranked(0, glance=0).chosen(1, 0, 1).sum() == 2
 
 
-def test_queries_without_their_place_do_not_count_in_the_recall() -> None:
-    one = replace(candidates(), known=np.array([True, False]), true=np.array([[True, False], [False, False]]))
-    assert figures_of(one, FORMS["two stages"])[0] == 1.0
+def test_the_best_weights_are_those_of_the_tasks_to_fit_on() -> None:
+    best, reached, ours = best_weights([(TASK, [ranked(2)] * 3)])
+    assert reached == ours == 1.0 and best[2] > 0
+    assert WAYS["three stages"] == (SHIPPED, OURS) and BEFORE != SHIPPED
+
+
+def test_photographs_are_seen_from_elsewhere_in_other_light() -> None:
+    frame = sample_frame(2)
+    views = [
+        relit(from_elsewhere(frame, np.random.default_rng(seed), (160, 120), 1.0), np.random.default_rng(seed))
+        for seed in (0, 0, 1)
+    ]
+    assert views[0].shape == (120, 160, 3) and np.array_equal(views[0], views[1])
+    assert not np.array_equal(views[0], views[2])
