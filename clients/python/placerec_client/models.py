@@ -183,10 +183,11 @@ class PlaceView(Model):
 
 
 class ScoreParts(Model):
-    """The parts of a match's score: it is the sum of `similarity` and `agreement`."""
+    """The parts of a match's score: it is the sum of `similarity`, `agreement` and, if not null, `geometry`."""
 
     similarity: float
     agreement: float
+    geometry: float | None = None
     inliers: int | None = None
     keypoints: int | None = None
     evidence: float | None = None
