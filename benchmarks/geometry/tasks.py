@@ -177,7 +177,7 @@ def traverses(camera: PictureEncoder, evaluation: Path) -> tuple[Task, Task]:
 
 
 @dataclass(frozen=True)
-class Displacement:
+class CameraMove:
     """Photographs as a camera sees them that was moved and turned in front of them.
 
     size: of all pictures.
@@ -193,23 +193,23 @@ class Displacement:
 
 
 DISPLACED = (
-    Displacement("facades", (160, 120), 2, 5, 1.0),
-    Displacement("facades", (240, 180), 2, 15, 0.5),
-    Displacement("roads", (160, 120), 16, 6, 0.8),
-    Displacement("scenes15", (160, 120), 13, 7, 1.0),
-    Displacement("camvid", (240, 180), 3, 8, 0.6),
+    CameraMove("facades", (160, 120), 2, 5, 1.0),
+    CameraMove("facades", (240, 180), 2, 15, 0.5),
+    CameraMove("roads", (160, 120), 16, 6, 0.8),
+    CameraMove("scenes15", (160, 120), 13, 7, 1.0),
+    CameraMove("camvid", (240, 180), 3, 8, 0.6),
 )
 """Their queries are cut, spotted and lit anew as well (``lab.training.views.augmentation``)."""
 SEEN_FROM_ELSEWHERE = (
-    Displacement("facades", (240, 180), 2, 25, 1.1),
-    Displacement("camvid", (200, 150), 3, 28, 1.2),
-    Displacement("tower", (160, 120), 5, 29, 0.9),
-    Displacement("scenes15", (160, 120), 13, 27, 1.1),
+    CameraMove("facades", (240, 180), 2, 25, 1.1),
+    CameraMove("camvid", (200, 150), 3, 28, 1.2),
+    CameraMove("tower", (160, 120), 5, 29, 0.9),
+    CameraMove("scenes15", (160, 120), 13, 27, 1.1),
 )
 """Their queries have other light and noise beside."""
 
 
-def displaced(camera: PictureEncoder, train: Path, one: Displacement, disturbed: bool) -> Task:
+def displaced(camera: PictureEncoder, train: Path, one: CameraMove, disturbed: bool) -> Task:
     """The photographs of a folder against themselves from elsewhere, disturbed much or little."""
     generator = np.random.default_rng(one.seed)
     paths = find_photographs(train / one.folder)[:: one.step]

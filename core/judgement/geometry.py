@@ -43,7 +43,8 @@ class Geometry:
     """The results of verification for the candidates of a ranking, in its order; NaN where one was not verified.
 
     evidence: float64 [n], at least 0.
-    gain: float64 [n], what three stages add to the scores of two, also of places that were not verified.
+    gain: float64 [n], what three stages add to the scores of two, also of places that were not verified; 0 as long as
+        the best match alone was.
 
     Raises:
         ValueError: the arrays differ in shape.

@@ -132,7 +132,7 @@ class Judgement:
 
     score: of the best match.
     decision: the decision value.
-    margin: the lead over the best rival; by three stages if others than the best match were verified, else by two.
+    margin: the lead over the best rival, in the scores of all stages.
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
@@ -326,12 +326,11 @@ class _Ranking:
     def leads(self, places: Positions) -> NDArray[np.float64]:
         """By how much the best match is ahead of some places, int64 [k]; float64 [k].
 
-        They are compared by the values of three stages.  As long as the best match alone was verified, they are by the
-        scores of two: nobody knows yet how well the others fit.
+        They are compared by the scores of all stages.
         """
-        if self.geometry is None or self.evidence is None or np.isnan(self.geometry.evidence[1:]).all():
-            return float(self.scores[0]) - self.scores[places].astype(np.float64)
-        values = self.scores + self.geometry.gain
+        values = self.scores.astype(np.float64)
+        if self.geometry is not None:
+            values = values + self.geometry.gain
         return np.asarray(values[0] - values[places], np.float64)
 
     def background(self, left_out: NDArray[np.bool_] | None = None) -> Background:

@@ -128,7 +128,7 @@ def verify_candidates(
         trial.verify(np.zeros(1, np.int64))
         ranked = trial.ranked()
         judgement = judged(ranked)
-    if not automatic or trial.unsettled(ranked) or worth_verifying(judgement, calibration):
+    if not automatic or not trial.found or worth_verifying(judgement, calibration):
         trial.verify_chosen()
         ranked = trial.ranked()
         judgement = judged(ranked)
@@ -159,10 +159,6 @@ class _Trial:
     def ranked(self) -> Candidates:
         """The candidates in their final order, with the results."""
         return verified(self.candidates, self.found)
-
-    def unsettled(self, ranked: Candidates) -> bool:
-        """Whether a place that was not verified, though it may have keypoints, comes first."""
-        return ranked.geometry is None or ranked.geometry.best is None
 
     def verify_chosen(self) -> None:
         """Verify those that are chosen as far as they can still win, and whatever comes first then."""
@@ -257,13 +253,16 @@ def relative_views(
 def verified(candidates: Candidates, found: Mapping[int, Verification]) -> Candidates:
     """The candidates in their final order, with the results of verification.
 
+    As long as the best match alone was verified, nobody knows how well the others fit, and the scores stay.
+
     Args:
         found: the results by positions among the candidates.
     """
     evidence, share = np.full(len(candidates.rows), np.nan), np.zeros(len(candidates.rows))
     for at, one in found.items():
         evidence[at], share[at] = one.evidence, one.inlier_share
-    gains = final_gains(share, candidates.first, candidates.agreement)
+    alone = set(found) <= {0}
+    gains = np.zeros(len(share)) if alone else final_gains(share, candidates.first, candidates.agreement)
     order = final_order(candidates.ordered, gains)
     last = max(np.flatnonzero(~np.isnan(evidence[order])), default=-1)
     verifications = tuple(found.get(at) for at in order[: last + 1].tolist())

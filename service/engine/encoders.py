@@ -76,7 +76,7 @@ class Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.
 
         Args:
-            keep_scaled: retain the scaled pixels in which keypoints are found, at most 0.7 MB.
+            keep_scaled: retain the scaled pixels in which keypoints are found, at most 0.3 MB.
         """
         return replace(self, source=np.zeros((0, 0, 3), np.uint8), _scaled=self.scaled if keep_scaled else None)
 

@@ -26,11 +26,11 @@ from core.ledger.maps.cameras import Cameras
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.counterparts import Counterparts
 from core.ledger.maps.frames import ObjectReader, read_pictures
-from core.ledger.maps.glances import Glances
 from core.ledger.maps.plan import Plan
 from core.ledger.maps.transfer import Transfer
 from core.ledger.maps.writing import Write
 from core.maps.enrolling import check_enrolment
+from core.maps.glances import Glances
 from core.maps.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (

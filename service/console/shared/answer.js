@@ -121,10 +121,14 @@ function MatchTile({ map, match, chosen, choose }) {
         <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
       </button>
       <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}>${place.id}</a><span>${decimal(score)}</span></span>
-      ${parts && html`<span class="faint small">${decimal(parts.similarity)} + ${decimal(parts.agreement)}${parts.inliers !== null && `, ${parts.inliers} inliers`}</span>`}
+      ${parts && html`<span class="faint small">${partsOf(parts)}${parts.inliers !== null && `, ${parts.inliers} inliers`}</span>`}
       ${place.sequence && html`<span class="faint small clip">${place.sequence}</span>`}
     </li>
   `;
+}
+
+function partsOf({ similarity, agreement, geometry }) {
+  return [similarity, agreement, geometry].filter((part) => part != null).map((part) => decimal(part)).join(" + ");
 }
 
 function Why({ answer }) {
@@ -134,7 +138,7 @@ function Why({ answer }) {
   return html`
     <${Facts} rows=${[
       ["Score", decimal(score)],
-      parts && ["Similarity + agreement", `${decimal(parts.similarity)} + ${decimal(parts.agreement)}`],
+      parts && [parts.geometry == null ? "Similarity + agreement" : "Similarity + agreement + geometry", partsOf(parts)],
       ["Margin to the best rival", decimal(margin)],
       ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],
       parts && parts.inliers !== null && ["Inliers", `${integer(parts.inliers)} of ${integer(parts.keypoints)}`],

@@ -176,6 +176,9 @@ def test_auto_stops_where_the_best_match_settles_the_answer(lab: Map, encoder: E
     answer = ask(lab, encoder, 3, "auto")  # a map of so few places leaves doubt
     assert answer.third_stage.state == "verified" and answer.judgement.verdict == "recognized"
     assert sum(one is not None for one in answer.candidates.verifications) == 1
+    candidates = answer.candidates
+    assert candidates.geometry is not None and not candidates.geometry.gain.any(), "nobody knows how the others fit"
+    assert answer.judgement.score == pytest.approx(candidates.scores[0])
 
 
 def test_auto_looks_at_the_others_where_the_best_match_does_not_settle_it(

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from core.judgement.geometry import AGREEMENT, INLIERS, SIMILARITY
+from core.recognition.verification import CANDIDATES
 from tests.service.map_jobs import asked, finished
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server, assert_problem
@@ -37,18 +39,20 @@ def parts(answer: dict[str, Any]) -> list[dict[str, Any]]:
 def test_always_tells_the_parts_of_each_match(server: Server, verified: str) -> None:
     answer = server.query(verified, seen(3), verify="always", k=PLACES)
     assert answer["verdict"] == "recognized" and answer["place"]["id"] == "p3"
-    assert answer["verification"]["state"] == "verified" and answer["verification"]["candidates"] == 10
-    assert answer["verification"]["keypoints"] > 100 and answer["milliseconds"]["verify"] > 0
+    verified_ = answer["verification"]
+    assert verified_["state"] == "verified" and 1 < verified_["candidates"] <= CANDIDATES
+    assert verified_["keypoints"] > 100 and answer["milliseconds"]["verify"] > 0
     for match in answer["matches"]:
         told = match["parts"]
-        assert match["score"] == pytest.approx(told["similarity"] + told["agreement"], abs=1e-6)
+        assert match["score"] == pytest.approx(told["similarity"] + told["agreement"] + told["geometry"], abs=1e-6)
+        inliers = 0 if told["inliers"] is None else told["inliers"] / told["keypoints"]
+        gain = INLIERS * inliers + SIMILARITY * told["similarity"] - AGREEMENT * told["agreement"]
+        assert told["geometry"] == pytest.approx(gain, abs=1e-6)
     best, *others = parts(answer)
     assert 20 < best["inliers"] <= best["keypoints"] and best["evidence"] > 80
-    values = [
-        m["score"] + 0.7 * (m["parts"]["inliers"] or 0) / (m["parts"]["keypoints"] or 1) for m in answer["matches"]
-    ]
-    assert values == sorted(values, reverse=True)
-    assert [one["inliers"] is None for one in others].count(True) == PLACES - 10
+    scores = [match["score"] for match in answer["matches"]]
+    assert scores == sorted(scores, reverse=True) and answer["score"] == scores[0]
+    assert [one["inliers"] is None for one in others].count(True) == PLACES - verified_["candidates"]
 
 
 @pytest.mark.parametrize("verify", ["never", "auto", "always"])
