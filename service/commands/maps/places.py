@@ -117,8 +117,7 @@ def delete_places(
                 return (await service.request("POST", path, json={"ids": place_ids, "dry_run": dry_run})).json()
 
             if missing := (await order(dry_run=True))["missing"]:
-                shown = ", ".join(one if one.isprintable() else ascii(one) for one in missing)
-                raise Failure(f"The map {map_id} has no place {shown}; nothing was deleted.")
+                raise Failure(f"The map {map_id} has no place {', '.join(missing)}; nothing was deleted.")
             if not yes:
                 typer.confirm(f"Delete from the map {map_id}: {', '.join(place_ids)}?", abort=True)
             deleted = await order(dry_run=False)
