@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from core.disk.permissions import PRIVATE_FILE, PRIVATE_FOLDER, open_private
 from core.errors import DataDirectoryLocked, PlacerecError, StorageFailure, StorageFull
 
 DISK_IS_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -51,10 +52,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its missing parents, and sync the name of each folder made."""
+    """Make a folder and its missing parents for this user alone, and sync the name of each folder made."""
     if not folder.is_dir():
         make_folder(folder.absolute().parent)
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(PRIVATE_FOLDER, exist_ok=True)
         sync_folder(folder.absolute().parent)
 
 
@@ -76,7 +77,7 @@ def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
 
 
 @contextmanager
-def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -> Iterator[Path]:
+def replacing(path: Path, temporary: Path | None = None, durable: bool = True, private: bool = True) -> Iterator[Path]:
     """Replace the file at ``path`` whole or not at all.
 
     The block writes a file at the temporary path that it is given.  When the block ends, that file is synced, renamed
@@ -85,12 +86,15 @@ def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -
     Args:
         temporary: where to write; by default ``path`` with the suffix ``.tmp``.
         durable: sync the file and the folder.  A file that can be made again needs no sync.
+        private: make the file for this user alone; else the process's umask says for whom it is.
 
     Raises:
         OSError: the disk refuses.
     """
     temporary = path.with_name(path.name + TEMPORARY) if temporary is None else temporary
     try:
+        if private:
+            _make_empty(temporary)
         yield temporary
         if durable:
             sync_file(temporary)
@@ -103,9 +107,17 @@ def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -
         sync_folder(path.absolute().parent)
 
 
-def write_file(path: Path, data: bytes) -> None:
+def _make_empty(path: Path) -> None:
+    descriptor = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
+        os.fchmod(descriptor, PRIVATE_FILE)  # a crash may have left the file of another version
+    finally:
+        os.close(descriptor)
+
+
+def write_file(path: Path, data: bytes, private: bool = True) -> None:
     """Put ``data`` at ``path`` whole or not at all, durably; see :func:`replacing`."""
-    with replacing(path) as temporary:
+    with replacing(path, private=private) as temporary:
         temporary.write_bytes(data)
 
 
@@ -178,7 +190,7 @@ class FolderLock:
         Raises:
             DataDirectoryLocked: another process holds it.
         """
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, PRIVATE_FILE)
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

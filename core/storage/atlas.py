@@ -20,6 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
+from core.disk.permissions import PRIVATE_FOLDER
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.maps.archives.reading import Archive
 from core.maps.pagination import Listing, decode_name, one_more, page_of
@@ -75,7 +76,7 @@ class Atlas:
             self._lock = FolderLock(directory / "LOCK")
             try:
                 self._check_format()
-                self._folder.mkdir(exist_ok=True)
+                self._folder.mkdir(PRIVATE_FOLDER, exist_ok=True)
                 sync_folder(directory)
                 self._scan()
             except BaseException:

@@ -41,7 +41,7 @@ RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("
 
 UNPRINTABLE = re.compile(rf"(?![\t\n])[{UNSEEN}\ud800-\udfff\U000e0000-\U000e007f]")
 """Characters that no name may have, but for a tab and the end of a line: with them a text could drive the terminal,
-turn a line around, or hide something.  Surrogates, which a terminal cannot be sent, and invisible tags are among them."""
+turn a line around, or hide something.  Surrogates, which no terminal takes, and invisible tags are among them."""
 
 
 class Failure(Exception):
@@ -185,13 +185,13 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file whole or not at all.
+    """Write a file whole or not at all; the process's umask says for whom it is.
 
     Raises:
         Failure: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, text.encode())
+        write_durably(path, text.encode(), private=False)
     except OSError as error:
         raise Failure(f"{path} cannot be written: {error.strerror}.") from error

@@ -252,11 +252,11 @@ def _remove_strays(folder: Path, index: BackupIndex) -> None:
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
     """The folder for this process alone."""
-    from core.disk.files import FolderLock
+    from core.disk.files import FolderLock, make_folder
     from core.errors import DataDirectoryLocked
 
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         lock = FolderLock(folder / "LOCK")
     except DataDirectoryLocked as error:
         raise Failure(f"Another process is writing to {folder}.") from error

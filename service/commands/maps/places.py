@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from core.disk.permissions import open_private
 from service.commands.connection.client import (
     AsJson,
     CommandTarget,
@@ -140,7 +141,8 @@ def save_thumbnail(
     """Save the picture that the map keeps of a place."""
     picture = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
     try:
-        file.write_bytes(picture)
+        with open(file, "wb", opener=open_private) as opened:
+            opened.write(picture)
     except OSError as error:
         raise Failure(f"{file} cannot be written: {error.strerror}.") from error
 
