@@ -182,28 +182,42 @@ def check_writable(folder: Path) -> None:
 
 
 class FolderLock:
-    """Locks a folder for one process by an advisory lock on a file in it."""
+    """Locks a folder for one process by advisory locks: on a file in it, and on the folder itself.
+
+    The file says to people what it is for, and is what other versions lock.  But it can be deleted, and a new one of
+    its name is not locked; the folder cannot be deleted while there is something in it.  Where a file system locks no
+    folders, the file alone is locked.
+    """
 
     def __init__(self, path: Path) -> None:
         """Take the lock without waiting.
 
         Raises:
             DataDirectoryLocked: another process holds it.
+            OSError: the disk refuses.
         """
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, PRIVATE_FILE)
+        self._descriptors: list[int] = []
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take(path, path.parent, os.O_RDONLY | os.O_DIRECTORY, needed=False)
+            self._take(path, path, os.O_RDWR | os.O_CREAT, needed=True)
+        except BaseException:
+            self.release()
+            raise
+
+    def _take(self, path: Path, locked: Path, flags: int, needed: bool) -> None:
+        descriptor = os.open(locked, flags | os.O_CLOEXEC, PRIVATE_FILE)
+        self._descriptors.append(descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            os.close(self._descriptor)
             raise DataDirectoryLocked(
                 f"Another process holds {path.parent}: stop it first, or use it with --url."
             ) from error
         except OSError:
-            os.close(self._descriptor)
-            raise
+            if needed:
+                raise
 
     def release(self) -> None:
         """Release the lock; releasing it again does nothing."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        while self._descriptors:
+            os.close(self._descriptors.pop())
