@@ -23,6 +23,7 @@ from core.disk.files import Damage, FolderLock, check_writable, disk_errors, mak
 from core.disk.permissions import PRIVATE_FOLDER
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.maps.archives.reading import Archive
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
@@ -212,6 +213,7 @@ class Atlas:
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
         before_listing: Callable[[], None],
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
         try:
@@ -223,6 +225,7 @@ class Atlas:
                     advance=advance,
                     check_picture=check_picture,
                     most_picture_bytes=most_picture_bytes,
+                    check_descriptors=check_descriptors,
                 )
                 before_listing()
         except Damage as damage:
