@@ -18,10 +18,10 @@ from service.access.roles import Principal
 
 LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
-"""What is repeated, as a refusal, is logged once in this time, with the number of repetitions."""
+"""Repeated events, such as refusals, are logged once in this time, with the number of repetitions."""
 
 MOST_KINDS = 1024
-"""Most kinds of refusals, and of views, that are counted apart."""
+"""Most kinds of refusals, and of disclosures, that are counted apart."""
 
 PARTS = {"map": "map", "place": "place", "sequence": "sequence", "camera": "camera", "job": "job"}
 """Parameters of a path that identify the changed object."""
@@ -147,7 +147,7 @@ class Refusals:
         self._repeats.note("refused", kind, fields)
 
 
-class Views:
+class Disclosures:
     """Logs requests that were given pictures of a map, or all of it."""
 
     def __init__(self) -> None:

@@ -25,7 +25,7 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import ASKER, Asker, Refusals, Views, asker_of, note_change
+from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_of, note_change
 from service.access.keyring import Keyring
 from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
@@ -198,7 +198,7 @@ class Access:
         self._endpoints: dict[str, list[Endpoint]] = {}
         for endpoint in endpoints:
             self._endpoints.setdefault(endpoint.method, []).append(endpoint)
-        self._refusals, self._views = Refusals(), Views()
+        self._refusals, self._disclosures = Refusals(), Disclosures()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         kind = scope["type"]
@@ -292,7 +292,7 @@ class Access:
         async def sending(message: Message) -> None:
             begins = message["type"] == "http.response.start" and message["status"] < 300
             if begins and state.get("noted", {}).get("pictures", True):
-                self._views.note(asker, path, message["status"])
+                self._disclosures.note(asker, path, message["status"])
             await send(message)
 
         await self.app(scope, receive, sending)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.access import audit
-from service.access.audit import ASKER, Asker, Refusals, Views, asker_fields, note_change
+from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_fields, note_change
 from service.jobs.jobs import Jobs
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -122,11 +122,11 @@ def test_who_saw_pictures_is_known(server: Server) -> None:
 
 
 def test_views_are_counted_by_key_and_map(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    views = Views()
+    disclosures = Disclosures()
     for map_id in ("lab", "lab", "hall", "lab"):
-        views.note(EVE, {"map": map_id}, 206)
+        disclosures.note(EVE, {"map": map_id}, 206)
     monkeypatch.setattr(audit, "REPEAT_SECONDS", 0.0)
-    views.note(EVE, {"map": "lab"}, 206)
+    disclosures.note(EVE, {"map": "lab"}, 206)
     assert [(record.__dict__["map"], record.__dict__.get("before")) for record in caplog.records] == [
         ("lab", None),
         ("hall", None),
