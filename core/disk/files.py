@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from core.disk.permissions import PRIVATE_FILE, PRIVATE_FOLDER, open_private
 from core.errors import DataDirectoryLocked, PlacerecError, StorageFailure, StorageFull
 
 DISK_IS_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -51,10 +52,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its missing parents, and sync the name of each folder made."""
+    """Make a folder and its missing parents for this user alone, and sync the name of each folder made."""
     if not folder.is_dir():
         make_folder(folder.absolute().parent)
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(PRIVATE_FOLDER, exist_ok=True)
         sync_folder(folder.absolute().parent)
 
 
@@ -76,7 +77,7 @@ def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
 
 
 @contextmanager
-def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -> Iterator[Path]:
+def replacing(path: Path, temporary: Path | None = None, durable: bool = True, private: bool = True) -> Iterator[Path]:
     """Replace the file at ``path`` whole or not at all.
 
     The block writes a file at the temporary path that it is given.  When the block ends, that file is synced, renamed
@@ -85,12 +86,15 @@ def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -
     Args:
         temporary: where to write; by default ``path`` with the suffix ``.tmp``.
         durable: sync the file and the folder.  A file that can be made again needs no sync.
+        private: make the file for this user alone; else the process's umask says for whom it is.
 
     Raises:
         OSError: the disk refuses.
     """
     temporary = path.with_name(path.name + TEMPORARY) if temporary is None else temporary
     try:
+        if private:
+            _make_empty(temporary)
         yield temporary
         if durable:
             sync_file(temporary)
@@ -103,9 +107,17 @@ def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -
         sync_folder(path.absolute().parent)
 
 
-def write_file(path: Path, data: bytes) -> None:
+def _make_empty(path: Path) -> None:
+    descriptor = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
+        os.fchmod(descriptor, PRIVATE_FILE)  # a crash may have left the file of another version
+    finally:
+        os.close(descriptor)
+
+
+def write_file(path: Path, data: bytes, private: bool = True) -> None:
     """Put ``data`` at ``path`` whole or not at all, durably; see :func:`replacing`."""
-    with replacing(path) as temporary:
+    with replacing(path, private=private) as temporary:
         temporary.write_bytes(data)
 
 
@@ -170,28 +182,42 @@ def check_writable(folder: Path) -> None:
 
 
 class FolderLock:
-    """Locks a folder for one process by an advisory lock on a file in it."""
+    """Locks a folder for one process by advisory locks: on a file in it, and on the folder itself.
+
+    The file says to people what it is for, and is what other versions lock.  But it can be deleted, and a new one of
+    its name is not locked; the folder cannot be deleted while there is something in it.  Where a file system locks no
+    folders, the file alone is locked.
+    """
 
     def __init__(self, path: Path) -> None:
         """Take the lock without waiting.
 
         Raises:
             DataDirectoryLocked: another process holds it.
+            OSError: the disk refuses.
         """
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        self._descriptors: list[int] = []
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take(path, path.parent, os.O_RDONLY | os.O_DIRECTORY, needed=False)
+            self._take(path, path, os.O_RDWR | os.O_CREAT, needed=True)
+        except BaseException:
+            self.release()
+            raise
+
+    def _take(self, path: Path, locked: Path, flags: int, needed: bool) -> None:
+        descriptor = os.open(locked, flags | os.O_CLOEXEC, PRIVATE_FILE)
+        self._descriptors.append(descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            os.close(self._descriptor)
             raise DataDirectoryLocked(
                 f"Another process holds {path.parent}: stop it first, or use it with --url."
             ) from error
         except OSError:
-            os.close(self._descriptor)
-            raise
+            if needed:
+                raise
 
     def release(self) -> None:
         """Release the lock; releasing it again does nothing."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        while self._descriptors:
+            os.close(self._descriptors.pop())

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from core.disk.files import Damage
+from core.disk.permissions import make_private
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 
 log = logging.getLogger(__name__)
@@ -61,7 +62,10 @@ def connect(
 
     Raises:
         sqlite3.Error: the file is missing (unless ``mode`` is ``rwc``) or cannot be read.
+        OSError: a new file cannot be made.
     """
+    if mode == "rwc":
+        make_private(path)  # SQLite gives its logs the same permissions
     address = f"{path.absolute().as_uri()}?mode={mode}"
     connection = sqlite3.connect(address, uri=True, timeout=timeout, isolation_level=None, check_same_thread=False)
     try:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import NDArray
 
 from core.errors import NoRegions
 from core.maps.records import Enrolment, Keep
@@ -10,6 +13,14 @@ from core.places import check_place_id
 
 LARGEST_HALF = 65504.0
 """The largest number in half precision."""
+
+CheckDescriptors = Callable[[NDArray[np.float32]], NDArray[np.bool_]]
+"""Says which of some descriptors, float32 [n, D], an encoder can have given: bool [n]."""
+
+
+def any_descriptors(descriptors: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """All descriptors, float32 [n, D], taken as they are: bool [n]."""
+    return np.ones(len(descriptors), np.bool_)
 
 
 def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:

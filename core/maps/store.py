@@ -21,6 +21,7 @@ from core.maps.archives.reading import Archive
 from core.maps.archives.writing import Advance, Expect, Exported
 from core.maps.cameras import Cameras
 from core.maps.counterparts import Counterparts
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
@@ -435,6 +436,7 @@ class Store(Protocol):
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
         before_listing: Callable[[], None],
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file; it is listed, and durable, when this returns, and not before.
 
@@ -444,6 +446,7 @@ class Store(Protocol):
             check_picture: raises InvalidImage for bytes that must not be shown as a picture.
             most_picture_bytes: a larger picture is refused before it is read.
             before_listing: called when the map is complete; its exceptions end the work.
+            check_descriptors: says which descriptors the map's encoder can have given.
 
         Raises:
             InvalidArchive: the file is damaged, or its content is not valid for a map.

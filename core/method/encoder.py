@@ -21,7 +21,7 @@ from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of, projection_tensors
 from core.method.projection import Projection
 from core.method.regions import Regions
-from core.method.vlad import aggregate, scores
+from core.method.vlad import aggregate, are_normalized, scores
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
 from core.networks.forward import Device, Precision, has_bfloat16
@@ -49,6 +49,15 @@ class EncoderDefinition(FeatureDefinition):
         """The layers that the backbone must return: those whose regions are fused, then those of the second stage."""
         further = () if self.agreement is None else self.agreement.layers
         return self.layers + tuple(layer for layer in further if layer not in self.layers)
+
+    @property
+    def descriptor_normalization(self) -> Normalization:
+        """The normalization of the descriptors that are stored and compared."""
+        return self.normalization if self.whitening is None else "global"
+
+    def could_give(self, descriptors: Array, tolerance: float) -> NDArray[np.bool_]:
+        """Which descriptors, float32 [n, D], have the length of those that such an encoder gives (:mod:`vlad`)."""
+        return are_normalized(descriptors, self.words, self.descriptor_normalization, tolerance)
 
     def projected(self) -> dict[str, int]:
         """How many values of each layer's projection are in use."""
@@ -231,8 +240,7 @@ class Encoder:
     def scores_from_inner_products(self, inner_products: Array) -> Array:
         """Scores from inner products of descriptors, float32 of any shape, of places that the second stage has not
         examined."""
-        normalization = self.definition.normalization if self.whitening is None else "global"
-        first = scores(inner_products, self.definition.words, normalization)
+        first = scores(inner_products, self.definition.words, self.definition.descriptor_normalization)
         stage = self.definition.agreement
         return first if stage is None else first * np.float32(1 - stage.share)
 

@@ -42,3 +42,22 @@ def scores(inner_products: Array, words: int, normalization: Normalization) -> A
         words: V.
     """
     return inner_products / np.float32(words) if normalization == "intra" else inner_products
+
+
+def are_normalized(descriptors: Array, words: int, normalization: Normalization, tolerance: float) -> NDArray[np.bool_]:
+    """Which flattened VLADs have the length that :func:`aggregate` gives them; bool [n].
+
+    Any other length would make a place more or less like every frame than its cosine says.
+
+    Args:
+        descriptors: float32 [n, D]; with ``intra``, D is a multiple of V.
+        words: V.
+        tolerance: by how much a length may differ from 1, since stored values are rounded.
+    """
+    parts = words if normalization == "intra" else 1
+    vectors = descriptors.reshape(len(descriptors), parts, -1)
+    lengths = np.sqrt(np.einsum("nvk,nvk->nv", vectors, vectors, dtype=np.float64))
+    fits = np.abs(lengths - 1) <= tolerance
+    if normalization == "intra":
+        fits |= lengths == 0  # no feature of the frame belongs to the word
+    return np.asarray(fits.all(axis=1) & (lengths > 0).any(axis=1))

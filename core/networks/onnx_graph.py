@@ -10,10 +10,11 @@ import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
-from onnx import GraphProto, ModelProto, NodeProto, TensorProto
+from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto
 
 from core.errors import InvalidModel
 from core.networks.description import NetworkDescription
+from core.networks.operators import check_operator, check_shapes
 
 MAX_NODES = 100_000
 MAX_VALUES = 2**17
@@ -22,10 +23,6 @@ MAX_VALUES = 2**17
 MAX_CELLS = 2**14
 
 _DOMAINS = ("", "ai.onnx")
-_UNBOUNDED = {"Loop", "Scan"}
-_CHANCE = {
-    "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike",
-}  # fmt: skip
 
 
 def read_graph(data: bytes) -> ModelProto:
@@ -45,24 +42,24 @@ def read_graph(data: bytes) -> ModelProto:
 
 
 def check_graph(model: ModelProto) -> None:
-    """Check that a graph only computes: by the standard's operators, on its input and on weights that it holds.
+    """Check that a graph only computes: by the standard's operators, on its input and on weights that it holds, and in
+    as much memory for one frame as for any other (:mod:`core.networks.operators`).
 
     Raises:
         InvalidModel: it does not; the text says why.
     """
     if model.functions:
         raise InvalidModel(f"It defines operators of its own ({model.functions[0].name[:60]}); export it without.")
-    count = 0
-    for graph in _graphs(model.graph):
-        count += len(graph.node)
-        if count > MAX_NODES:
-            raise InvalidModel(f"It has more than {MAX_NODES} operators.")
-        if graph.sparse_initializer:
-            raise InvalidModel("It has sparse weights, which are not read.")
-        for node in graph.node:
-            _check_node(node)
-        for tensor in _tensors(graph):
-            _check_tensor(tensor)
+    graph = model.graph
+    if len(graph.node) > MAX_NODES:
+        raise InvalidModel(f"It has more than {MAX_NODES} operators.")
+    if graph.sparse_initializer or any(attribute.HasField("sparse_tensor") for attribute in _attributes(graph)):
+        raise InvalidModel("It has sparse weights, which are not read.")
+    for node in graph.node:
+        _check_node(node)
+    for tensor in _tensors(graph):
+        _check_tensor(tensor)
+    check_shapes(graph)
 
 
 def _check_node(node: NodeProto) -> None:
@@ -70,11 +67,7 @@ def _check_node(node: NodeProto) -> None:
         raise InvalidModel(
             f"It needs the operator {node.domain[:60]}.{node.op_type[:60]}, which is not of the standard."
         )
-    if node.op_type in _UNBOUNDED:
-        raise InvalidModel(f"It has a {node.op_type}, whose end cannot be foreseen; export it unrolled.")
-    training = any(attribute.name == "training_mode" and attribute.i for attribute in node.attribute)
-    if node.op_type in _CHANCE or training:
-        raise InvalidModel(f"It has a {node.op_type} that gives other values each time; export it for evaluation.")
+    check_operator(node)
 
 
 def _check_tensor(tensor: TensorProto) -> None:
@@ -98,23 +91,15 @@ def bytes_of(tensor: TensorProto) -> int:
     return (count + 1) // 2 if four_bits else count * width
 
 
-def _graphs(root: GraphProto) -> Iterator[GraphProto]:
-    """A graph and those within its operators, such as the branches of an If."""
-    waiting = [root]
-    while waiting:
-        graph = waiting.pop()
-        yield graph
-        for node in graph.node:
-            for attribute in node.attribute:
-                waiting += [*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs]
+def _attributes(graph: GraphProto) -> Iterator[AttributeProto]:
+    return (attribute for node in graph.node for attribute in node.attribute)
 
 
 def _tensors(graph: GraphProto) -> Iterator[TensorProto]:
     yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            yield from [attribute.t] if attribute.HasField("t") else []
-            yield from attribute.tensors
+    for attribute in _attributes(graph):
+        yield from [attribute.t] if attribute.HasField("t") else []
+        yield from attribute.tensors
 
 
 def graph_input(model: ModelProto, description: NetworkDescription) -> str:

@@ -18,6 +18,7 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
 from core.ledger.postgres import LONG_SECONDS, PostgresLedger
 from core.maps.archives.reading import Archive
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
@@ -131,6 +132,7 @@ class PostgresStore(ABC, Generic[MapT]):
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
         before_listing: Callable[[], None],
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
         check_map_id(map_id)
@@ -144,7 +146,7 @@ class PostgresStore(ABC, Generic[MapT]):
         try:
             writing = self._map(map_id, number).writing
             layout = layout_of(archive.manifest)
-            Importing(archive, layout, advance, check_picture, most_picture_bytes, writing).fill()
+            Importing(archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors).fill()
             before_listing()
             with self.database.transaction(f"import map {map_id!r}", Lock.MAPS) as connection:
                 record.publish(connection, number, map_id)

@@ -20,8 +20,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
+from core.disk.permissions import PRIVATE_FOLDER
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.maps.archives.reading import Archive
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
@@ -75,7 +77,7 @@ class Atlas:
             self._lock = FolderLock(directory / "LOCK")
             try:
                 self._check_format()
-                self._folder.mkdir(exist_ok=True)
+                self._folder.mkdir(PRIVATE_FOLDER, exist_ok=True)
                 sync_folder(directory)
                 self._scan()
             except BaseException:
@@ -211,6 +213,7 @@ class Atlas:
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
         before_listing: Callable[[], None],
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
         try:
@@ -222,6 +225,7 @@ class Atlas:
                     advance=advance,
                     check_picture=check_picture,
                     most_picture_bytes=most_picture_bytes,
+                    check_descriptors=check_descriptors,
                 )
                 before_listing()
         except Damage as damage:

@@ -98,7 +98,7 @@ class Map(LedgerMap):
         self._keypoints_of: tuple[object, KeypointsStatus | None] = (None, None)  # in a state of the database
         self.indexer: Indexer | None = None
         super().__init__()
-        self.review = ReviewFrames(folder / REVIEW_FILE, self._expect_open)
+        self.review = ReviewFrames(folder / REVIEW_FILE, record.id, self._expect_open)
         self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
@@ -350,4 +350,4 @@ class Map(LedgerMap):
                 snapshot = self.snapshot()
                 connection = stack.enter_context(self._reading())
                 read_now(connection)
-            return inspect(self._folder, connection, snapshot, progress)
+            return inspect(self._folder, connection, snapshot, self.review, progress)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
+from core.disk.permissions import PRIVATE_FOLDER
 from core.disk.sqlite_file import transaction
 from core.errors import UnknownMap
 from core.index import CodeTable
@@ -88,7 +89,7 @@ def create_folder(folder: Path, record: MapRecord, rows: int) -> None:
     Raises:
         OSError, sqlite3.Error: the disk refuses.
     """
-    folder.mkdir()
+    folder.mkdir(PRIVATE_FOLDER)
     connection = connect(folder / FILE, create=True)
     try:
         prepare(connection, create=True)

@@ -25,7 +25,9 @@ from core.storage.database.segments import SegmentEntry, segment_entries
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.segment_files import Layout
-from core.storage.opening import read_layout
+from core.storage.opening import UNLISTED, read_layout
+from core.storage.review import FILE as REVIEW_FILE
+from core.storage.review import ReviewFrames
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.segment import Segment
 from core.storage.search.snapshot import Snapshot
@@ -83,7 +85,9 @@ def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyRepo
         connection = connect(folder / FILE) if is_log_sound else connect_without_log(folder / FILE)
         try:
             check_schema(connection)
-            report = inspect(folder, connection_of(connection), None, progress)
+            map_id = folder.name.removeprefix(UNLISTED)
+            review = ReviewFrames(folder / REVIEW_FILE, map_id, lambda: None)
+            report = inspect(folder, connection_of(connection), None, review, progress)
             return report.model_copy(
                 update={"ok": report.ok and not findings.problems, "problems": findings.problems + report.problems}
             )
@@ -93,17 +97,22 @@ def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyRepo
 
 
 def inspect(
-    folder: Path, connection: MapConnection, snapshot: Snapshot | None, progress: Progress = no_progress
+    folder: Path,
+    connection: MapConnection,
+    snapshot: Snapshot | None,
+    review: ReviewFrames,
+    progress: Progress = no_progress,
 ) -> VerifyReport:
     """Check a map's files against each other and, if the map is in service, against its snapshot.
 
     This checks SQLite's integrity, the checksums of rows, descriptors and keypoints, the rows that places refer to, the
-    digests of pictures and the index files, and that the snapshot is what is stored.
+    digests of pictures, the frames for review and the index files, and that the snapshot is what is stored.
 
     Args:
         connection: in a transaction of the moment of the snapshot.  The transaction is ended before descriptors are
             read, which takes long, because SQLite cannot empty its log while it lasts.
         snapshot: also keeps the files of its descriptors from being deleted; None for a map that is out of service.
+        review: the frames that the map stores for review.
         progress: is called while descriptors are read.
     """
     findings = _Findings(progress)
@@ -139,6 +148,9 @@ def inspect(
             checked, stale = IndexFiles(folder, layout).check(segments) if snapshot.table is not None else (0, [])
             findings.checked_bytes += checked
             findings.stale_caches += stale
+    problems, size = review.check()
+    findings.problems += problems
+    findings.checked_bytes += size
     return findings.report()
 
 

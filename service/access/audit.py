@@ -1,4 +1,4 @@
-"""The audit trail: a line for each change of a map, with the name of the key that made it.
+"""The audit trail: a line for each change of a map, and for who saw its pictures, with the name of the key.
 
 The lines go to the logger ``placerec.audit``, whatever level the other logs have, and are stored by
 ``service.administration.audit_trail``.  No line contains a key, a frame, or metadata.
@@ -18,10 +18,10 @@ from service.access.roles import Principal
 
 LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
-"""A repeated refusal is logged once in this time, with the number of repetitions."""
+"""Repeated events, such as refusals, are logged once in this time, with the number of repetitions."""
 
-MOST_REFUSALS = 1024
-"""Most kinds of refusals that are counted apart."""
+MOST_KINDS = 1024
+"""Most kinds of refusals, and of disclosures, that are counted apart."""
 
 PARTS = {"map": "map", "place": "place", "sequence": "sequence", "camera": "camera", "job": "job"}
 """Parameters of a path that identify the changed object."""
@@ -113,15 +113,14 @@ def now_asking() -> dict[str, Any]:
     return asker_fields(ASKER.get())
 
 
-class Refusals:
-    """Logs requests that were refused; repeated ones only now and then, so that they do not fill the disk."""
+class Repeats:
+    """Logs what may be repeated often: only now and then, so that it does not fill the disk."""
 
     def __init__(self) -> None:
         self._logged: OrderedDict[tuple[str | None, ...], tuple[float, int]] = OrderedDict()
 
-    def note(self, asker: Asker, path: Mapping[str, str], status: int, problem: str) -> None:
-        """Note that a request was refused."""
-        kind = (asker.client, asker.key, asker.operation, problem)
+    def note(self, event: str, kind: tuple[str | None, ...], fields: Mapping[str, Any]) -> None:
+        """Note an event; it is not logged if one of its kind was logged a moment ago."""
         now = time.monotonic()
         logged_at, silent = self._logged.get(kind, (-REPEAT_SECONDS, 0))
         if now - logged_at < REPEAT_SECONDS:
@@ -129,8 +128,33 @@ class Refusals:
             return
         self._logged[kind] = (now, 0)
         self._logged.move_to_end(kind)
-        if len(self._logged) > MOST_REFUSALS:
+        if len(self._logged) > MOST_KINDS:
             self._logged.popitem(last=False)
+        log.info(event, extra={**fields, **({"before": silent} if silent else {})})
+
+
+class Refusals:
+    """Logs requests that were refused."""
+
+    def __init__(self) -> None:
+        self._repeats = Repeats()
+
+    def note(self, asker: Asker, path: Mapping[str, str], status: int, problem: str) -> None:
+        """Note that a request was refused."""
+        kind = (asker.client, asker.key, asker.operation, problem)
         named = {name: path[name] for name in PARTS if name in path}
-        repeated = {"before": silent} if silent else {}
-        log.info("refused", extra={**named, **asker_fields(asker), "status": status, "problem": problem, **repeated})
+        fields = {**named, **asker_fields(asker), "status": status, "problem": problem}
+        self._repeats.note("refused", kind, fields)
+
+
+class Disclosures:
+    """Logs requests that were given pictures of a map, or all of it."""
+
+    def __init__(self) -> None:
+        self._repeats = Repeats()
+
+    def note(self, asker: Asker, path: Mapping[str, str], status: int) -> None:
+        """Note that a request is answered with them."""
+        kind = (asker.client, asker.key, asker.operation, path.get("map"))
+        named = {name: path[name] for name in PARTS if name in path}
+        self._repeats.note("shown", kind, {**named, **asker_fields(asker), "status": status})

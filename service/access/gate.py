@@ -25,7 +25,7 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import ASKER, Asker, Refusals, asker_of, note_change
+from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_of, note_change
 from service.access.keyring import Keyring
 from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
@@ -198,7 +198,7 @@ class Access:
         self._endpoints: dict[str, list[Endpoint]] = {}
         for endpoint in endpoints:
             self._endpoints.setdefault(endpoint.method, []).append(endpoint)
-        self._refusals = Refusals()
+        self._refusals, self._disclosures = Refusals(), Disclosures()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         kind = scope["type"]
@@ -219,6 +219,8 @@ class Access:
         ASKER.set(asker)  # also for requests that change nothing: they may start jobs
         if endpoint is not None and endpoint.rule.changes:
             await self._change(scope, receive, send, asker, path)
+        elif endpoint is not None and endpoint.rule.shows:
+            await self._show(scope, receive, send, asker, path)
         else:
             await self.app(scope, receive, send)
 
@@ -282,6 +284,18 @@ class Access:
             raise
         finally:
             note_change(asker, path, state.get("noted", {}), status)
+
+    async def _show(self, scope: Scope, receive: Receive, send: Send, asker: Asker, path: Mapping[str, str]) -> None:
+        """Pass on a request for pictures, and write it to the audit trail when it is answered with some."""
+        state = scope["state"]
+
+        async def sending(message: Message) -> None:
+            begins = message["type"] == "http.response.start" and message["status"] < 300
+            if begins and state.get("noted", {}).get("pictures", True):
+                self._disclosures.note(asker, path, message["status"])
+            await send(message)
+
+        await self.app(scope, receive, sending)
 
     async def _refuse(
         self,

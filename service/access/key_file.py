@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from core.disk.files import Damage, sync_folder
+from core.disk.files import Damage, make_folder, sync_folder
 from core.disk.sqlite_file import NotOurs, SqliteFile, UnreadVersion, transaction
 from core.ledger import LedgerConnection, Statement
 from core.ledger.sqlite import SqliteConnection, file_of
@@ -25,7 +25,6 @@ from service.access.key_table import TABLES
 from service.errors.faults import KeysUnreadable
 
 FILE = "keys.sqlite"
-MODE = 0o600
 BUSY_SECONDS = 5.0
 
 DURABLE = {"synchronous": "EXTRA"}
@@ -64,9 +63,8 @@ class KeyFile:
         """Make the file whole or not at all: one without its tables would count as damaged."""
         temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
         with self._refusals():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
             try:
-                os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
                 _file(temporary).open().close()
                 with suppress(FileExistsError):  # another process was quicker
                     os.link(temporary, self.path)

@@ -27,7 +27,7 @@ from core.names import word
 from core.places import check_map_id
 from service.access.key_file import KeyFile
 from service.access.key_table import KEYS, KeyPlace, KeyTable
-from service.access.roles import LEVELS, Role
+from service.access.roles import ANONYMOUS, LEVELS, NOBODY, OWNER, Role
 from service.errors.faults import (
     InvalidRequest,
     KeyEnded,
@@ -41,7 +41,9 @@ from service.errors.faults import (
 
 ID = re.compile(r"[0-9a-f]{12}")
 NAME = re.compile(word(64, more="@"))
-RESERVED = frozenset({"anonymous", "owner"})
+RESERVED = frozenset({ANONYMOUS.name, OWNER.name, NOBODY.name})
+"""Names under which the audit trail has requests without a key, in small letters."""
+
 SECRET_BYTES = 32
 
 KeyState = Literal["in force", "revoked", "expired"]
@@ -163,7 +165,7 @@ class Keys:
             InvalidIdentifier: the id of a map is not valid.
             TooManyKeys, LastAdminKey.
         """
-        if not NAME.fullmatch(name) or ID.fullmatch(name) or name in RESERVED:
+        if not NAME.fullmatch(name) or ID.fullmatch(name) or name.lower() in RESERVED:
             raise InvalidRequest(
                 f"A key cannot have the name {name[:80]!r}. Use at most 64 letters, digits and . _ @ -."
             )

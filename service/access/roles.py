@@ -88,11 +88,13 @@ class Rule:
         role: the lowest role that may call it.
         maps: how it treats a key that is limited to some maps.
         changes: whether it changes a map, or starts a job that does; each call is then written to the audit trail.
+        shows: whether it gives out pictures of a map, or all of it; that is written to the audit trail, too.
     """
 
     role: Role
     maps: MapScope
     changes: bool = False
+    shows: bool = False
 
 
 OPERATIONS: dict[str, Rule] = {
@@ -123,7 +125,7 @@ OPERATIONS: dict[str, Rule] = {
     "create_map": Rule("admin", "named", changes=True),
     "edit_map": Rule("admin", "path", changes=True),
     "delete_map": Rule("admin", "path", changes=True),
-    "follow_map": Rule("query", "path"),  # pictures need the role enrol, which also sees the callers
+    "follow_map": Rule("query", "path", shows=True),  # pictures need the role enrol, which also sees the callers
     "verify_map": Rule("admin", "path"),  # it reads all that is stored, which keeps the disk busy
     # Places, traverses, cameras: the objects that an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
@@ -133,7 +135,7 @@ OPERATIONS: dict[str, Rule] = {
     "delete_places": Rule("enrol", "path", changes=True),
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
-    "see_thumbnail": Rule("query", "path"),
+    "see_thumbnail": Rule("query", "path", shows=True),
     "read_plan": Rule("query", "path"),
     "list_sequences": Rule("query", "path"),
     "delete_sequence": Rule("enrol", "path", changes=True),
@@ -148,11 +150,11 @@ OPERATIONS: dict[str, Rule] = {
     "query_or_enrol": Rule("enrol", "path", changes=True),
     "list_answers": Rule("query", "path"),
     "list_place_matches": Rule("query", "path"),
-    "see_explanation": Rule("query", "path"),
+    "see_explanation": Rule("query", "path", shows=True),
     # Review: its frames are what robots saw, and labels change how the map is calibrated
     "list_review": Rule("enrol", "path"),
-    "see_review_picture": Rule("enrol", "path"),
-    "export_labels": Rule("enrol", "path"),
+    "see_review_picture": Rule("enrol", "path", shows=True),
+    "export_labels": Rule("enrol", "path", shows=True),
     "label_frame": Rule("enrol", "path", changes=True),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
@@ -169,7 +171,7 @@ OPERATIONS: dict[str, Rule] = {
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),
-    "export_map": Rule("admin", "path"),  # it reads all of a map, with its pictures
+    "export_map": Rule("admin", "path", shows=True),  # it reads all of a map, with its pictures
     "import_map": Rule("admin", "named", changes=True),
     "rebuild_map": Rule("admin", "path", changes=True),
     "fill_keypoints": Rule("admin", "path", changes=True),

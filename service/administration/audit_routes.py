@@ -1,4 +1,4 @@
-"""The route of the audit trail: who changed what, and who was refused."""
+"""The route of the audit trail: who changed what, who saw pictures, and who was refused."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class AuditEntry(BaseModel):
     model_config = ConfigDict(extra="allow", json_schema_extra={"examples": [AUDIT_EXAMPLE]})
 
     time: str = Field(description="When the line was written (ISO 8601 in UTC).")
-    event: str = Field(description="`change`, `refused`, or `job` with the state that it has reached.")
+    event: str = Field(description="`change`, `shown`, `refused`, or `job` with the state that it has reached.")
     operation: str | None = Field(description="The operation that was called.")
     status: int | None = Field(description="Of the answer; 0: none was sent. Null for the line of a job.")
     principal: str | None = Field(description="The name of the caller's key.")
@@ -102,7 +102,7 @@ def read_audit(
     options: Annotated[AuditParameters, Query()],
     trail: Annotated[AuditTrail, Depends(FromState("audit_trail"))],
 ) -> AuditPage:
-    """Read the audit trail from its latest line: who changed what, and who was refused.
+    """Read the audit trail from its latest line: who changed what, who saw pictures, and who was refused.
 
     Parts of the file that were moved away are read, too, unless they are compressed. A request reads a bounded part of
     the trail, so a page can be shorter than its limit: go on while there is a `next_cursor`.

@@ -13,12 +13,14 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from io import TextIOWrapper
 from logging.handlers import WatchedFileHandler
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
 
 from sqlalchemy import Column, MetaData, Table, bindparam, select
 
+from core.disk.permissions import open_private
 from core.errors import StorageFailure, StorageFull
 from core.ledger import Ledger, Statement, Tables
 from core.ledger.statements import integer, text
@@ -115,6 +117,10 @@ class AuditFile(WatchedFileHandler):
             super().__init__(path, encoding="utf-8")
         except OSError as error:
             raise StorageFailure(f"The audit file {path} cannot be opened: {error.strerror}.") from error
+
+    def _open(self) -> TextIOWrapper:
+        """The file, which is made for this user alone if it is missing."""
+        return open(self.baseFilename, "a", encoding=self.encoding, opener=open_private)
 
     def lines(self, before: Position | None) -> Iterator[AuditLine]:
         return lines_of_files(self.path, before)

@@ -15,7 +15,6 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
-    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -40,9 +39,9 @@ RENAMED = {("places", "forget"): "delete", ("sequences", "forget"): "delete", ("
 """Commands by their group and the names that they had once."""
 
 
-UNPRINTABLE = re.compile(rf"(?![\t\n])[{UNSEEN}]")
+UNPRINTABLE = re.compile(rf"(?![\t\n])[{UNSEEN}\ud800-\udfff\U000e0000-\U000e007f]")
 """Characters that no name may have, but for a tab and the end of a line: with them a text could drive the terminal,
-turn a line around, or hide something."""
+turn a line around, or hide something.  Surrogates, which no terminal takes, and invisible tags are among them."""
 
 
 class Failure(Exception):
@@ -73,7 +72,12 @@ class Commands(TyperGroup):
 
 def printable(text: str) -> str:
     """A text with its unprintable characters as JSON writes them (``\\u001b``), for it may come from anybody."""
-    return UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return UNPRINTABLE.sub(_escaped, text)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    units = found[0].encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
 
 
 def say(sentence: str) -> None:
@@ -99,10 +103,17 @@ class Rate(ProgressColumn):
         return Text("" if speed is None else f"{speed:.1f}/s")
 
 
+class Title(ProgressColumn):
+    """The column of a progress bar that shows what is done, which may contain the name of a map or of a file."""
+
+    def render(self, task: Task) -> Text:
+        return Text(printable(task.description))
+
+
 def progress() -> Progress:
     """A progress bar on standard error; if that is no terminal, only the last state is written."""
     return Progress(
-        TextColumn("{task.description}", markup=False),
+        Title(),
         BarColumn(),
         MofNCompleteColumn(),
         Rate(),
@@ -139,7 +150,8 @@ def table(*columns: str, title: str | None = None) -> Table:
         header_style="bold",
     )
     for column in columns:
-        made.add_column(column.removeprefix("#"), justify="right" if column.startswith("#") else "left")
+        heading = Text(printable(column.removeprefix("#")))
+        made.add_column(heading, justify="right" if column.startswith("#") else "left")
     return made
 
 
@@ -173,13 +185,13 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file whole or not at all.
+    """Write a file whole or not at all; the process's umask says for whom it is.
 
     Raises:
         Failure: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, text.encode())
+        write_durably(path, text.encode(), private=False)
     except OSError as error:
         raise Failure(f"{path} cannot be written: {error.strerror}.") from error

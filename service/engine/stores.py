@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Protocol
 
 from core.disk.files import FolderLock, disk_errors, make_folder
+from core.disk.permissions import close_to_others
 from core.maps import Store
 from core.milvus import open_store
 from core.postgres import Bucket, open_database
 from core.storage import Atlas
+from service.access import key_file
 from service.settings import Settings
 
 
@@ -20,7 +22,7 @@ class SweptStore(Store, Protocol):
 
 
 class OpenStore:
-    """The store of a service, and the lock on its data directory; close it at the end.
+    """The store of a service, and the lock on its data directory, which is closed to others; close it at the end.
 
     Servers are not waited for: without one that can be reached the service starts and is not ready.
 
@@ -32,11 +34,13 @@ class OpenStore:
     def __init__(self, settings: Settings) -> None:
         self.maps: Store
         self._lock: FolderLock | None = None
+        with disk_errors(f"open the data directory {settings.data_dir}"):
+            make_folder(settings.data_dir)
+            close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
         if settings.engine == "files":
             self.maps = Atlas(settings.data_dir)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
-            make_folder(settings.data_dir)
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
             store = _store(settings)

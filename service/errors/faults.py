@@ -234,6 +234,10 @@ class MalformedHead(Fault):
         self.headers = headers or {}
 
 
+class UnknownTransferCoding(Fault):
+    """The body is sent in a transfer coding that is not known."""
+
+
 class HeadTooSlow(Fault):
     """The head of the request did not arrive in time."""
 

@@ -169,6 +169,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.HeadTooSlow: Kind(408, "head-too-slow", "The request did not arrive in time"),
     faults.UrlTooLong: Kind(414, "url-too-long", "The path and the query string are too long"),
     faults.HeadTooLarge: Kind(431, "head-too-large", "The headers are too many or too long"),
+    faults.UnknownTransferCoding: Kind(501, "unknown-transfer-coding", "The transfer coding is not known"),
     # Limits of the installation
     faults.TooManyMaps: Kind(409, "too-many-maps", "No more maps can be created"),
     faults.TooManyPlaces: Kind(409, "too-many-places", "The map can hold no more places"),

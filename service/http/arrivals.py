@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from core.disk.files import disk_errors, sync_folder
+from core.disk.permissions import PRIVATE_FOLDER
 from service.worker_threads import to_its_end
 
 
@@ -42,11 +43,11 @@ class Arrival:
             StorageFull, StorageFailure: the disk refuses.
         """
         with disk_errors(self._action):
-            self.temporary.parent.mkdir(parents=True, exist_ok=True)
+            self.temporary.parent.mkdir(PRIVATE_FOLDER, parents=True, exist_ok=True)
             check_room()
             path = self.temporary
             if self._inside is not None:
-                path.mkdir()
+                path.mkdir(PRIVATE_FOLDER)
                 path = path / self._inside
             self.file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 

@@ -5,13 +5,22 @@ from __future__ import annotations
 import asyncio
 import http
 import logging
+import re
 import secrets
 import sys
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from service.errors.faults import Fault, HeadTooLarge, HeadTooSlow, MalformedHead, TooManyConnections, UrlTooLong
+from service.errors.faults import (
+    Fault,
+    HeadTooLarge,
+    HeadTooSlow,
+    MalformedHead,
+    TooManyConnections,
+    UnknownTransferCoding,
+    UrlTooLong,
+)
 from service.errors.problems import MEDIA_TYPE, RETRY_LATER, declared, problem_of, retry_after
 from service.http.connections import LEAST_PROGRESS, Connections, untaken
 from service.http.websocket_connection import WebSocketConnection, handshake_fault
@@ -25,6 +34,9 @@ LAST_SECONDS = 0.25
 
 FIELD_EXTRA = 4
 """Bytes of a header line besides its name and value: the colon, the space, the end of the line."""
+
+HOST = re.compile(rb"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._~!$&'()*+,;=%-]*)(:[0-9]*)?")
+"""A Host header: an IPv6 address in brackets, or any other host, and a port."""
 
 log = logging.getLogger("placerec.connections")
 
@@ -155,6 +167,8 @@ class HttpConnection(HttpToolsProtocol):
         if self._fields_size > settings.max_header_bytes:
             self._refuse(HeadTooLarge(f"The headers have more than {settings.max_header_bytes} bytes."))
         if self._in_head:  # the trailers of a body are ignored
+            if name.lower() == b"transfer-encoding":
+                self._check_codings(value)
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -172,6 +186,7 @@ class HttpConnection(HttpToolsProtocol):
             self._connections.ended("pipelining")
             self._stop_listening()
             raise _Refused
+        self._check_host()
         if self.parser.should_upgrade() and self._should_upgrade():
             self._check_handshake()
         super().on_headers_complete()
@@ -207,6 +222,21 @@ class HttpConnection(HttpToolsProtocol):
         elif self._head_timer is None:
             # The rest of a refused body is discarded, but not for ever.
             self._head_timer = self.loop.call_later(self._settings.read_timeout, self._head_too_slow)
+
+    def _check_codings(self, codings: bytes) -> None:
+        if unknown := {coding.strip().lower() for coding in codings.split(b",")} - {b"chunked"}:
+            named = ", ".join(sorted(repr(one[:40].decode("latin-1")) for one in unknown))
+            self._refuse(UnknownTransferCoding(f"The transfer coding {named} is not known; send chunked, or none."))
+
+    def _check_host(self) -> None:
+        """Refuse a request that says of no host, of two, or of an impossible one that it is meant for it (RFC 9112)."""
+        hosts = [value for name, value in self.headers if name == b"host"]
+        if len(hosts) > 1:
+            self._refuse(MalformedHead("The request has more than one Host header."))
+        if not hosts and self.parser.get_http_version() != "1.0":
+            self._refuse(MalformedHead("The request has no Host header."))
+        if hosts and not HOST.fullmatch(hosts[0].strip()):
+            self._refuse(MalformedHead("The Host header is not a host and a port."))
 
     def _check_handshake(self) -> None:
         start = b"%b %b HTTP/%b" % (self.parser.get_method(), self.url, self.parser.get_http_version().encode())

@@ -32,6 +32,7 @@ COMMON: tuple[type[Exception], ...] = (
     faults.HeadTooSlow,
     faults.UrlTooLong,
     faults.HeadTooLarge,
+    faults.UnknownTransferCoding,
     faults.TooManyConnections,
     faults.Stopping,
 )

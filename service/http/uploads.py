@@ -113,8 +113,12 @@ async def read_many(request: Request, settings: Settings) -> list[FormPart]:
     Raises:
         UnsupportedMediaType: the body is not a form.
         BodyTooLarge, MalformedBody: the body breaks a limit, or is not a valid form.
+        InvalidRequest: it has more frames than a batch may have, though not more parts than these and some fields.
     """
-    return await _read_form(request, settings, settings.max_batch_items)
+    parts = await _read_form(request, settings, settings.max_batch_items)
+    if (count := sum(map(is_file, parts))) > settings.max_batch_items:
+        raise InvalidRequest(f"The form has {count} file parts; the limit is {settings.max_batch_items}.")
+    return parts
 
 
 async def _read_form(request: Request, settings: Settings, frames: int) -> list[FormPart]:

@@ -19,7 +19,7 @@ from websockets.server import ServerProtocol
 from service.errors.faults import Fault, HeadTooLarge, MalformedHead, MemoryFull
 from service.http.connections import Connection, Connections
 
-POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1008, 1013, 1012
+INVALID_DATA, POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1007, 1008, 1013, 1012
 
 
 def handshake_fault(head: bytes) -> Fault | None:
@@ -41,6 +41,14 @@ def handshake_fault(head: bytes) -> Fault | None:
         "and 16 bytes in base64 as Sec-WebSocket-Key.",
         {"Sec-WebSocket-Version": "13"},
     )
+
+
+def _is_utf_8(text: bytes) -> bool:
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
@@ -113,6 +121,9 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
             return
         if self.queue.qsize() >= self._settings.max_stream_messages:
             self._fail(POLICY_VIOLATION, "too-many-messages")
+            return
+        if self.curr_msg_data_type == "text" and not _is_utf_8(b"".join(self.frames)):
+            self._fail(INVALID_DATA, "invalid-text")
             return
         size = sum(map(len, self.frames))
         self._held.append(size)

@@ -113,6 +113,7 @@ async def follow_map(
     map_ = await engine.map(map_id)
     stream = MapStream(engine, map_, options, lambda: request.app.state.gate.identify(request.scope))
     stream.check(principal)
+    request.state.noted = {"map": map_id, "pictures": options.pictures}  # without them, nothing is audited
     return await stream_response(request, stream.texts(last_event_id))
 
 

@@ -18,6 +18,7 @@ from starlette.datastructures import Headers
 from starlette.responses import FileResponse
 from starlette.types import Message, Receive, Scope, Send
 
+from core.disk.permissions import PRIVATE_FOLDER
 from core.errors import StorageFull
 from core.maps import Map
 from core.maps.archives.writing import Exported
@@ -143,7 +144,7 @@ class Exports:
             self._check_open()
             map_.open()
             state = map_.exporter.state()  # read first, so that a change meanwhile is noticed
-            self._folder.mkdir(exist_ok=True)
+            self._folder.mkdir(PRIVATE_FOLDER, exist_ok=True)
             return state, map_.exporter.write(
                 path, lambda _written: self._check_open(), lambda size: from_thread.run(self._make_space, size)
             )

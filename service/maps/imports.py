@@ -34,6 +34,8 @@ from core.frames.images import Limits
 from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive, opening_of
 from core.maps.archives.tar_layout import BLOCK
+from core.maps.enrolling import any_descriptors
+from core.maps.records import Precision
 from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
 from core.storage.archives.unpacking import check_sizes
@@ -53,6 +55,9 @@ FOLDER = "imports"
 THUMBNAIL_BYTES, THUMBNAIL_PIXELS = 4 << 20, 2048 * 2048
 """Pictures up to this size are imported even if the service's own limit on frames is lower: they may be thumbnails
 that a service with a higher limit made."""
+
+LENGTH_TOLERANCES: Mapping[Precision, float] = {"half": 0.01, "compressed": 0.1}
+"""By how much the length of a descriptor may differ from that which its encoder gives, by the precision of the map."""
 
 log = logging.getLogger("placerec.imports")
 
@@ -245,7 +250,8 @@ class Imports:
         with disk_errors("read the map file"):
             archive = Archive(self._folder / name)
         with archive:
-            self.check_encoder(archive.manifest)
+            definition = self.check_encoder(archive.manifest).definition
+            tolerance = LENGTH_TOLERANCES[archive.manifest.map.precision]
             limits = self._picture_limits()
             self._engine.maps.import_map(
                 archive,
@@ -254,6 +260,7 @@ class Imports:
                 partial(_check_picture, limits=limits),
                 limits.max_bytes,
                 lambda: before_listing(archive),
+                any_descriptors if definition is None else partial(definition.could_give, tolerance=tolerance),
             )
         log.info("map imported", extra={"map": map_id, "places": archive.manifest.places, "manifest": archive.tag})
 

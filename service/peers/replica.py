@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sqlalchemy import Column, MetaData, Table, bindparam, select, update
 
-from core.disk.files import disk_errors, write_file
+from core.disk.files import disk_errors, make_folder, write_file
 from core.errors import StorageFailure
 from core.ledger import LedgerConnection, Statement, Tables
 from core.ledger.postgres import PostgresLedger
@@ -214,6 +214,6 @@ def _id_of(directory: Path) -> str:
         if path.exists() and (found := path.read_text().strip()):
             return found
         made = f"r-{secrets.token_hex(8)}"
-        directory.mkdir(parents=True, exist_ok=True)
+        make_folder(directory)
         write_file(path, f"{made}\n".encode())
         return made

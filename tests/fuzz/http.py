@@ -15,6 +15,9 @@ SECOND = b"0\r\n\r\nGET /livez HTTP/1.1\r\n\r\n"
 PATIENCE = 10.0
 """Seconds in which an answer, or the end of the connection, has to come; for what is whole but wrong."""
 
+NOT_IMPLEMENTED = 501
+"""The answer to a transfer coding that is not known, which is the client's mistake all the same."""
+
 STATUS = re.compile(rb"HTTP/1\.1 (\d{3}) ")
 
 
@@ -108,8 +111,8 @@ def mangled(seed: int, count: int) -> Iterator[bytes]:
 
 
 def complaint(port: int, sent: bytes) -> str:
-    """What was wrong with the answer to some bytes; empty if it was below 500 or the connection was closed."""
+    """What was wrong with the answer to some bytes; empty if it was below 500, 501, or the connection was closed."""
     statuses, ended = spoken(port, sent)
-    if any(status >= 500 for status in statuses):
+    if any(status >= 500 and status != NOT_IMPLEMENTED for status in statuses):
         return f"answered with {statuses}: {sent[:200]!r}"
     return "" if ended else f"neither answered nor ended in {PATIENCE:.0f} s: {sent[:200]!r}"

@@ -341,6 +341,10 @@ class StorageFailure(Problem):
     """500 ``storage-failure``: The disk failed."""
 
 
+class UnknownTransferCoding(Problem):
+    """501 ``unknown-transfer-coding``: The transfer coding is not known."""
+
+
 class DataDirectoryLocked(Problem):
     """503 ``data-directory-locked``: Another process uses the data directory."""
 
@@ -533,6 +537,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "internal-error": InternalError,
     "invalid-keypoints": InvalidKeypoints,
     "storage-failure": StorageFailure,
+    "unknown-transfer-coding": UnknownTransferCoding,
     "data-directory-locked": DataDirectoryLocked,
     "data-directory-too-new": DataDirectoryTooNew,
     "data-directory-too-old": DataDirectoryTooOld,

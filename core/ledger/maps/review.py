@@ -92,6 +92,13 @@ _PUT_PICTURE = Statement(
     lambda insert: insert(_PICTURES).values({name: bindparam(name) for name in ("map", "number", "bytes")})
 )
 _PICTURE = Statement(select(_P.bytes).where(_P.map == bindparam("map"), _P.number == bindparam("number")))
+_FIRST_AFTER = Statement(
+    select(_F.number, _F.digest, _P.bytes)
+    .outerjoin(_PICTURES, (_P.map == _F.map) & (_P.number == _F.number))
+    .where(_OF_MAP, _F.number > bindparam("after"))
+    .order_by(_F.number)
+    .limit(1)
+)
 _NEXT = Statement(
     lambda insert: (
         insert(_NUMBERS)
@@ -226,6 +233,12 @@ def drop(connection: MapConnection, numbers: list[int]) -> None:
 def unsound(connection: MapConnection) -> list[int]:
     """The numbers of the frames whose row does not match its checksum."""
     return [int(columns[0]) for *columns, seal in connection.execute(_ALL) if not is_sound(columns, seal)]
+
+
+def first_after(connection: MapConnection, number: int) -> tuple[int, bytes, bytes | None] | None:
+    """The first frame of a higher number: its number, its digest, and its picture where that is in the ledger."""
+    found = connection.one(_FIRST_AFTER, after=number)
+    return None if found is None else (int(found[0]), found[1], found[2])
 
 
 def _size(connection: MapConnection) -> tuple[int, int]:

@@ -7,12 +7,14 @@ and where each part lies; then everything, to write it.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+from core.disk.permissions import open_private
 from core.errors import StorageFailure
 from core.maps.archives.manifest import (
     CAMERAS,
@@ -123,7 +125,7 @@ def write_archive(source: ArchiveSource, path: Path, advance: Advance, expect: E
     manifest = _planned(source)
     tape = TarLayout(manifest, len(written(manifest)))
     expect(tape.size)
-    file = path.open("xb")
+    file = os.fdopen(open_private(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb")
     try:
         with file:
             return _write(file, path, source, manifest, tape, advance)

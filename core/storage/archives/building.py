@@ -11,6 +11,7 @@ from core.disk.sqlite_file import transaction
 from core.ledger.maps.record import state_of
 from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.reading import Archive
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.records import MapRecord
 from core.storage.archives.importing import Importing
 from core.storage.archives.unpacking import Advance, CheckPicture, check_sizes, layout_of
@@ -30,12 +31,14 @@ def build(
     advance: Advance = lambda _done, _all: None,
     check_picture: CheckPicture = lambda _content: None,
     most_picture_bytes: int = MOST_PICTURE_BYTES,
+    check_descriptors: CheckDescriptors = any_descriptors,
 ) -> None:
     """Make ``folder`` with the map of an export file in it, durable except for the folder's own name.
 
     Args:
         map_id: of the new map; it may differ from that in the file.
         most_picture_bytes: a larger picture is refused before it is read.
+        check_descriptors: says which descriptors the map's encoder can have given.
 
     Raises:
         InvalidArchive: the file is damaged, or its content is not valid for a map; ``folder`` is then of no use.
@@ -56,7 +59,7 @@ def build(
             write.finish()
 
     try:
-        importing = Importing(archive, layout, advance, check_picture, most_picture_bytes, writing)
+        importing = Importing(archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors)
         importing.fill()
         for (line,) in driver.execute("PRAGMA quick_check").fetchall():
             if line != "ok":

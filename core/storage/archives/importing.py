@@ -18,6 +18,7 @@ from core.ledger.maps.record import MapState
 from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
 from core.maps.archives.reading import Archive
 from core.maps.cameras import CameraRecord
+from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.stored_fields import moment_text
 from core.places import NO_SEQUENCE
 from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking
@@ -56,8 +57,9 @@ class Importing(Unpacking):
         check_picture: CheckPicture,
         most_picture_bytes: int,
         writing: Callable[[], AbstractContextManager[ImportWrite]],
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
-        super().__init__(archive, layout, advance, check_picture, most_picture_bytes)
+        super().__init__(archive, layout, advance, check_picture, most_picture_bytes, check_descriptors)
         self._writing = writing
         self._codes: dict[str, int] = {}
         self._lost: dict[int, int] = {}  # the codes of the tracks whose sequences are gone, by their numbers there

@@ -20,7 +20,7 @@ from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, Place
 from core.maps.archives.manifest import ArchivePart, Manifest
 from core.maps.archives.reading import Archive, PartReader
 from core.maps.cameras import MOST_CAMERAS
-from core.maps.enrolling import LARGEST_HALF
+from core.maps.enrolling import LARGEST_HALF, CheckDescriptors, any_descriptors
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 
 CHUNK_BYTES = 16 << 20
@@ -90,6 +90,7 @@ class Unpacking(ABC):
 
     Args:
         most_picture_bytes: a larger picture is refused before it is read.
+        check_descriptors: says which descriptors the map's encoder can have given.
     """
 
     def __init__(
@@ -99,7 +100,9 @@ class Unpacking(ABC):
         advance: Advance = lambda _done, _all: None,
         check_picture: CheckPicture = lambda _content: None,
         most_picture_bytes: int = MOST_PICTURE_BYTES,
+        check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
+        self._can_be_given = check_descriptors
         self.archive, self.layout, self.advance = archive, layout, advance
         self._check_picture, self._most_picture_bytes = check_picture, most_picture_bytes
         self.rows = 0
@@ -182,6 +185,11 @@ class Unpacking(ABC):
         for line, value in zip(chunk, largest.tolist(), strict=True):
             if not 0 < value <= LARGEST_HALF:  # this is also false for NaN
                 raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} cannot be compared.")
+        for line, can in zip(chunk, self._can_be_given(vectors).tolist(), strict=True):
+            if not can:
+                raise InvalidArchive(
+                    f"{name}: the descriptor of place {line.id!r} has a length that its encoder gives to none."
+                )
 
     def _content(self, line: PlaceLine, images: PartReader, records: PartReader) -> Content:
         return Content(self._picture(line, images), self._keypoints(line, records))

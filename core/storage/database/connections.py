@@ -53,6 +53,7 @@ def connect(path: Path, create: bool = False) -> sqlite3.Connection:
 
     Raises:
         sqlite3.Error: the file is missing (unless ``create``) or cannot be read.
+        OSError: a new file cannot be made.
     """
     return sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
 

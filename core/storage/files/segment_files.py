@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.disk.files import Damage, missing, sync_folder, write_at
+from core.disk.permissions import open_private
 from core.maps.records import Precision
 from core.storage.files.row_formats import (
     HALF,
@@ -230,7 +231,7 @@ def append(folder: Path, layout: Layout, first_row: int, records: NDArray[np.voi
 
 
 def _write(path: Path, layout: Layout, number: int, offset: int, records: NDArray[np.void]) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = open_private(path, os.O_WRONLY | os.O_CREAT)
     try:
         if offset == 0:
             write_at(descriptor, layout.header(number), 0)

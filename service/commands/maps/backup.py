@@ -2,6 +2,7 @@
 
 DIR/index.json              the saved maps, each with its file and the SHA-256 of that file's manifest
 DIR/<map>.<sha256…>.tar     a file is never overwritten: a new one has a name of its own, which the index then names
+DIR/.<map>.part             what there is of a file that is being written; no other file's name begins so
 """
 
 from __future__ import annotations
@@ -190,7 +191,7 @@ async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str)
         with suppress(Failure):  # a missing or damaged file is written again
             check_file(folder / before.file, before.manifest_sha256)
             known = before.manifest_sha256
-    downloaded = folder / map_id
+    downloaded = folder / f".{map_id}"  # no name of a map begins so: a map named index.json would replace the index
     tag = await download(service, map_id, downloaded, known, overwrite=True)
     if tag is None:
         remark(f"{map_id}: unchanged.")
@@ -251,11 +252,11 @@ def _remove_strays(folder: Path, index: BackupIndex) -> None:
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
     """The folder for this process alone."""
-    from core.disk.files import FolderLock
+    from core.disk.files import FolderLock, make_folder
     from core.errors import DataDirectoryLocked
 
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         lock = FolderLock(folder / "LOCK")
     except DataDirectoryLocked as error:
         raise Failure(f"Another process is writing to {folder}.") from error

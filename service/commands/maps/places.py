@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from core.disk.permissions import open_private
 from service.commands.connection.client import (
     AsJson,
     CommandTarget,
@@ -117,8 +118,7 @@ def delete_places(
                 return (await service.request("POST", path, json={"ids": place_ids, "dry_run": dry_run})).json()
 
             if missing := (await order(dry_run=True))["missing"]:
-                shown = ", ".join(one if one.isprintable() else ascii(one) for one in missing)
-                raise Failure(f"The map {map_id} has no place {shown}; nothing was deleted.")
+                raise Failure(f"The map {map_id} has no place {', '.join(missing)}; nothing was deleted.")
             if not yes:
                 typer.confirm(f"Delete from the map {map_id}: {', '.join(place_ids)}?", abort=True)
             deleted = await order(dry_run=False)
@@ -141,7 +141,8 @@ def save_thumbnail(
     """Save the picture that the map keeps of a place."""
     picture = ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
     try:
-        file.write_bytes(picture)
+        with open(file, "wb", opener=open_private) as opened:
+            opened.write(picture)
     except OSError as error:
         raise Failure(f"{file} cannot be written: {error.strerror}.") from error
 

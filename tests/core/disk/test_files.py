@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import sqlite3
+import stat
 from pathlib import Path
 
 import pytest
@@ -79,5 +81,35 @@ def test_one_holder_at_a_time(tmp_path: Path) -> None:
     with pytest.raises(DataDirectoryLocked):
         FolderLock(tmp_path / "LOCK")
     lock.release()
+    lock.release()
+    FolderLock(tmp_path / "LOCK").release()
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_lock_holds_though_its_file_is_deleted(tmp_path: Path, replaced: bool) -> None:
+    path = tmp_path / "LOCK"
+    lock = FolderLock(path)
+    path.unlink()
+    if replaced:
+        path.touch()
+    with pytest.raises(DataDirectoryLocked):
+        FolderLock(path)
+    lock.release()
+    FolderLock(path).release()
+
+
+def test_the_file_alone_is_locked_where_folders_are_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on network file systems, which lock only what is open for writing."""
+    whole = fcntl.flock
+
+    def flock(descriptor: int, operation: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        whole(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    lock = FolderLock(tmp_path / "LOCK")
+    with pytest.raises(DataDirectoryLocked):
+        FolderLock(tmp_path / "LOCK")
     lock.release()
     FolderLock(tmp_path / "LOCK").release()

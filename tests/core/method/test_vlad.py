@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from core.maps.records import Precision
 from core.method.equations import Normalization, matching_score, vlad
-from core.method.vlad import aggregate, scores
+from core.method.vlad import aggregate, are_normalized, scores
+from core.storage.files.row_formats import pack_descriptors, unpack_descriptors
+from service.maps.imports import LENGTH_TOLERANCES
 
 
 def test_empty_and_zero_clusters_stay_zero() -> None:
@@ -47,3 +50,20 @@ def test_equals_the_equations(shape: tuple[int, int, int], gamma: float, normali
     assert made.dtype == np.float32
     # A residual near 0 is a difference of nearly equal numbers, and a power under 1 magnifies its rounding.
     np.testing.assert_allclose(made, wanted.reshape(-1), atol=2e-3 if gamma < 0.5 else 2e-4)
+
+
+@pytest.mark.parametrize("normalization", ["intra", "global"])
+@pytest.mark.parametrize("precision", ["half", "compressed"])
+@pytest.mark.parametrize(("words", "values"), [(16, 24), (128, 64), (1, 300)])
+def test_stored_vlads_have_their_length_and_others_have_not(
+    normalization: Normalization, precision: Precision, words: int, values: int
+) -> None:
+    generator = np.random.default_rng(5)
+    centers = generator.standard_normal((words, values)).astype(np.float32)
+    features = (generator.standard_normal((40, values)).astype(np.float32) for _ in range(20))
+    made = np.stack([aggregate(one, centers, 0.5, normalization) for one in features])
+    stored = unpack_descriptors(pack_descriptors(made, precision), precision, made.shape[1])
+    tolerance = LENGTH_TOLERANCES[precision]
+    assert are_normalized(stored, words, normalization, tolerance).all()
+    for factor in (0.0, 0.5, 2.0, 1000.0):
+        assert not are_normalized(factor * stored, words, normalization, tolerance).any()

@@ -14,6 +14,7 @@ from core.maps import MapSettings, ReviewSetting
 from core.maps.review import StoredReviews
 from core.storage import Atlas
 from core.storage.review import FILE, ReviewFrames
+from core.storage.verification import inspect_folder
 from tests.core.maps.review import check_pages_are_of_one_moment
 
 ENCODER = "some@" + "0" * 64
@@ -22,7 +23,7 @@ ANSWER = {"verdict": "unknown", "score": 0.25, "camera": None, "text": "naïve\u
 
 
 def frames_at(folder: Path) -> ReviewFrames:
-    return ReviewFrames(folder / FILE, lambda: None)
+    return ReviewFrames(folder / FILE, "lab", lambda: None)
 
 
 def test_a_frame_is_stored_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
@@ -142,6 +143,72 @@ def test_a_damaged_file_is_put_aside_and_the_map_goes_on(tmp_path: Path) -> None
     assert review.page(None, 10).frames == [] and review.keep(b"one", ANSWER, SETTING)
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
     review.close()
+
+
+def test_frames_of_another_map_are_not_shown(tmp_path: Path) -> None:
+    """Two maps whose files change places, as a careless restore may do it."""
+    atlas = Atlas(tmp_path / "data")
+    for name in ("lab", "hall"):
+        review = atlas.create(name, ENCODER, 8, MapSettings(review=SETTING)).review
+        assert review.keep(f"a frame of {name}".encode(), ANSWER, SETTING)
+        assert atlas.verify(name).ok
+    atlas.close()
+    lab, hall, aside = (tmp_path / "data" / "maps" / name for name in ("lab", "hall", "aside"))
+    for source, target in ((lab, aside), (hall, lab), (aside, hall)):
+        target.mkdir(exist_ok=True)
+        (source / FILE).rename(target / FILE)
+    aside.rmdir()
+    atlas = Atlas(tmp_path / "data")
+    report = atlas.verify("lab")
+    assert not report.ok and report.problems == [f"{FILE}: it belongs to the map 'hall'"]
+    for name, folder in (("lab", lab), ("hall", hall)):
+        review = atlas.get(name).review
+        assert review.page(None, 10) == StoredReviews([], 0, 0)
+        assert review.keep(b"new", ANSWER, SETTING) and atlas.verify(name).ok
+        assert len(list(folder.glob(f"{FILE}.damaged-*"))) == 1
+    atlas.close()
+
+
+@pytest.mark.parametrize("statement", ["DROP TABLE review_map", "DELETE FROM review_map"])
+def test_a_file_that_names_no_map_yet_is_taken(tmp_path: Path, statement: str) -> None:
+    """Of an earlier version, or of a crash right after it was made."""
+    review = frames_at(tmp_path)
+    review.keep(b"one", ANSWER, SETTING)
+    review.close()
+    edit(tmp_path / FILE, statement)
+    if statement.startswith("DROP"):
+        edit(tmp_path / FILE, "PRAGMA user_version = 2")
+    assert frames_at(tmp_path).check() == ([], 3)
+    review = frames_at(tmp_path)
+    assert review.page(None, 10).count == 1
+    review.close()
+    other = ReviewFrames(tmp_path / FILE, "hall", lambda: None)
+    assert other.check() == ([f"{FILE}: it belongs to the map 'lab'"], 3)
+
+
+def test_verify_reads_the_frames(tmp_path: Path) -> None:
+    """In service and out of it; nothing is mended by looking."""
+    atlas = Atlas(tmp_path / "data")
+    map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
+    for number in range(4):
+        assert map_.review.keep(bytes([number]) * 100, ANSWER, SETTING)
+    assert atlas.verify("lab").checked_bytes >= 400
+    atlas.close()
+    path = tmp_path / "data" / "maps" / "lab" / FILE
+    edit(path, "UPDATE review_frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
+    edit(path, "UPDATE review_pictures SET bytes = x'FF' WHERE number = 2")
+    edit(path, "DELETE FROM review_pictures WHERE number = 3")
+    found = [
+        f"{FILE}: frame 1 does not match its checksum",
+        *(f"{FILE}: the picture of frame {number} does not match its digest" for number in (2, 3)),
+    ]
+    atlas = Atlas(tmp_path / "data")
+    assert atlas.verify("lab").problems == atlas.verify("lab").problems == found
+    assert inspect_folder(path.parent).problems == found
+    atlas.close()
+    path.write_bytes(b"no database at all" * 100)
+    (problem,) = inspect_folder(path.parent).problems
+    assert problem.startswith(FILE) and path.read_bytes()[:2] == b"no"
 
 
 def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from onnx import ModelProto, TensorProto, helper, numpy_helper
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from core.errors import InvalidModel
 from core.networks.description import Aggregation, NetworkDescription, Output, checked, read_description
@@ -175,6 +175,88 @@ REFUSED: dict[str, tuple[Callable[[], ModelProto], str]] = {
     ),
     "no input left": (lambda: onnx_network([node("Conv", ["other", "w"], "maps")]), "cannot compute it"),
 }
+
+
+def branch(name: str, shape: list[int]) -> GraphProto:
+    """Adds up zeros of a shape."""
+    nodes = [node("ConstantOfShape", [f"{name} shape"], f"{name} zeros"), node("ReduceSum", [f"{name} zeros"], name)]
+    value = helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
+    return helper.make_graph(nodes, name, [], [value], [numpy_helper.from_array(np.array(shape), f"{name} shape")])
+
+
+BRIGHT = [
+    node("ReduceMean", ["images"], "mean", keepdims=0),
+    node("Greater", ["mean", "limit"], "bright"),
+]
+LIMIT = numpy_helper.from_array(np.array(1e6, np.float32), "limit")
+"""No picture of a trial is so bright."""
+
+COUNT = [*BRIGHT, node("Cast", ["bright"], "number", to=TensorProto.INT64), node("Unsqueeze", ["number", "0"], "count")]
+FURTHER = [LIMIT, numpy_helper.from_array(np.array([0]), "0"), numpy_helper.from_array(np.array(2, np.float32), "two")]
+
+OF_THE_PICTURE: dict[str, list[NodeProto]] = {
+    "a branch": [
+        *BRIGHT,
+        helper.make_node(
+            "If", ["bright"], ["more"], then_branch=branch("huge", [700_000_000]), else_branch=branch("small", [1])
+        ),
+    ],
+    "a shape": [*COUNT, node("ConstantOfShape", ["count"], "zeros"), node("ReduceSum", ["zeros"], "more")],
+    "an expansion": [*COUNT, node("Expand", ["two", "count"], "twos"), node("ReduceSum", ["twos"], "more")],
+    "repeats": [
+        *COUNT,
+        node("Reshape", ["mean", "count"], "one"),
+        node("Tile", ["one", "count"], "means"),
+        node("ReduceSum", ["means"], "more"),
+    ],
+    "a range": [*BRIGHT, node("Range", ["limit", "mean", "two"], "steps"), node("ReduceSum", ["steps"], "more")],
+    "bright pixels": [
+        node("NonZero", ["images"], "pixels"),
+        node("Transpose", ["pixels"], "rows", perm=[1, 0]),
+        node("MatMul", ["rows", "pixels"], "square"),
+        node("Cast", ["square"], "floats", to=TensorProto.FLOAT),
+        node("ReduceSum", ["floats"], "more"),
+    ],
+    "a member of a list": [
+        *COUNT,
+        helper.make_node("SequenceConstruct", ["images", "two"], ["list"]),
+        node("SequenceAt", ["list", "number"], "member"),
+        node("ReduceSum", ["member"], "more"),
+    ],
+}
+
+
+@pytest.mark.parametrize("what", OF_THE_PICTURE)
+def test_no_size_depends_on_the_picture(what: str) -> None:
+    """A network that needs little for the pictures of its trial, and much for one that is brighter."""
+    nodes = [CONVOLUTION, *OF_THE_PICTURE[what], node("Add", ["maps", "more"], "sum")]
+    graph = onnx_network(nodes, "sum", tensors=FURTHER).SerializeToString()
+    with pytest.raises(InvalidModel, match=r"If with a graph in it|depends on the picture|SequenceConstruct"):
+        OnnxNetwork("growing", graph, MAPS)
+
+
+def test_sizes_may_depend_on_the_size_of_the_input(tmp_path: Path) -> None:
+    """As exporters write them for an input of any size: from its shape, over numbers, to where a shape is needed."""
+    nodes = [
+        CONVOLUTION,
+        node("Shape", ["maps"], "shape"),
+        node("Gather", ["shape", "0"], "batch"),
+        node("Concat", ["batch", "six", "all"], "flat shape", axis=0),
+        node("Reshape", ["maps", "flat shape"], "flat"),
+        node("Expand", ["two", "shape"], "twos"),
+        node("Reshape", ["flat", "shape"], "again"),
+        node("Add", ["again", "twos"], "sum"),
+    ]
+    extra = [
+        numpy_helper.from_array(np.array([0]), "0"),
+        numpy_helper.from_array(np.array([6]), "six"),
+        numpy_helper.from_array(np.array([-1]), "all"),
+        numpy_helper.from_array(np.array(2, np.float32), "two"),
+    ]
+    graph = import_onnx(write(tmp_path, onnx_network(nodes, "sum", tensors=extra)), MAPS)
+    images = torch.randn(1, 3, SIDE, SIDE)
+    plain = OnnxNetwork("plain", onnx_network().SerializeToString(), MAPS)
+    assert torch.allclose(OnnxNetwork("any size", graph, MAPS)(images)[0], plain(images)[0] + 2)
 
 
 @pytest.mark.parametrize("what", REFUSED)

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from service.access import audit
-from service.access.audit import ASKER, Asker, Refusals, asker_fields, note_change
+from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_fields, note_change
 from service.jobs.jobs import Jobs
+from tests.service.scenes import jpeg
 from tests.service.server import Server
 
 EVE = Asker("eve", "0123456789ab", "prune_map", "a-request", None, "10.0.0.1")
@@ -82,9 +83,9 @@ def test_a_repeated_refusal_is_logged_once(caplog: pytest.LogCaptureFixture, mon
     monkeypatch.setattr(audit, "REPEAT_SECONDS", 0.0)
     refusals.note(EVE, {"map": "lab"}, 403, "role-too-low")
     assert caplog.records[-1].__dict__["before"] == 99
-    for number in range(2 * audit.MOST_REFUSALS):
+    for number in range(2 * audit.MOST_KINDS):
         refusals.note(Asker("nobody", client=str(number)), {}, 401, "key-needed")
-    assert len(refusals._logged) == audit.MOST_REFUSALS
+    assert len(refusals._repeats._logged) == audit.MOST_KINDS
 
 
 def test_nobody_says_of_itself_where_it_calls_from(server: Server) -> None:
@@ -93,3 +94,41 @@ def test_nobody_says_of_itself_where_it_calls_from(server: Server) -> None:
     assert server.client.post("/v1/maps", json={"id": "by-whom"}, headers=forged).status_code == 201
     lines = server.lines_soon(logger="placerec.audit", operation="create_map", map="by-whom")
     assert [line["client"] for line in lines] == ["127.0.0.1"]
+
+
+def test_who_saw_pictures_is_known(server: Server) -> None:
+    """Exports, thumbnails, explanations and events with pictures: one line for what is repeated, none for a refusal."""
+    server.create_map("seen", keep="image")
+    assert server.enrol("seen", "p0", jpeg(0)).status_code == 201
+    maps = "/v1/maps/seen"
+    thumbnail = server.client.get(f"{maps}/places/p0/thumbnail")
+    for path in (f"{maps}/places/p0/thumbnail", f"{maps}/export", f"{maps}/export", f"{maps}/review/labels"):
+        assert server.client.get(path).status_code == 200
+    unchanged = server.client.get(f"{maps}/export", headers={"If-None-Match": "*"})
+    assert unchanged.status_code == 304 and thumbnail.status_code == 200
+    assert server.client.get(f"{maps}/places/absent/thumbnail").status_code == 404
+    for pictures in ("false", "true"):
+        with server.client.stream("GET", f"{maps}/events", params={"pictures": pictures}) as events:
+            assert events.status_code == 200
+        lines = server.lines(logger="placerec.audit", message="shown", map="seen")
+        assert ("follow_map" in [line["operation"] for line in lines]) == (pictures == "true")
+    assert [(line["operation"], line["status"], line.get("place")) for line in lines] == [
+        ("see_thumbnail", 200, "p0"),
+        ("export_map", 200, None),
+        ("export_labels", 200, None),
+        ("follow_map", 200, None),
+    ]
+    assert {(line["principal"], line["client"]) for line in lines} == {("anonymous", "127.0.0.1")}
+
+
+def test_views_are_counted_by_key_and_map(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    disclosures = Disclosures()
+    for map_id in ("lab", "lab", "hall", "lab"):
+        disclosures.note(EVE, {"map": map_id}, 206)
+    monkeypatch.setattr(audit, "REPEAT_SECONDS", 0.0)
+    disclosures.note(EVE, {"map": "lab"}, 206)
+    assert [(record.__dict__["map"], record.__dict__.get("before")) for record in caplog.records] == [
+        ("lab", None),
+        ("hall", None),
+        ("lab", 2),
+    ]

@@ -94,7 +94,7 @@ def test_a_change_of_the_file_leaves_no_journal_that_could_come_back(file_store:
 
 def test_what_cannot_be_a_key_is_refused(store: Keys) -> None:
     past = datetime.now(UTC) - timedelta(seconds=1)
-    for name in ("", "two words", "a" * 65, "0123456789ab", "anonymous", "owner", "new\nline"):
+    for name in ("", "two words", "a" * 65, "0123456789ab", "anonymous", "owner", "nobody", "Nobody", "new\nline"):
         with pytest.raises(InvalidRequest):
             store.create(name, "query")
     for role in ("open", "root"):

@@ -17,7 +17,7 @@ from service.app.application import create_app
 from service.errors.faults import RateExceeded
 from service.settings import Settings
 from tests.service.access.test_keys import Clock
-from tests.service.server import assert_problem
+from tests.service.server import Server, assert_problem
 from tests.service.wire import eventually
 
 if TYPE_CHECKING:
@@ -141,3 +141,18 @@ async def test_a_key_over_its_rate_learns_when_to_come_again(tmp_path: Path) -> 
                 assert_problem(await ask(wrong), 401, "key-refused")
             assert_problem(await ask(wrong), 429, "rate-exceeded")
             assert (await ask(second)).status_code == 404, "a right key is taken from the same address"
+
+
+def test_wrong_keys_are_counted_whatever_address_they_claim(tmp_path: Path) -> None:
+    """Each with another address in the header that a proxy would set, from this machine, where no proxy is named."""
+    Keys.of(tmp_path / "data").create("admin", "admin")
+    server = Server(tmp_path).wait("/livez")
+    wrong = f"Bearer placerec_{'0' * 12}_{'x' * 43}"
+    statuses = [
+        server.client.get(
+            "/v1/maps", headers={"Authorization": wrong, "X-Forwarded-For": f"10.0.0.{number}"}
+        ).status_code
+        for number in range(40)
+    ]
+    assert server.stop() == 0
+    assert statuses[0] == 401 and 429 in statuses

@@ -65,6 +65,13 @@ def test_whoever_only_queries_changes_nothing(endpoints: list[Endpoint]) -> None
             assert endpoint.method not in READING and covers(endpoint.rule.role, "enrol"), endpoint.operation
 
 
+def test_whoever_shows_pictures_is_audited(endpoints: list[Endpoint]) -> None:
+    """A route of pictures or exports that is new is to be named here, and marked in its rule."""
+    showing = {endpoint.operation for endpoint in endpoints if endpoint.rule.shows}
+    named = re.compile("see_|export_")
+    assert showing == {one.operation for one in endpoints if named.match(one.operation)} | {"follow_map"}
+
+
 def test_roles_are_ordered() -> None:
     order: tuple[Role, ...] = ("query", "enrol", "admin")
     for index, role in enumerate(order):

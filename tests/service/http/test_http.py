@@ -75,6 +75,14 @@ def test_a_connection_that_says_nothing_is_closed(strict: Server) -> None:
         (b"\x16\x03\x01\x02\x00\x01\x00", (400, "malformed-head")),
         (b"GET /livez HTTP/1.1\r\nHost: a\r\nContent-Length: 1\r\nTransfer-Encoding: chunked\r\n\r\n", (400, None)),
         (b"GET /livez HTTP/9.9\r\n\r\n", (400, "malformed-head")),
+        (b"GET /livez HTTP/1.1\r\n\r\n", (400, "malformed-head")),  # no Host
+        (get("/livez", "Host: localhost"), (400, "malformed-head")),  # a second one
+        (b"GET /livez HTTP/1.0\r\nHost: a\r\nhost: b\r\n\r\n", (400, "malformed-head")),
+        (b"GET /livez HTTP/1.1\r\nHost: a/b\r\n\r\n", (400, "malformed-head")),
+        (b"GET /livez HTTP/1.1\r\nHost: user@a\r\n\r\n", (400, "malformed-head")),
+        (get("/livez", "Transfer-Encoding: gzip, chunked"), (501, "unknown-transfer-coding")),
+        (get("/livez", "Transfer-Encoding: identity"), (501, "unknown-transfer-coding")),
+        (get("/livez", "Transfer-Encoding: chunked, chunked"), (400, "malformed-head")),
     ],
 )
 def test_a_head_beyond_the_limits_is_refused(strict: Server, sent: bytes, told: tuple[int, str | None]) -> None:
@@ -88,6 +96,19 @@ def test_a_head_beyond_the_limits_is_refused(strict: Server, sent: bytes, told: 
 def test_a_head_just_within_the_limits_is_taken(strict: Server) -> None:
     with opened(strict) as connection:
         connection.sendall(get("/livez?" + "x" * 1980, *[f"X-{n}: {'y' * 100}" for n in range(18)]))
+        assert answer(connection)[0] == 200
+
+
+@pytest.mark.parametrize("host", ["localhost", "a_b.example:8000", "[::1]:8000", "127.0.0.1", "localhost:"])
+def test_every_host_is_taken(server: Server, host: str) -> None:
+    with opened(server) as connection:
+        connection.sendall(f"GET /livez HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        assert answer(connection)[0] == 200
+
+
+def test_a_client_of_http_1_0_need_not_name_the_host(server: Server) -> None:
+    with opened(server) as connection:
+        connection.sendall(b"GET /livez HTTP/1.0\r\n\r\n")
         assert answer(connection)[0] == 200
 
 

@@ -65,6 +65,25 @@ def test_a_message_that_is_too_long_ends_it_before_it_came(strict: Server, strea
     assert closed_with(stream) == 1009
 
 
+@pytest.mark.parametrize(
+    "sent",
+    [frame(FINAL | TEXT, b"\xff"), frame(TEXT, b'"\xc3') + frame(FINAL | CONTINUED, b'("')],
+    ids=["whole", "cut"],
+)
+def test_text_that_is_no_utf_8_ends_it(strict: Server, stream: ClientConnection, sent: bytes) -> None:
+    """It is the client's mistake: the log has no error of the service."""
+    before, lines = held(strict), strict.lines(level="error")
+    stream.socket.sendall(sent)
+    assert closed_with(stream) == 1007
+    assert eventually(lambda: held(strict) == before)
+    assert strict.lines(level="error") == lines, strict.lines(level="error")[-1]["exception"]
+
+
+def test_a_character_may_be_cut_by_a_fragment(strict: Server, stream: ClientConnection) -> None:
+    stream.socket.sendall(frame(TEXT, b'"\xc3') + frame(FINAL | CONTINUED, b'\xa4"'))
+    assert json.loads(stream.recv(timeout=60))["problem"]["status"] == 400
+
+
 def held(server: Server) -> float:
     """Bytes that its uploads take."""
     text = server.client.get("/metrics").text

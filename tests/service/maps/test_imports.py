@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -97,9 +98,8 @@ async def test_cancelled_while_the_map_is_built(
     tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with runtime_at(tmp_path) as runtime:
-        monkeypatch.setattr(
-            runtime.imports, "check_encoder", lambda _: None
-        )  # the encoder of the test maps does not exist
+        # The encoder of the test maps does not exist, so that nothing is known of the length of its descriptors.
+        monkeypatch.setattr(runtime.imports, "check_encoder", lambda _: SimpleNamespace(definition=None))
         monkeypatch.setattr(unpacking, "CHUNK_BYTES", 1)
         gate = Gate(descriptors.append)
         with monkeypatch.context() as disk:

@@ -196,6 +196,22 @@ def test_hostile_files(server: Server, content: bytes) -> None:
     assert_problem(text, 415, "unsupported-media-type")
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.1, 4.0])
+def test_descriptors_of_another_length_are_refused(server: Server, content: bytes, factor: float) -> None:
+    """A place whose descriptor is four times as long would be more like every frame than any other place."""
+
+    def lengthen(manifest: dict[str, Any], parts: Parts) -> None:
+        _, name, *_ = group_names(0)
+        width, dimension = len(parts[name]) // manifest["places"], manifest["map"]["dimension"]
+        rows = np.frombuffer(parts[name], np.uint8).reshape(-1, width).copy()
+        last = rows[-1, : 2 * dimension].view("<f2")
+        last[:] = (last.astype(np.float32) * factor).astype("<f2")
+        parts[name] = rows.tobytes()
+
+    refused = import_file(server, changed(content, lengthen), new_id())
+    assert "has a length that its encoder gives to none" in assert_problem(refused, 422, "invalid-archive")["detail"]
+
+
 def test_digests(server: Server, content: bytes) -> None:
     right = base64.b64encode(hashlib.sha256(content).digest()).decode()
     wrong = base64.b64encode(bytes(32)).decode()

@@ -163,6 +163,9 @@ def test_a_batch_over_its_limits(tight_server: Server, tight_map: str) -> None:
     assert_problem(send(tight_server, tight_map, many, {"a": small}), 422, "invalid-request")
     heavy = {f"f{number}": b"\xff\xd8" + b"x" * 59_000 for number in range(8)}
     assert_problem(send(tight_server, tight_map, many, heavy), 413, "body-too-large")
+    files = [("f", ("f.jpg", small, "image/jpeg"))] * 4
+    queried = tight_server.client.post(f"/v1/maps/{tight_map}/query:batch", files=files)
+    assert "4 file parts; the limit is 3" in assert_problem(queried, 422, "invalid-request")["detail"]
     crowd = {f"f{number}": b"x" for number in range(60)}
     assert_problem(send(tight_server, tight_map, many, crowd), 413, "body-too-large")
     assert set(tight_server.places(tight_map)) == set()

@@ -188,9 +188,14 @@ def _size_of(headers: Mapping[str, str]) -> int:
 def _opened(path: Path) -> BinaryIO:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return path.open("ab" if path.exists() else "wb")
+        return open(path, "ab" if path.exists() else "wb", opener=_open_private)
     except OSError as error:
         raise TransferFailed(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _open_private(path: str, flags: int) -> int:
+    """For this user alone, if it is a new file: a map has pictures of rooms."""
+    return os.open(path, flags, 0o600)
 
 
 def _write(file: BinaryIO, content: bytes) -> None:

@@ -184,3 +184,24 @@ def test_a_service_chooses_no_file(placerec: Placerec, tmp_path: Path, name: obj
         refused = placerec("backup", "create", folder, "--url", address, status=1)
     assert "no id of a map" in refused.stderr
     assert sorted(path for path in tmp_path.rglob("*") if path.name != "LOCK") == before
+
+
+def test_no_map_takes_the_place_of_another_file_of_a_backup(
+    placerec: Placerec, url: list[str], server: Server, tmp_path: Path
+) -> None:
+    """Maps whose names are those of the index and of another map's file."""
+    server.create_map("plain")
+    assert server.enrol("plain", "p", jpeg(0)).status_code == 201
+    folder = tmp_path / "backup"
+    placerec("backup", "create", folder, "--map", "plain", *url)
+    (file,) = folder.glob("plain.*.tar")
+    before = file.read_bytes()
+    named = ["index.json", file.name]
+    for name in named:
+        server.create_map(name)
+        placerec("backup", "create", folder, "--map", name, *url)
+    assert file.read_bytes() == before
+    placerec("backup", "verify", folder)
+    index = json.loads((folder / "index.json").read_text())["maps"]
+    assert {entry["id"] for entry in index} == {"plain", *named}
+    assert {path.name for path in folder.iterdir()} == {"LOCK", "index.json", *(entry["file"] for entry in index)}
