@@ -87,7 +87,7 @@ FIRST_STEPS, MOST_STEPS = 5, 15
 ENOUGH = 0.05
 """The cost is twice a logarithm of a likelihood; a step that lowers it by less is the last."""
 
-_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """From a camera's optical frame (right, down, ahead) to the axes of ROS (ahead, left, up)."""
 
 
@@ -120,6 +120,52 @@ class RelativeView:
         return float(np.degrees(np.sqrt(self.covariance[2, 2])))
 
 
+@dataclass(frozen=True)
+class Sighting:
+    """The points that a query and a place see.
+
+    numbers: int64 [n], of the query's keypoints; ascending.
+    query, place: unit vectors in the optical frames (right, down, ahead), float64 [n, 3]; NaN where not known.
+    fitting: bool [n], the inliers of the verification.
+    pixel: the angle in radians that a pixel covers, of a frame with a longer side of LONGEST_SIDE.
+    """
+
+    numbers: NDArray[np.int64]
+    query: Array
+    place: Array
+    fitting: NDArray[np.bool_]
+    pixel: float
+
+    def usable(self) -> NDArray[np.bool_]:
+        """Which points fit and are seen in known directions, bool [n]."""
+        known = np.isfinite(self.place).all(axis=1) & np.isfinite(self.query).all(axis=1)
+        return np.asarray(self.fitting & known)
+
+
+def sighting_of(
+    query: Keypoints,
+    place: Keypoints,
+    verification: Verification,
+    query_camera: Intrinsics | None = None,
+    place_camera: Intrinsics | None = None,
+) -> Sighting | None:
+    """The points that a query shares with a place that was verified; arguments and errors as :func:`relative_view`.
+
+    Returns:
+        None if the evidence is less than LEAST_EVIDENCE.
+    """
+    if verification.evidence < LEAST_EVIDENCE:
+        return None
+    ours, theirs = verification.matches.T
+    seen, known = query.pixels()[ours], place.pixels()[theirs]
+    at, shown = (
+        _pinhole(frame) if camera is None else camera.of_size(frame.width, frame.height)
+        for camera, frame in ((query_camera, query), (place_camera, place))
+    )
+    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
+    return Sighting(ours, at.bearings(seen), shown.bearings(known), verification.inliers, float(pixel))
+
+
 def relative_view(
     query: Keypoints,
     place: Keypoints,
@@ -138,18 +184,11 @@ def relative_view(
     Raises:
         UnfitIntrinsics: intrinsics do not fit the frame.
     """
-    if verification.evidence < LEAST_EVIDENCE:
+    sighting = sighting_of(query, place, verification, query_camera, place_camera)
+    if sighting is None:
         return None
-    ours, theirs = verification.matches.T
-    seen, known = query.pixels()[ours], place.pixels()[theirs]
-    cameras = [
-        None if camera is None else camera.of_size(frame.width, frame.height)
-        for camera, frame in ((query_camera, query), (place_camera, place))
-    ]
-    at, shown = (camera or _pinhole(frame) for camera, frame in zip(cameras, (query, place), strict=True))
-    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
-    view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
-    return _by_assumed_field(view) if view is not None and None in cameras else view
+    view = view_of_bearings(sighting.place, sighting.query, sighting.pixel)
+    return _by_assumed_field(view) if view is not None and None in (query_camera, place_camera) else view
 
 
 def _by_assumed_field(view: RelativeView) -> RelativeView:
@@ -467,9 +506,9 @@ def _view(p: Array, q: Array, model: _Model, noise: float) -> RelativeView:
     inliers = int((np.square(residuals).sum(axis=1) < (3 * noise) ** 2).sum())
     # A rotation that precedes R by -Rᵀ ω is one that follows it by ω; both in the axes of ROS.
     change = np.zeros((6, 6))
-    change[:3, :3], change[3:, 3:] = -_BODY @ model.rotation.T, _BODY
-    turn = _BODY @ model.rotation.T @ _BODY.T
-    return RelativeView(turn, _BODY @ centre, change @ covariance @ change.T, inliers, "intrinsics")
+    change[:3, :3], change[3:, 3:] = -BODY @ model.rotation.T, BODY
+    turn = BODY @ model.rotation.T @ BODY.T
+    return RelativeView(turn, BODY @ centre, change @ covariance @ change.T, inliers, "intrinsics")
 
 
 def _mixture(views: Sequence[tuple[float, RelativeView]]) -> RelativeView:

@@ -24,7 +24,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.geometry.pose import RelativeView
+from core.geometry.bundle import Stand, bundle_stand
+from core.geometry.pose import RelativeView, Sighting
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
@@ -50,6 +51,16 @@ covariance says."""
 CONTRADICTION = 30.0
 """Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
 _STEPS = 8
+BUNDLED = 4
+"""The most places whose points are adjusted together."""
+BUNDLE_REACH = 30.0
+"""Metres from the best match within which places are."""
+APART = 0.2
+"""Metres that they are apart at least: looks from one position say nothing of distances."""
+BUNDLE_HEADING = float(np.radians(1))
+"""Deviation of the errors of places' headings, where several places show them."""
+SLOPE = float(np.radians(4))
+"""Deviation of the slope of the ground, by which heights of places that poses do not give are off."""
 
 
 def _unknown() -> Vectors:
@@ -140,6 +151,7 @@ def estimate_pose(
     reach: float,
     used: int = 20,
     views: Sequence[RelativeView | None] | None = None,
+    sightings: Sequence[Sighting | None] | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose of a frame from its matches.
 
@@ -194,6 +206,8 @@ def estimate_pose(
         yaw = float(np.radians(90 - heading if on_earth else heading))
         place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
         found = _fused(found, place_views, yaw, mean, axes, on_earth)
+    if heading is not None and sightings and sightings[0] is not None:
+        found = _bundled(found, covariance, places, mean, axes, on_earth, seen.get(0), sightings)
     return found.without_height() if on_earth else found
 
 
@@ -248,6 +262,86 @@ def _fused(
         covariance=covariance,
         source="field-of-view" if "field-of-view" in sources else "intrinsics",
     )
+
+
+def _bundled(
+    found: PoseEstimate,
+    prior: Vectors,
+    places: Whereabouts,
+    mean: Vectors,
+    axes: Vectors,
+    on_earth: bool,
+    view: RelativeView | None,
+    sightings: Sequence[Sighting | None],
+) -> PoseEstimate:
+    """The estimate by the points of several places together; unchanged if they do not tell it."""
+    local = (places.position - mean) @ axes.T
+    directions = _directions(places, axes, on_earth)
+    known = [
+        row
+        for row, sighting in enumerate(sightings)
+        if sighting is not None
+        and places.kind[row] == places.kind[0]
+        and np.isfinite(directions[row])
+        and np.linalg.norm(local[row] - local[0]) <= BUNDLE_REACH
+    ]
+    if not known or known[0] != 0:
+        return found
+    rows: list[int] = []
+    for row in [0, *sorted(known[1:], key=lambda row: -int(sightings[row].fitting.sum()))]:
+        if len(rows) < BUNDLED and all(np.linalg.norm(local[row] - local[other]) >= APART for other in rows):
+            rows.append(row)
+    if len(rows) < 2:
+        return found
+
+    def place(row: int) -> Stand:
+        height = PLACE_POSITION + SLOPE * float(np.linalg.norm(local[row] - local[0]))
+        covariance = np.diag(
+            np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height])
+        )
+        return Stand(local[row], _level(directions[row]), covariance)
+
+    stands = [place(row) for row in rows]
+    pose = found.pose
+    position, yaw = _of(pose, mean, axes, on_earth)
+    attitude = _level(yaw) if view is None else stands[0].attitude @ view.turn
+    loose = np.zeros((6, 6))
+    loose[:3, :3] = np.diag(np.full(3, LEVEL**2))
+    loose[2, 2] = TURN**2
+    loose[3:, 3:] = prior[:3, :3] * 4 + np.eye(3)
+    best = Stand(np.zeros(3), _level(yaw), loose)
+    stand = bundle_stand(best, stands, [sightings[row] for row in rows], Stand(position, attitude, loose))
+    if stand is None:
+        return found
+    covariance = found.covariance.copy()
+    which = [3, 4, 5, 2]
+    covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = stand.covariance[np.ix_(which, which)]
+    at, degrees = mean + stand.position @ axes, float(np.degrees(np.arctan2(stand.attitude[1, 0], stand.attitude[0, 0])))
+    if on_earth:
+        made = _geographic(at, (90 - degrees) % 360)
+    else:
+        made = Pose(x=at[0], y=at[1], z=at[2], heading=degrees % 360)
+    return replace(
+        found,
+        pose=made,
+        spread=float(np.sqrt(covariance[0, 0] + covariance[1, 1])),
+        heading_spread=float(np.degrees(np.sqrt(covariance[5, 5]))),
+        covariance=covariance,
+        places=len(rows),
+        source="intrinsics",
+    )
+
+
+def _level(angle: float) -> Vectors:
+    """The attitude of a level camera that looks in a direction counter-clockwise from x, [3, 3]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def _of(pose: Pose, mean: Vectors, axes: Vectors, on_earth: bool) -> tuple[Vectors, float]:
+    """The position of a pose from the mean, [3], and its heading counter-clockwise from x, in radians."""
+    assert pose.heading is not None
+    return (pose.position() - mean) @ axes.T, float(np.radians(90 - pose.heading if on_earth else pose.heading))
 
 
 def _missed(state: Vectors, place_views: _PlaceViews, number: int) -> tuple[Vectors, Vectors, Vectors]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from core.errors import UnfitIntrinsics
 from core.geometry.keypoints import Keypoints
-from core.geometry.pose import RelativeView, relative_view
+from core.geometry.pose import LEAST_EVIDENCE, RelativeView, Sighting, relative_view, sighting_of
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
@@ -170,6 +171,29 @@ def relative_views(
         views.append(view)
         used += view is not None
     return views, note
+
+
+def sightings(
+    map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
+) -> list[Sighting | None]:
+    """The points that the query shares with places that were verified, however far they are from the best match.
+
+    Returns:
+        One for each of the first candidates; None where the intrinsics of a camera are not known or do not fit.
+    """
+    query = stage.keypoints
+    if verifier is None or query is None or (camera := map_.cameras.intrinsics(verifier.camera)) is None:
+        return []
+    found: list[Sighting | None] = []
+    for row, one in zip(candidates.rows.tolist(), candidates.verifications, strict=False):
+        place, sighting = stage.stored.get(row), None
+        if one is not None and place is not None and one.evidence >= LEAST_EVIDENCE:
+            (known,) = map_.places_at([row])
+            shown = map_.cameras.intrinsics(None if known is None else known.camera)
+            with suppress(UnfitIntrinsics):
+                sighting = None if shown is None else sighting_of(query, place, one, camera, shown)
+        found.append(sighting)
+    return found
 
 
 def verified(candidates: Candidates, found: Sequence[Verification | None]) -> Candidates:
