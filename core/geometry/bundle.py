@@ -20,12 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, OUTLYING, Sighting
+from core.kernels import bundle as kernels
 
 Array = NDArray[np.float64]
 
@@ -37,8 +39,20 @@ NEARNESS_DEVIATION = 0.5
 """Prior deviation of a point's nearness, in 1 / m."""
 MOST_NEARNESS = 4.0
 """Nothing is seen from nearer than 25 cm."""
-LENGTHS = 0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0
+LENGTHS = -10.0, -7.0, -4.5, -2.5, -1.0, 0.0, 1.0, 2.5, 4.5, 7.0, 10.0
 """Metres that the query is tried to be from the best match, in the direction of its shift."""
+BLUR = 3.0
+"""Factor of the noise at first, so that more observations lead the way to the minimum."""
+FIRST_STEPS = 3
+"""From each start."""
+FOLLOWED = 3
+"""The starts that are followed to their minima."""
+SAME = 0.02
+"""Minima that differ by less, in metres, are one."""
+TEMPERATURE = 4.0
+"""Minima are weighed by the exponential of half their cost over this, as points are no independent evidence."""
+NEGLIGIBLE = 1e-3
+"""Weight from which on a minimum is a part of the mixture."""
 INFLATION = 1.5
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
 LEAST_FITTING = 0.5
@@ -65,22 +79,24 @@ class Stand:
 
 @dataclass(frozen=True)
 class _Bundle:
-    """The directions of n points in the query and in k places.
+    """The directions of n points in the query and in k places, o observations.
 
     bearings: of the query, in the camera's axes, [n, 3].
-    numbers: of each place, which of the points it sees, [m].
-    seen: of each place, their directions in the camera's axes, [m, 3].
-    noise: of each place, of a direction, in radians.
+    point: which of the points an observation is of, int64 [o].
+    place: which place sees it, from 1, int64 [o].
+    seen: its direction in the axes of the place's camera, [o, 3].
+    noise: of each place, of a direction, in radians, [k].
     stands: the query's prior, then those of the places.
     """
 
     bearings: Array
-    numbers: list[NDArray[np.int64]]
-    seen: list[Array]
-    noise: list[float]
+    point: NDArray[np.int64]
+    place: NDArray[np.int64]
+    seen: Array
+    noise: Array
     stands: list[Stand]
 
-    @property
+    @cached_property
     def information(self) -> Array:
         """The inverses of the priors' covariances on a diagonal of blocks, [6 k + 6, 6 k + 6]."""
         size = 6 * len(self.stands)
@@ -88,6 +104,67 @@ class _Bundle:
         for at, stand in enumerate(self.stands):
             made[6 * at : 6 * at + 6, 6 * at : 6 * at + 6] = np.linalg.inv(stand.covariance)
         return made
+
+    @cached_property
+    def scale(self) -> Array:
+        """One by the variance of what an observation misses, [o]: both pictures have noise, hence the two."""
+        return 1 / (2 * self.noise[self.place - 1] ** 2)
+
+    def state(self, query: Stand) -> _State:
+        """The state with the query's camera at some stand and the places where they are thought to be."""
+        stands = [query, *self.stands[1:]]
+        attitudes = np.array([stand.attitude for stand in stands], np.float64)
+        positions = np.array([stand.position for stand in stands], np.float64)
+        nearness = np.empty(len(self.bearings))
+        kernels.nearest(
+            self.bearings, self.point, self.place, self.seen, attitudes, positions, MOST_NEARNESS, nearness
+        )
+        return _State(attitudes, positions, nearness)
+
+    def squares(self, state: _State) -> Array:
+        """The squares of what observations miss, by their variance, [o]."""
+        found = np.empty(len(self.point))
+        kernels.squares(
+            self.bearings, self.point, self.place, self.seen, self.scale,
+            state.attitudes, state.positions, state.nearness, found,
+        )  # fmt: skip
+        return found
+
+    def cost(self, state: _State) -> float:
+        """Twice the negative log likelihood with the priors, but for constants."""
+        squares, missed = self.squares(state), self.prior_misses(state)
+        near = float(state.nearness @ state.nearness) / NEARNESS_DEVIATION**2
+        return float((squares / (1 + squares / OUTLYING**2)).sum() + missed @ self.information @ missed) + near
+
+    def prior_misses(self, state: _State) -> Array:
+        """By how much the poses miss their priors, [6 k + 6]."""
+        turned = state.attitudes @ np.array([stand.attitude.T for stand in self.stands])
+        shifted = state.positions - np.array([stand.position for stand in self.stands])
+        return np.hstack([[cv2.Rodrigues(turn)[0][:, 0] for turn in turned], shifted]).ravel()
+
+    def normal_equations(self, state: _State, inflation: float = 1.0) -> _Normal:
+        """The normal equations at a state, with the variance of observations multiplied by a factor."""
+        size, count = 6 * len(self.stands), len(self.bearings)
+        poses, gradient = self.information.copy(), self.information @ self.prior_misses(state)
+        prior = 1 / NEARNESS_DEVIATION**2
+        nearness, mixed, slope = np.full(count, prior), np.zeros((count, size)), state.nearness * prior
+        kernels.normal_equations(
+            self.bearings, self.point, self.place, self.seen, self.scale / inflation,
+            state.attitudes, state.positions, state.nearness, OUTLYING**2 / inflation,
+            poses, gradient, nearness, slope, mixed,
+        )  # fmt: skip
+        return _Normal(poses, nearness, mixed, gradient, slope)
+
+    def with_measured_noise(self, state: _State) -> _Bundle:
+        """The bundle with the noise that directions have, of each place by the median of the squares.
+
+        Of each point's values, the free nearness takes one.
+        """
+        squares = self.squares(state)
+        free = max(0.2, 1 - (len(self.bearings) + 6) / (2 * len(squares)))
+        medians = [float(np.median(squares[self.place == at])) for at in range(1, len(self.stands))]
+        factors = np.clip(np.sqrt(np.array(medians) / (1.386 * free)), *NOISE_LIMITS)
+        return replace(self, noise=self.noise * factors)
 
 
 @dataclass(frozen=True)
@@ -98,134 +175,12 @@ class _State:
     positions: Array
     nearness: Array
 
-
-def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting], start: Stand) -> Stand | None:
-    """Where the query's camera stands, by the points that it shares with places.
-
-    Args:
-        query: what is known of it otherwise, loosely.
-        places: at least one, the best match first.
-        sightings: of the points that the query shares with each.
-        start: where the search begins: its attitude is nearly right, and so is its direction from the best match.
-
-    Returns:
-        None if two places share too few points, if they do not differ in position, or if the best match does not fit.
-    """
-    used = list(range(len(places)))
-    while len(used) > 1:
-        bundle = _bundle(query, [places[at] for at in used], [sightings[at] for at in used])
-        if bundle is None:
-            return None
-        state = _minimized(bundle, _start(bundle, start))
-        bundle = _with_measured_noise(bundle, state)
-        state = _minimized(bundle, state)
-        shares = [float(np.mean(squares < 9)) for squares in _squares(bundle, state)]
-        worst = int(np.argmin(shares))
-        if shares[worst] >= LEAST_FITTING:
-            return _stand(bundle, state)
-        if worst == 0:
-            return None
-        used.pop(worst)
-    return None
-
-
-def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]) -> _Bundle | None:
-    """The points that are used; None if two places share too few."""
-    usable = [np.flatnonzero(sighting.usable()) for sighting in sightings]
-    most = 1 + max(int(sighting.numbers.max(initial=0)) for sighting in sightings)
-    count, bearings = np.zeros(most, np.int64), np.zeros((most, 3))
-    for sighting, rows in zip(sightings, usable, strict=True):
-        count[sighting.numbers[rows]] += 1
-        bearings[sighting.numbers[rows]] = sighting.query[rows] @ BODY.T
-    shared, single = np.flatnonzero(count > 1), np.flatnonzero(count == 1)
-    if len(shared) < LEAST_SHARED:
-        return None
-    chosen = _thinned(shared, MOST_POINTS)
-    chosen = np.r_[chosen, _thinned(single, MOST_POINTS - len(chosen))]
-    points = np.full(most, -1)
-    points[chosen] = np.arange(len(chosen))
-    numbers, seen = [], []
-    for sighting, rows in zip(sightings, usable, strict=True):
-        rows = rows[points[sighting.numbers[rows]] >= 0]
-        numbers.append(points[sighting.numbers[rows]])
-        seen.append(sighting.place[rows] @ BODY.T)
-    noise = [NOISE * sighting.pixel for sighting in sightings]
-    if min(len(rows) for rows in numbers) == 0:
-        return None
-    return _Bundle(bearings[chosen], numbers, seen, noise, [query, *places])
-
-
-def _thinned(values: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """At most ``most`` of them, evenly."""
-    return values[np.linspace(0, len(values) - 1, max(0, min(len(values), most))).round().astype(np.int64)]
-
-
-def _start(bundle: _Bundle, start: Stand) -> _State:
-    """The best state on the way from the best match to where the search begins."""
-    _, *places = bundle.stands
-    away = start.position - places[0].position
-    length = float(np.linalg.norm(away))
-    directions = [away / length, -away / length] if length > 1e-9 else [start.attitude[:, 0], -start.attitude[:, 0]]
-    tried = [start.position, *(places[0].position + far * way for way in directions for far in LENGTHS)]
-    attitudes = np.array([start.attitude, *(place.attitude for place in places)])
-    best, least = None, np.inf
-    for position in tried:
-        positions = np.array([position, *(place.position for place in places)])
-        state = _State(attitudes, positions, np.zeros(len(bundle.bearings)))
-        state = replace(state, nearness=_nearness(bundle, state))
-        cost = _cost(bundle, state)
-        if cost < least:
-            best, least = state, cost
-    assert best is not None
-    return best
-
-
-def _nearness(bundle: _Bundle, state: _State) -> Array:
-    """The nearness of each point at which its directions come nearest to each other, [n]."""
-    ahead = bundle.bearings @ state.attitudes[0].T
-    above, below = np.zeros(len(ahead)), np.full(len(ahead), 1e-9)
-    for at, (numbers, seen) in enumerate(zip(bundle.numbers, bundle.seen, strict=True), 1):
-        ray = seen @ state.attitudes[at].T
-        crossed = np.cross(ray, ahead[numbers])
-        moved = np.cross(ray, state.positions[0] - state.positions[at])
-        above[numbers] -= (crossed * moved).sum(axis=1)
-        below[numbers] += np.square(moved).sum(axis=1)
-    return np.clip(above / below, 0, MOST_NEARNESS)
-
-
-def _missed(bundle: _Bundle, state: _State, at: int) -> tuple[Array, Array, Array]:
-    """v / |v| - A_k p of a place's points, [m, 3], |v|, [m, 1], and A_k p, [m, 3]."""
-    numbers = bundle.numbers[at]
-    ahead = bundle.bearings[numbers] @ state.attitudes[0].T
-    v = ahead + state.nearness[numbers, np.newaxis] * (state.positions[0] - state.positions[at + 1])
-    length = np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
-    ray = bundle.seen[at] @ state.attitudes[at + 1].T
-    return v / length - ray, length, ray
-
-
-def _squares(bundle: _Bundle, state: _State) -> list[Array]:
-    """The squares of what is missed by the noise, of each place [m]; both pictures have noise, hence the two."""
-    return [
-        np.square(_missed(bundle, state, at)[0]).sum(axis=1) / (2 * noise**2) for at, noise in enumerate(bundle.noise)
-    ]
-
-
-def _prior_misses(bundle: _Bundle, state: _State) -> Array:
-    """By how much the poses miss their priors, [6 k + 6]."""
-    return np.concatenate(
-        [
-            np.r_[cv2.Rodrigues(attitude @ stand.attitude.T)[0][:, 0], position - stand.position]
-            for stand, attitude, position in zip(bundle.stands, state.attitudes, state.positions, strict=True)
-        ]
-    )
-
-
-def _cost(bundle: _Bundle, state: _State) -> float:
-    """Twice the negative log likelihood with the priors, but for constants."""
-    robust = sum(float((squares / (1 + squares / OUTLYING**2)).sum()) for squares in _squares(bundle, state))
-    missed = _prior_misses(bundle, state)
-    near = float(np.square(state.nearness / NEARNESS_DEVIATION).sum())
-    return robust + float(missed @ bundle.information @ missed) + near
+    def moved(self, step: Array, nearer: Array) -> _State:
+        """The state after a step of the poses, [6 k + 6], and of the nearnesses, [n]."""
+        steps = step.reshape(-1, 6)
+        turns = np.array([cv2.Rodrigues(turn)[0] for turn in steps[:, :3]])
+        nearness = np.clip(self.nearness + nearer, 0, MOST_NEARNESS)
+        return _State(turns @ self.attitudes, self.positions + steps[:, 3:], nearness)
 
 
 @dataclass(frozen=True)
@@ -246,91 +201,134 @@ class _Normal:
         return matrix, self.poses_gradient - shared.T @ self.nearness_gradient, diagonal
 
 
-def _normal_equations(bundle: _Bundle, state: _State, inflation: float = 1.0) -> _Normal:
-    size, count = 6 * len(bundle.stands), len(bundle.bearings)
-    information = bundle.information
-    poses, gradient = information.copy(), information @ _prior_misses(bundle, state)
-    prior = 1 / NEARNESS_DEVIATION**2
-    nearness, mixed, slope = np.full(count, prior), np.zeros((count, size)), state.nearness * prior
-    for at, (numbers, noise) in enumerate(zip(bundle.numbers, bundle.noise, strict=True)):
-        missed, length, ray = _missed(bundle, state, at)
-        seen = missed + ray
-        squares = np.square(missed).sum(axis=1) / (2 * noise**2)
-        weights = 1 / np.square(1 + squares / OUTLYING**2) / (2 * noise**2 * inflation)
-        tangent = (np.eye(3) - seen[:, :, np.newaxis] * seen[:, np.newaxis]) / length[:, :, np.newaxis]
-        near = state.nearness[numbers, np.newaxis, np.newaxis]
-        ahead = bundle.bearings[numbers] @ state.attitudes[0].T
-        jacobian = np.empty((len(numbers), 3, 12))
-        jacobian[:, :, :3] = -tangent @ _crossing(ahead)
-        jacobian[:, :, 3:6] = near * tangent
-        jacobian[:, :, 6:9] = _crossing(ray)
-        jacobian[:, :, 9:] = -near * tangent
-        by_nearness = tangent @ (state.positions[0] - state.positions[at + 1])
-        weighted = jacobian * weights[:, np.newaxis, np.newaxis]
-        which = np.r_[0:6, 6 * at + 6 : 6 * at + 12]
-        flat = weighted.reshape(-1, 12)
-        poses[np.ix_(which, which)] += flat.T @ jacobian.reshape(-1, 12)
-        gradient[which] += flat.T @ missed.reshape(-1)
-        nearness[numbers] += weights * np.square(by_nearness).sum(axis=1)
-        slope[numbers] += weights * (by_nearness * missed).sum(axis=1)
-        mixed[numbers[:, np.newaxis], which] += np.einsum("mij,mi->mj", weighted, by_nearness)
-    return _Normal(poses, nearness, mixed, gradient, slope)
+def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting], start: Stand) -> Stand | None:
+    """Where the query's camera stands, by the points that it shares with places.
+
+    Args:
+        query: what is known of it otherwise, loosely.
+        places: at least one, the best match first.
+        sightings: of the points that the query shares with each.
+        start: where the search begins: its attitude is nearly right, and so is its direction from the best match.
+
+    Returns:
+        None if two places share too few points, or if the best match does not fit.
+    """
+    used = list(range(len(places)))
+    while len(used) > 1:
+        bundle = _bundle(query, [places[at] for at in used], [sightings[at] for at in used])
+        if bundle is None:
+            return None
+        found, bundle = _minima(bundle, start)
+        fits = bundle.squares(found[0][1]) < 9
+        shares = [float(np.mean(fits[bundle.place == at])) for at in range(1, len(used) + 1)]
+        worst = int(np.argmin(shares))
+        if shares[worst] >= LEAST_FITTING:
+            return _mixture([(cost, _stand(bundle, state)) for cost, state in found])
+        if worst == 0:
+            return None
+        used.pop(worst)
+    return None
 
 
-def _crossing(vectors: Array) -> Array:
-    """The matrices of v ×, [m, 3, 3]."""
-    made = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    made[:, 0, 1], made[:, 0, 2], made[:, 1, 2] = -z, y, -x
-    made[:, 1, 0], made[:, 2, 0], made[:, 2, 1] = z, -y, x
-    return made
+def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]) -> _Bundle | None:
+    """The points that are used; None if two places share too few, or a place has none of them."""
+    usable = [np.flatnonzero(sighting.usable()) for sighting in sightings]
+    most = 1 + max(int(sighting.numbers.max(initial=0)) for sighting in sightings)
+    count, bearings = np.zeros(most, np.int64), np.zeros((most, 3))
+    for sighting, rows in zip(sightings, usable, strict=True):
+        count[sighting.numbers[rows]] += 1
+        bearings[sighting.numbers[rows]] = sighting.query[rows] @ BODY.T
+    shared, single = np.flatnonzero(count > 1), np.flatnonzero(count == 1)
+    if len(shared) < LEAST_SHARED:
+        return None
+    chosen = _thinned(shared, MOST_POINTS)
+    chosen = np.r_[chosen, _thinned(single, MOST_POINTS - len(chosen))]
+    points = np.full(most, -1)
+    points[chosen] = np.arange(len(chosen))
+    kept = [
+        rows[points[sighting.numbers[rows]] >= 0] for sighting, rows in zip(sightings, usable, strict=True)
+    ]
+    if min(map(len, kept)) == 0:
+        return None
+    pairs = list(zip(sightings, kept, strict=True))
+    return _Bundle(
+        bearings[chosen],
+        np.concatenate([points[sighting.numbers[rows]] for sighting, rows in pairs]),
+        np.repeat(np.arange(1, len(kept) + 1), list(map(len, kept))),
+        np.ascontiguousarray(np.concatenate([sighting.place[rows] for sighting, rows in pairs]) @ BODY.T),
+        np.array([NOISE * sighting.pixel for sighting in sightings]),
+        [query, *places],
+    )
 
 
-def _minimized(bundle: _Bundle, state: _State) -> _State:
-    """The state at the minimum of the cost that is reached from one (Levenberg and Marquardt)."""
-    cost, damping = _cost(bundle, state), 1e-3
-    normal = _normal_equations(bundle, state)
-    for _ in range(MOST_STEPS):
+def _thinned(values: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """At most ``most`` of them, evenly."""
+    return values[np.linspace(0, len(values) - 1, max(0, min(len(values), most))).round().astype(np.int64)]
+
+
+def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], _Bundle]:
+    """The minima of the cost, best first, and the bundle with the noise that was measured at the best one."""
+    best = bundle.stands[1]
+    away = start.position - best.position
+    length = float(np.linalg.norm(away))
+    direction = away / length if length > 1e-9 else start.attitude[:, 0]
+    tried = [start.position, *(best.position + far * direction for far in LENGTHS)]
+    blurred = replace(bundle, noise=bundle.noise * BLUR)
+    begun = [
+        _minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in tried
+    ]
+    begun.sort(key=lambda pair: pair[0])
+    followed = _distinct([_minimized(bundle, state) for _, state in begun[:FOLLOWED]])
+    bundle = bundle.with_measured_noise(followed[0][1])
+    return _distinct([_minimized(bundle, state) for _, state in followed]), bundle
+
+
+def _distinct(minima: list[tuple[float, _State]]) -> list[tuple[float, _State]]:
+    """The minima, best first, without those at which the query stands where it does at a better one."""
+    found: list[tuple[float, _State]] = []
+    for cost, state in sorted(minima, key=lambda pair: pair[0]):
+        at = state.positions[0]
+        if all(np.linalg.norm(at - other.positions[0]) > SAME for _, other in found):
+            found.append((cost, state))
+    return found
+
+
+def _minimized(bundle: _Bundle, state: _State, steps: int = MOST_STEPS) -> tuple[float, _State]:
+    """The cost and the state at the minimum that is reached from one (Levenberg and Marquardt)."""
+    cost, damping = bundle.cost(state), 1e-3
+    normal = bundle.normal_equations(state)
+    for _ in range(steps):
         matrix, right, diagonal = normal.reduced(damping)
         step = -np.linalg.solve(matrix, right)
-        nearer = -(normal.nearness_gradient + normal.mixed @ step) / diagonal
-        tried = _moved(state, step, nearer)
-        less = cost - _cost(bundle, tried)
+        tried = state.moved(step, -(normal.nearness_gradient + normal.mixed @ step) / diagonal)
+        less = cost - bundle.cost(tried)
         if less > 0:
             state, cost, damping = tried, cost - less, damping / 5
             if less < ENOUGH:
                 break
-            normal = _normal_equations(bundle, state)
+            normal = bundle.normal_equations(state)
         elif damping > 1e6:
             break
         else:
             damping *= 10
-    return state
-
-
-def _moved(state: _State, step: Array, nearer: Array) -> _State:
-    """The state after a step of the poses, [6 k + 6], and of the nearnesses, [n]."""
-    steps = step.reshape(-1, 6)
-    attitudes = np.array(
-        [cv2.Rodrigues(turn)[0] @ attitude for turn, attitude in zip(steps[:, :3], state.attitudes, strict=True)]
-    )
-    nearness = np.clip(state.nearness + nearer, 0, MOST_NEARNESS)
-    return _State(attitudes, state.positions + steps[:, 3:], nearness)
-
-
-def _with_measured_noise(bundle: _Bundle, state: _State) -> _Bundle:
-    """The bundle with the noise that directions have, by the median of the squares.
-
-    Of each place's two values for a point, the free nearness takes a part.
-    """
-    squares = np.concatenate(_squares(bundle, state))
-    free = max(0.2, 1 - (len(bundle.bearings) + 6) / (2 * len(squares)))
-    low, high = NOISE_LIMITS
-    factor = float(np.clip(np.sqrt(np.median(squares) / (1.386 * free)), low, high))
-    return replace(bundle, noise=[factor * noise for noise in bundle.noise])
+    return cost, state
 
 
 def _stand(bundle: _Bundle, state: _State) -> Stand:
-    matrix, _, _ = _normal_equations(bundle, state, INFLATION).reduced()
+    matrix, _, _ = bundle.normal_equations(state, INFLATION).reduced()
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     return Stand(state.positions[0], state.attitudes[0], covariance[:6, :6])
+
+
+def _mixture(minima: Sequence[tuple[float, Stand]]) -> Stand:
+    """Mean and covariance of the minima: their disagreement adds to the uncertainty of each."""
+    least, first = minima[0]
+    weights = np.array([np.exp((least - cost) / (2 * TEMPERATURE)) for cost, _ in minima])
+    weights = np.where(weights > NEGLIGIBLE, weights, 0) / weights[weights > NEGLIGIBLE].sum()
+    at = np.array(
+        [np.r_[cv2.Rodrigues(one.attitude @ first.attitude.T)[0][:, 0], one.position] for _, one in minima]
+    )
+    mean = weights @ at
+    within = np.einsum("k,kij->ij", weights, [one.covariance for _, one in minima])
+    covariance = within + (at - mean).T @ (weights[:, np.newaxis] * (at - mean))
+    return Stand(mean[3:], np.asarray(cv2.Rodrigues(mean[:3])[0] @ first.attitude), covariance)
