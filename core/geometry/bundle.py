@@ -39,8 +39,17 @@ NEARNESS_DEVIATION = 0.5
 """Prior deviation of a point's nearness, in 1 / m."""
 MOST_NEARNESS = 4.0
 """Nothing is seen from nearer than 25 cm."""
-LENGTHS = -10.0, -7.0, -4.5, -2.5, -1.0, 0.0, 1.0, 2.5, 4.5, 7.0, 10.0
+LENGTHS = tuple(np.linspace(-15, 15, 61).tolist())
 """Metres that the query is tried to be from the best match, in the direction of its shift."""
+FACTORS = 0.6, 1.0, 1.6
+"""Of the length at which the counts of shared points are best explained, the starts."""
+DECLINE, DECLINE_DEVIATION = 1.5, 0.5
+"""Power of the ratio of counts of shared points that gives the inverse ratio of distances, and the deviation of the
+logarithm."""
+LEAST_DISTANCE = 0.3
+"""Metres to a place from which on fewer points are shared."""
+LEAST_LIKENESS = 0.9
+"""Of the descriptors of points that a place other than the best match shares."""
 BLUR = 3.0
 """Factor of the noise at first, so that more observations lead the way to the minimum."""
 FIRST_STEPS = 3
@@ -87,6 +96,7 @@ class _Bundle:
     seen: its direction in the axes of the place's camera, [o, 3].
     noise: of each place, of a direction, in radians, [k].
     stands: the query's prior, then those of the places.
+    counts: of points that the query shares with each place, [k].
     """
 
     bearings: Array
@@ -95,6 +105,7 @@ class _Bundle:
     seen: Array
     noise: Array
     stands: list[Stand]
+    counts: Array
 
     @cached_property
     def information(self) -> Array:
@@ -134,7 +145,25 @@ class _Bundle:
         """Twice the negative log likelihood with the priors, but for constants."""
         squares, missed = self.squares(state), self.prior_misses(state)
         near = float(state.nearness @ state.nearness) / NEARNESS_DEVIATION**2
-        return float((squares / (1 + squares / OUTLYING**2)).sum() + missed @ self.information @ missed) + near
+        decline, _ = self.declines(state.positions)
+        return (
+            float((squares / (1 + squares / OUTLYING**2)).sum() + missed @ self.information @ missed)
+            + near
+            + float(decline @ decline)
+        )
+
+    def declines(self, positions: Array) -> tuple[Array, Array]:
+        """By how much the counts of shared points miss the query's distances, [k - 1], and the derivatives, [k - 1, 3].
+
+        Fewer points are shared from farther away, whatever the size of the scene.
+        """
+        away = positions[0] - positions[1:]
+        distances = np.sqrt(np.square(away).sum(axis=1) + LEAST_DISTANCE**2)
+        slopes = away / np.square(distances)[:, np.newaxis]
+        expected = DECLINE * np.log(self.counts / self.counts[0])
+        missed = np.log(distances[0] / distances) - expected
+        by = DECLINE_DEVIATION * np.sqrt(len(self.counts) - 1)
+        return missed[1:] / by, (slopes[0] - slopes[1:]) / by
 
     def prior_misses(self, state: _State) -> Array:
         """By how much the poses miss their priors, [6 k + 6]."""
@@ -153,6 +182,9 @@ class _Bundle:
             state.attitudes, state.positions, state.nearness, OUTLYING**2 / inflation,
             poses, gradient, nearness, slope, mixed,
         )  # fmt: skip
+        decline, by_position = self.declines(state.positions)
+        poses[3:6, 3:6] += by_position.T @ by_position
+        gradient[3:6] += by_position.T @ decline
         return _Normal(poses, nearness, mixed, gradient, slope)
 
     def with_measured_noise(self, state: _State) -> _Bundle:
@@ -232,7 +264,10 @@ def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sigh
 
 def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]) -> _Bundle | None:
     """The points that are used; None if two places share too few, or a place has none of them."""
-    usable = [np.flatnonzero(sighting.usable()) for sighting in sightings]
+    usable = [
+        np.flatnonzero(sighting.usable() & (sighting.likeness > LEAST_LIKENESS * (at > 0)))
+        for at, sighting in enumerate(sightings)
+    ]
     most = 1 + max(int(sighting.numbers.max(initial=0)) for sighting in sightings)
     count, bearings = np.zeros(most, np.int64), np.zeros((most, 3))
     for sighting, rows in zip(sightings, usable, strict=True):
@@ -258,6 +293,7 @@ def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]
         np.ascontiguousarray(np.concatenate([sighting.place[rows] for sighting, rows in pairs]) @ BODY.T),
         np.array([NOISE * sighting.pixel for sighting in sightings]),
         [query, *places],
+        np.array([sighting.fitting.sum() for sighting in sightings], np.float64),
     )
 
 
@@ -272,10 +308,19 @@ def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], 
     away = start.position - best.position
     length = float(np.linalg.norm(away))
     direction = away / length if length > 1e-9 else start.attitude[:, 0]
-    tried = [start.position, *(best.position + far * direction for far in LENGTHS)]
+    places = np.array([stand.position for stand in bundle.stands[1:]])
+
+    def unlikely(far: float) -> float:
+        decline, _ = bundle.declines(np.vstack([places[0] + far * direction, places]))
+        return float(decline @ decline)
+
+    likely = min(LENGTHS, key=unlikely)
     blurred = replace(bundle, noise=bundle.noise * BLUR)
     begun = [
-        _minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in tried
+        _minimized(
+            blurred, bundle.state(replace(start, position=places[0] + factor * likely * direction)), FIRST_STEPS
+        )
+        for factor in FACTORS
     ]
     begun.sort(key=lambda pair: pair[0])
     followed = _distinct([_minimized(bundle, state) for _, state in begun[:FOLLOWED]])

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from core.frames.intrinsics import Intrinsics
 from core.geometry.detection import LONGEST_SIDE
-from core.geometry.keypoints import Keypoints
+from core.geometry.keypoints import RESOLUTION, Keypoints
 from core.geometry.verification import CONFIDENCE, ITERATIONS, THRESHOLD, Verification
 
 Array = NDArray[np.float64]
@@ -127,6 +127,7 @@ class Sighting:
     numbers: int64 [n], of the query's keypoints; ascending.
     query, place: unit vectors in the optical frames (right, down, ahead), float64 [n, 3]; NaN where not known.
     fitting: bool [n], the inliers of the verification.
+    likeness: float64 [n], the cosine of both descriptors.
     pixel: the angle in radians that a pixel covers, of a frame with a longer side of LONGEST_SIDE.
     """
 
@@ -134,6 +135,7 @@ class Sighting:
     query: Array
     place: Array
     fitting: NDArray[np.bool_]
+    likeness: Array
     pixel: float
 
     def usable(self) -> NDArray[np.bool_]:
@@ -163,7 +165,8 @@ def sighting_of(
         for camera, frame in ((query_camera, query), (place_camera, place))
     )
     pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
-    return Sighting(ours, at.bearings(seen), shown.bearings(known), verification.inliers, float(pixel))
+    alike = np.einsum("nd,nd->n", query.descriptors[ours].astype(np.int64), place.descriptors[theirs]) / RESOLUTION**2
+    return Sighting(ours, at.bearings(seen), shown.bearings(known), verification.inliers, alike, float(pixel))
 
 
 def relative_view(
