@@ -39,9 +39,9 @@ NEARNESS_DEVIATION = 0.5
 """Prior deviation of a point's nearness, in 1 / m."""
 MOST_NEARNESS = 4.0
 """Nothing is seen from nearer than 25 cm."""
-LENGTHS = tuple(np.linspace(-15, 15, 61).tolist())
+LENGTHS = tuple(np.linspace(0.25, 15, 60).tolist())
 """Metres that the query is tried to be from the best match, in the direction of its shift."""
-FACTORS = 0.6, 1.0, 1.6
+FACTORS = -0.6, 0.5, 1.0, 1.7
 """Of the length at which the counts of shared points are best explained, the starts."""
 DECLINE, DECLINE_DEVIATION = 1.5, 0.5
 """Power of the ratio of counts of shared points that gives the inverse ratio of distances, and the deviation of the
