@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, OUTLYING, Sighting
+from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, Sighting
 from core.kernels import bundle as kernels
 
 Array = NDArray[np.float64]
@@ -39,11 +39,11 @@ NEARNESS_DEVIATION = 0.5
 """Prior deviation of a point's nearness, in 1 / m."""
 MOST_NEARNESS = 4.0
 """Nothing is seen from nearer than 25 cm."""
-LENGTHS = tuple(np.linspace(0.25, 15, 60).tolist())
+LENGTHS = np.linspace(0.25, 15, 60)
 """Metres that the query is tried to be from the best match, in the direction of its shift."""
 FACTORS = -0.6, 0.5, 1.0, 1.7
 """Of the length at which the counts of shared points are best explained, the starts."""
-DECLINE, DECLINE_DEVIATION = 1.5, 0.5
+DECLINE, DECLINE_DEVIATION = 1.5, 0.3
 """Power of the ratio of counts of shared points that gives the inverse ratio of distances, and the deviation of the
 logarithm."""
 LEAST_DISTANCE = 0.3
@@ -54,16 +54,22 @@ BLUR = 3.0
 """Factor of the noise at first, so that more observations lead the way to the minimum."""
 FIRST_STEPS = 3
 """From each start."""
-FOLLOWED = 3
+FOLLOWED = 4
 """The starts that are followed to their minima."""
 SAME = 0.02
 """Minima that differ by less, in metres, are one."""
-TEMPERATURE = 4.0
+TEMPERATURE = 20.0
 """Minima are weighed by the exponential of half their cost over this, as points are no independent evidence."""
 NEGLIGIBLE = 1e-3
 """Weight from which on a minimum is a part of the mixture."""
-INFLATION = 1.5
+INFLATION = 2.0
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
+OUTLYING = 2.0
+"""Residuals of this many deviations weigh a quarter (Geman and McClure, 1985); from afar, half of the matches are wrong."""
+CASES = 1.0
+"""Cases as which the prior of the errors of places' headings and positions counts beside what their pictures show."""
+LEAST_VARIANCE = 0.1
+"""Share of the prior's variance that is left of it at least."""
 LEAST_FITTING = 0.5
 """The share of a place's directions that are within three deviations; with less, the place is left out."""
 MOST_STEPS = 12
@@ -145,25 +151,40 @@ class _Bundle:
         """Twice the negative log likelihood with the priors, but for constants."""
         squares, missed = self.squares(state), self.prior_misses(state)
         near = float(state.nearness @ state.nearness) / NEARNESS_DEVIATION**2
-        decline, _ = self.declines(state.positions)
+        decline, _ = self.declines(state.positions[:1])
         return (
             float((squares / (1 + squares / OUTLYING**2)).sum() + missed @ self.information @ missed)
             + near
-            + float(decline @ decline)
+            + float(np.square(decline).sum())
         )
 
-    def declines(self, positions: Array) -> tuple[Array, Array]:
-        """By how much the counts of shared points miss the query's distances, [k - 1], and the derivatives, [k - 1, 3].
+    def declines(self, tried: Array) -> tuple[Array, Array]:
+        """By how much the counts of shared points miss distances of the query, and the derivatives.
 
         Fewer points are shared from farther away, whatever the size of the scene.
+
+        Args:
+            tried: positions of the query, [n, 3].
+
+        Returns:
+            [n, k - 1] and [n, k - 1, 3].
         """
-        away = positions[0] - positions[1:]
-        distances = np.sqrt(np.square(away).sum(axis=1) + LEAST_DISTANCE**2)
-        slopes = away / np.square(distances)[:, np.newaxis]
-        expected = DECLINE * np.log(self.counts / self.counts[0])
-        missed = np.log(distances[0] / distances) - expected
+        away = tried[:, np.newaxis] - self.places
+        squares = np.square(away).sum(axis=2) + LEAST_DISTANCE**2
+        logarithms, slopes = np.log(squares) / 2, away / squares[:, :, np.newaxis]
         by = DECLINE_DEVIATION * np.sqrt(len(self.counts) - 1)
-        return missed[1:] / by, (slopes[0] - slopes[1:]) / by
+        missed = logarithms[:, :1] - logarithms[:, 1:] - self.expected[1:]
+        return missed / by, (slopes[:, :1] - slopes[:, 1:]) / by
+
+    @cached_property
+    def expected(self) -> Array:
+        """The logarithms of the ratios of the query's distances from the best match and from places, [k]."""
+        return DECLINE * np.log(self.counts / self.counts[0])
+
+    @cached_property
+    def places(self) -> Array:
+        """Where the places are thought to be, [k, 3]."""
+        return np.array([stand.position for stand in self.stands[1:]])
 
     def prior_misses(self, state: _State) -> Array:
         """By how much the poses miss their priors, [6 k + 6]."""
@@ -182,21 +203,32 @@ class _Bundle:
             state.attitudes, state.positions, state.nearness, OUTLYING**2 / inflation,
             poses, gradient, nearness, slope, mixed,
         )  # fmt: skip
-        decline, by_position = self.declines(state.positions)
+        (decline,), (by_position,) = self.declines(state.positions[:1])
         poses[3:6, 3:6] += by_position.T @ by_position
         gradient[3:6] += by_position.T @ decline
         return _Normal(poses, nearness, mixed, gradient, slope)
 
     def with_measured_noise(self, state: _State) -> _Bundle:
-        """The bundle with the noise that directions have, of each place by the median of the squares.
+        """The bundle with the noise that directions have, and places' headings and positions.
 
-        Of each point's values, the free nearness takes one.
+        Directions: of each place by the median of the squares.  Of each point's values, the free nearness takes one.
+        Headings and positions in the plane: by the squares of what they miss, beside which the prior is CASES cases.
         """
         squares = self.squares(state)
         free = max(0.2, 1 - (len(self.bearings) + 6) / (2 * len(squares)))
         medians = [float(np.median(squares[self.place == at])) for at in range(1, len(self.stands))]
         factors = np.clip(np.sqrt(np.array(medians) / (1.386 * free)), *NOISE_LIMITS)
-        return replace(self, noise=self.noise * factors)
+        misses = np.square(self.prior_misses(state).reshape(-1, 6)[1:])
+        stands = [self.stands[0]]
+        for stand in self.stands[1:]:
+            covariance = stand.covariance.copy()
+            for which in ([2], [3, 4]):
+                known = covariance[which[0], which[0]]
+                total = CASES * known + misses[:, which].sum()
+                learnt = max(total / (CASES + (len(misses) - 1) * len(which)), LEAST_VARIANCE * known)
+                covariance[which, which] = learnt
+            stands.append(replace(stand, covariance=covariance))
+        return replace(self, noise=self.noise * factors, stands=stands)
 
 
 @dataclass(frozen=True)
@@ -308,17 +340,12 @@ def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], 
     away = start.position - best.position
     length = float(np.linalg.norm(away))
     direction = away / length if length > 1e-9 else start.attitude[:, 0]
-    places = np.array([stand.position for stand in bundle.stands[1:]])
-
-    def unlikely(far: float) -> float:
-        decline, _ = bundle.declines(np.vstack([places[0] + far * direction, places]))
-        return float(decline @ decline)
-
-    likely = min(LENGTHS, key=unlikely)
+    tried = best.position + LENGTHS[:, np.newaxis] * direction
+    likely = float(LENGTHS[np.square(bundle.declines(tried)[0]).sum(axis=1).argmin()])
     blurred = replace(bundle, noise=bundle.noise * BLUR)
     begun = [
         _minimized(
-            blurred, bundle.state(replace(start, position=places[0] + factor * likely * direction)), FIRST_STEPS
+            blurred, bundle.state(replace(start, position=best.position + factor * likely * direction)), FIRST_STEPS
         )
         for factor in FACTORS
     ]

@@ -57,7 +57,7 @@ BUNDLE_REACH = 30.0
 """Metres from the best match within which places are."""
 APART = 0.2
 """Metres that they are apart at least: looks from one position say nothing of distances."""
-BUNDLE_HEADING = float(np.radians(1))
+BUNDLE_HEADING = float(np.radians(0.5))
 """Deviation of the errors of places' headings, where several places show them."""
 SLOPE = float(np.radians(4))
 """Deviation of the slope of the ground, by which heights of places that poses do not give are off."""
