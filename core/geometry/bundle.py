@@ -31,7 +31,7 @@ from core.kernels import bundle as kernels
 
 Array = NDArray[np.float64]
 
-MOST_POINTS = 250
+MOST_POINTS = 160
 """More points are thinned out evenly, those first that only one place shares."""
 LEAST_SHARED = 12
 """Points that the query shares with two places at least: the scale is theirs."""
@@ -66,14 +66,14 @@ INFLATION = 2.0
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
 OUTLYING = 2.0
 """Residuals of this many deviations weigh a quarter (Geman and McClure, 1985); from afar, half of the matches are wrong."""
-CASES = 1.0
+CASES = 0.5
 """Cases as which the prior of the errors of places' headings and positions counts beside what their pictures show."""
-LEAST_VARIANCE = 0.1
+LEAST_VARIANCE = 0.04
 """Share of the prior's variance that is left of it at least."""
 LEAST_FITTING = 0.5
 """The share of a place's directions that are within three deviations; with less, the place is left out."""
-MOST_STEPS = 12
-ENOUGH = 0.05
+MOST_STEPS = 8
+ENOUGH = 1.0
 """The cost is twice a logarithm of a likelihood; a step that lowers it by less is the last."""
 
 

@@ -31,7 +31,7 @@ VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 """Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if no candidate has any, or the
 frame so few that they would say nothing."""
 
-MOST_VIEWS = 2
+MOST_VIEWS = 1
 """The most places whose geometry gives the pose: two directions meet in a point, and each takes some 20 ms."""
 
 CANDIDATES = 10
