@@ -58,7 +58,7 @@ FOLLOWED = 4
 """The starts that are followed to their minima."""
 SAME = 0.02
 """Minima that differ by less, in metres, are one."""
-TEMPERATURE = 20.0
+TEMPERATURE = 8.0
 """Minima are weighed by the exponential of half their cost over this, as points are no independent evidence."""
 NEGLIGIBLE = 1e-3
 """Weight from which on a minimum is a part of the mixture."""
@@ -343,11 +343,9 @@ def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], 
     tried = best.position + LENGTHS[:, np.newaxis] * direction
     likely = float(LENGTHS[np.square(bundle.declines(tried)[0]).sum(axis=1).argmin()])
     blurred = replace(bundle, noise=bundle.noise * BLUR)
+    starts = [start.position, *(best.position + factor * likely * direction for factor in FACTORS)]
     begun = [
-        _minimized(
-            blurred, bundle.state(replace(start, position=best.position + factor * likely * direction)), FIRST_STEPS
-        )
-        for factor in FACTORS
+        _minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in starts
     ]
     begun.sort(key=lambda pair: pair[0])
     followed = _distinct([_minimized(bundle, state) for _, state in begun[:FOLLOWED]])
