@@ -48,8 +48,8 @@ DECLINE, DECLINE_DEVIATION = 1.5, 0.3
 logarithm."""
 LEAST_DISTANCE = 0.3
 """Metres to a place from which on fewer points are shared."""
-LEAST_LIKENESS = 0.9
-"""Of the descriptors of points that a place other than the best match shares."""
+LEAST_LIKENESS = 0.95
+"""Of the descriptors of points that another place shares, as a share of the median of those of the best match."""
 BLUR = 3.0
 """Factor of the noise at first, so that more observations lead the way to the minimum."""
 FIRST_STEPS = 3
@@ -296,10 +296,12 @@ def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sigh
 
 def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]) -> _Bundle | None:
     """The points that are used; None if two places share too few, or a place has none of them."""
-    usable = [
-        np.flatnonzero(sighting.usable() & (sighting.likeness > LEAST_LIKENESS * (at > 0)))
-        for at, sighting in enumerate(sightings)
-    ]
+    best, *others = sightings
+    if not best.usable().any():
+        return None
+    alike = LEAST_LIKENESS * float(np.median(best.likeness[best.usable()]))
+    usable = [np.flatnonzero(best.usable())]
+    usable += [np.flatnonzero(sighting.usable() & (sighting.likeness > alike)) for sighting in others]
     most = 1 + max(int(sighting.numbers.max(initial=0)) for sighting in sightings)
     count, bearings = np.zeros(most, np.int64), np.zeros((most, 3))
     for sighting, rows in zip(sightings, usable, strict=True):
