@@ -279,17 +279,17 @@ def estimates(encoder: Encoder, network: XFeat, traverse: PosedTraverse) -> Iter
             numbers = {row: int(np.abs(traverse.poses[:, 0] - x[row]).argmin()) for row in near}
             verified = dict(zip(near, verify(query, [keypoints[number] for number in numbers.values()]), strict=True))
             best = keypoints[numbers[0]]
-            view = relative_view(query, best, verified[0])
-            made: list[PoseEstimate | None] = [estimate_pose(candidates.whereabouts, log_odds, reach, views=[view]), None]
+            views = [relative_view(query, best, verified[0])]
+            made = [estimate_pose(candidates.whereabouts, log_odds, reach, views=views), None]
             if (camera := traverse.camera) is not None:
-                view = relative_view(query, best, verified[0], camera, camera)
+                views = [relative_view(query, best, verified[0], camera, camera)]
                 shared = [
                     sighting_of(query, keypoints[numbers[row]], verified[row], camera, camera)
                     if row in verified
                     else None
                     for row in range(near[-1] + 1)
                 ]
-                made[1] = estimate_pose(candidates.whereabouts, log_odds, reach, views=[view], sightings=shared)
+                made[1] = estimate_pose(candidates.whereabouts, log_odds, reach, views=views, sightings=shared)
             yield true, answer.pose, made[0], made[1]
         atlas.close()
 

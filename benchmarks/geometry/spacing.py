@@ -146,9 +146,7 @@ def ask(encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder:
     queries = sorted(set(range(places[0], places[-1])) - set(places))
     question = Question(k=1, verify="always", camera=CAMERA)
     keypoints = traverse.keypoints
-    asked = [
-        Query(traverse.encodings[number], question, partial(keypoints.__getitem__, number)) for number in queries
-    ]
+    asked = [Query(traverse.encodings[number], question, partial(keypoints.__getitem__, number)) for number in queries]
     answers = locate(map_, encoder, asked)
     for number, answer in zip(queries, answers, strict=True):
         found.asked.append(number)

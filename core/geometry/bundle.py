@@ -65,7 +65,9 @@ NEGLIGIBLE = 1e-3
 INFLATION = 2.0
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
 OUTLYING = 2.0
-"""Residuals of this many deviations weigh a quarter (Geman and McClure, 1985); from afar, half of the matches are wrong."""
+"""Residuals of this many deviations weigh a quarter (Geman and McClure, 1985).
+
+Of matches of frames that are 10 m apart, half are wrong along the epipolar line, where verification cannot tell."""
 CASES = 0.5
 """Cases as which the prior of the errors of places' headings and positions counts beside what their pictures show."""
 LEAST_VARIANCE = 0.04
@@ -133,9 +135,7 @@ class _Bundle:
         attitudes = np.array([stand.attitude for stand in stands], np.float64)
         positions = np.array([stand.position for stand in stands], np.float64)
         nearness = np.empty(len(self.bearings))
-        kernels.nearest(
-            self.bearings, self.point, self.place, self.seen, attitudes, positions, MOST_NEARNESS, nearness
-        )
+        kernels.nearest(self.bearings, self.point, self.place, self.seen, attitudes, positions, MOST_NEARNESS, nearness)
         return _State(attitudes, positions, nearness)
 
     def squares(self, state: _State) -> Array:
@@ -314,9 +314,7 @@ def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]
     chosen = np.r_[chosen, _thinned(single, MOST_POINTS - len(chosen))]
     points = np.full(most, -1)
     points[chosen] = np.arange(len(chosen))
-    kept = [
-        rows[points[sighting.numbers[rows]] >= 0] for sighting, rows in zip(sightings, usable, strict=True)
-    ]
+    kept = [rows[points[sighting.numbers[rows]] >= 0] for sighting, rows in zip(sightings, usable, strict=True)]
     if min(map(len, kept)) == 0:
         return None
     pairs = list(zip(sightings, kept, strict=True))
@@ -346,9 +344,7 @@ def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], 
     likely = float(LENGTHS[np.square(bundle.declines(tried)[0]).sum(axis=1).argmin()])
     blurred = replace(bundle, noise=bundle.noise * BLUR)
     starts = [start.position, *(best.position + factor * likely * direction for factor in FACTORS)]
-    begun = [
-        _minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in starts
-    ]
+    begun = [_minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in starts]
     begun.sort(key=lambda pair: pair[0])
     followed = _distinct([_minimized(bundle, state) for _, state in begun[:FOLLOWED]])
     bundle = bundle.with_measured_noise(followed[0][1])
@@ -397,9 +393,7 @@ def _mixture(minima: Sequence[tuple[float, Stand]]) -> Stand:
     least, first = minima[0]
     weights = np.array([np.exp((least - cost) / (2 * TEMPERATURE)) for cost, _ in minima])
     weights = np.where(weights > NEGLIGIBLE, weights, 0) / weights[weights > NEGLIGIBLE].sum()
-    at = np.array(
-        [np.r_[cv2.Rodrigues(one.attitude @ first.attitude.T)[0][:, 0], one.position] for _, one in minima]
-    )
+    at = np.array([np.r_[cv2.Rodrigues(one.attitude @ first.attitude.T)[0][:, 0], one.position] for _, one in minima])
     mean = weights @ at
     within = np.einsum("k,kij->ij", weights, [one.covariance for _, one in minima])
     covariance = within + (at - mean).T @ (weights[:, np.newaxis] * (at - mean))

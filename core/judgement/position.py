@@ -13,6 +13,9 @@ agree with each place's shift s and turn t,
 
 with the place's position a, its heading φ and its attitude W.  The errors of views are not independent, as they share
 the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).
+
+Where the best match and another place share points with the query and the intrinsics are known, that estimate is only
+where a bundle adjustment begins (:mod:`core.geometry.bundle`).  It gets the mean of the places as a prior that is wide.
 """
 
 from __future__ import annotations
@@ -166,6 +169,8 @@ def estimate_pose(
         reach: metres from the best match within which other matches belong to its answer.
         views: how the query's camera stands to those of the first places, in their order; None where a place was not
             verified.  The heading of a place is taken for the direction in which its camera looks.
+        sightings: the points that the query shares with the first places, however far they are from the best match, by
+            the intrinsics of both cameras; None where these are not known or a place was not verified.
 
     Returns:
         None if there is no match, or the best one has no pose.
@@ -248,11 +253,7 @@ def _fused(
     posterior = np.linalg.inv(normal)
     which = [0, 1, 2, 5]
     covariance[np.ix_(which, which)] = posterior[:4, :4]
-    position, degrees = mean + state[:3] @ axes, float(np.degrees(state[3]))
-    if on_earth:
-        pose = _geographic(position, (90 - degrees) % 360)
-    else:
-        pose = Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
+    pose = _pose_at(mean + state[:3] @ axes, float(np.degrees(state[3])), on_earth)
     sources = {place_views.views[number].source for number in retained}
     return replace(
         found,
@@ -277,18 +278,18 @@ def _bundled(
     """The estimate by the points of several places together; unchanged if they do not tell it."""
     local = (places.position - mean) @ axes.T
     directions = _directions(places, axes, on_earth)
-    known = [
-        row
+    shared = {
+        row: sighting
         for row, sighting in enumerate(sightings)
         if sighting is not None
         and places.kind[row] == places.kind[0]
         and np.isfinite(directions[row])
         and np.linalg.norm(local[row] - local[0]) <= BUNDLE_REACH
-    ]
-    if not known or known[0] != 0:
+    }
+    if 0 not in shared:
         return found
     rows: list[int] = []
-    for row in [0, *sorted(known[1:], key=lambda row: -int(sightings[row].fitting.sum()))]:
+    for row in sorted(shared, key=lambda row: (row > 0, -int(shared[row].fitting.sum()))):
         if len(rows) < BUNDLED and all(np.linalg.norm(local[row] - local[other]) >= APART for other in rows):
             rows.append(row)
     if len(rows) < 2:
@@ -296,31 +297,25 @@ def _bundled(
 
     def place(row: int) -> Stand:
         height = PLACE_POSITION + SLOPE * float(np.linalg.norm(local[row] - local[0]))
-        covariance = np.diag(
-            np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height])
-        )
+        covariance = np.diag(np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height]))
         return Stand(local[row], _level(directions[row]), covariance)
 
     stands = [place(row) for row in rows]
-    pose = found.pose
-    position, yaw = _of(pose, mean, axes, on_earth)
+    position, yaw = _of(found.pose, mean, axes, on_earth)
     attitude = _level(yaw) if view is None else stands[0].attitude @ view.turn
     loose = np.zeros((6, 6))
     loose[:3, :3] = np.diag(np.full(3, LEVEL**2))
     loose[2, 2] = TURN**2
     loose[3:, 3:] = prior[:3, :3] * 4 + np.eye(3)
     best = Stand(np.zeros(3), _level(yaw), loose)
-    stand = bundle_stand(best, stands, [sightings[row] for row in rows], Stand(position, attitude, loose))
+    stand = bundle_stand(best, stands, [shared[row] for row in rows], Stand(position, attitude, loose))
     if stand is None:
         return found
     covariance = found.covariance.copy()
     which = [3, 4, 5, 2]
     covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = stand.covariance[np.ix_(which, which)]
-    at, degrees = mean + stand.position @ axes, float(np.degrees(np.arctan2(stand.attitude[1, 0], stand.attitude[0, 0])))
-    if on_earth:
-        made = _geographic(at, (90 - degrees) % 360)
-    else:
-        made = Pose(x=at[0], y=at[1], z=at[2], heading=degrees % 360)
+    ahead = stand.attitude[:, 0]
+    made = _pose_at(mean + stand.position @ axes, float(np.degrees(np.arctan2(ahead[1], ahead[0]))), on_earth)
     return replace(
         found,
         pose=made,
@@ -330,6 +325,13 @@ def _bundled(
         places=len(rows),
         source="intrinsics",
     )
+
+
+def _pose_at(position: Vectors, degrees: float, on_earth: bool) -> Pose:
+    """The pose at a position, [3], with a heading counter-clockwise from the first axis."""
+    if on_earth:
+        return _geographic(position, (90 - degrees) % 360)
+    return Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
 
 
 def _level(angle: float) -> Vectors:

@@ -68,8 +68,8 @@ def normal_equations(  # type: ignore[no-untyped-def]
     """Add the observations to the normal equations.
 
     Values are a rotation about the world's axes that follows the attitude and a shift, for each camera, and nearnesses.
-    ``poses`` is [6 k + 6, 6 k + 6] with the gradient [6 k + 6], ``diagonal`` and ``slope`` are those of nearnesses, [n],
-    and ``mixed`` is [n, 6 k + 6].
+    ``poses`` is [6 k + 6, 6 k + 6] with the gradient [6 k + 6], ``diagonal`` and ``slope`` are those of nearnesses,
+    [n], and ``mixed`` is [n, 6 k + 6].
     """
     ray, ahead, v, missed, by_nearness = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     jacobian, tangent = np.zeros((3, 12)), np.empty((3, 3))

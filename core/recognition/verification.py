@@ -173,9 +173,7 @@ def relative_views(
     return views, note
 
 
-def sightings(
-    map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
-) -> list[Sighting | None]:
+def sightings(map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None) -> list[Sighting | None]:
     """The points that the query shares with places that were verified, however far they are from the best match.
 
     Returns:

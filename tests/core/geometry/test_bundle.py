@@ -112,9 +112,7 @@ def test_a_place_that_only_looks_alike_is_left_out() -> None:
     places = [stand((0, 0, 0)), stand((4, 0, 0)), stand((-4, 0, 0))]
     shared = sightings(query, places, random)
     strange = [*places, stand((10, 12, 0), 90)]  # its picture is that of the second place
-    found = bundle_stand(
-        replace(places[0], covariance=LOOSE), strange, [*shared, shared[1]], begun(query, places[0])
-    )
+    found = bundle_stand(replace(places[0], covariance=LOOSE), strange, [*shared, shared[1]], begun(query, places[0]))
     assert found is not None and np.linalg.norm((found.position - query.position)[:2]) < 0.3
 
 
@@ -147,7 +145,7 @@ def test_the_normal_equations_are_those_of_the_cost() -> None:
     """Of small residuals the robust cost is the sum of their squares, whose slope is twice the gradient."""
     random = np.random.default_rng(7)
     query, places = stand((1, 0.2, 0.1), 2), [stand((0, 0, 0)), stand((3, 0.1, 0), 1)]
-    bearings = random.normal(0, 1, (6, 3)) + [5, 0, 0]
+    bearings = random.normal(0, 1, (6, 3)) + np.array([5, 0, 0])
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
     point, place = np.tile(np.arange(6), 2), np.repeat([1, 2], 6)
     attitudes = np.array([one.attitude for one in (query, *places)])
