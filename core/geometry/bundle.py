@@ -367,7 +367,7 @@ def _minimized(bundle: _Bundle, state: _State, steps: int = MOST_STEPS) -> tuple
     normal = bundle.normal_equations(state)
     for _ in range(steps):
         matrix, right, diagonal = normal.reduced(damping)
-        step = -np.linalg.solve(matrix, right)
+        step = -np.asarray(np.linalg.solve(matrix, right), np.float64)
         tried = state.moved(step, -(normal.nearness_gradient + normal.mixed @ step) / diagonal)
         less = cost - bundle.cost(tried)
         if less > 0:
