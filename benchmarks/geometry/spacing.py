@@ -1,10 +1,10 @@
 """How far off a pose is where the places of a map are far apart, and whether its covariance says so.
 
-    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2]
+    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2] [--auto]
 
 The frames of kitti_short stand about 1.2 m apart, with measured poses.  Every second, fourth, … of them is a place of a
-map, with its x, y and heading and the camera's intrinsics.  The others are asked with ``verify`` ``always``.  Maps that
-begin at other frames give more cases.
+map, with its x, y and heading and the camera's intrinsics.  The others are asked with ``verify`` ``always``, or
+``auto``.  Maps that begin at other frames give more cases.
 
 Only recognized frames have a pose.  The normalized estimation error squared, e^T P^-1 e over the number of its values,
 is 1 on average if a covariance P is right, and less if it is careful (Bar-Shalom, Li and Kirubarajan, 2001, section
@@ -37,7 +37,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import load_xfeat
 from core.places import PlaceFields, Pose
-from core.recognition.question import Query, Question
+from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import describe, locate
 from core.storage import Atlas
 
@@ -113,16 +113,18 @@ def measured_traverse(encoder: Encoder, folder: Path) -> MeasuredTraverse:
     )
 
 
-def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int) -> Outcome:
+def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify) -> Outcome:
     """What is found with every ``spacing``-th frame as a place, in maps that begin at several frames."""
     found = Outcome()
     for start in np.unique(np.linspace(0, spacing, starts, endpoint=False).astype(int)).tolist():
         with tempfile.TemporaryDirectory() as folder:
-            ask(encoder, traverse, list(range(start, len(traverse.frames), spacing)), Path(folder), found)
+            ask(encoder, traverse, list(range(start, len(traverse.frames), spacing)), Path(folder), when, found)
     return found
 
 
-def ask(encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, found: Outcome) -> None:
+def ask(
+    encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, when: Verify, found: Outcome
+) -> None:
     """Add what is found with some frames as places and the others between the first and the last one as queries."""
     atlas = Atlas(folder)
     settings = MapSettings(keep="none")
@@ -144,7 +146,7 @@ def ask(encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder:
         ]
     )
     queries = sorted(set(range(places[0], places[-1])) - set(places))
-    question = Question(k=1, verify="always", camera=CAMERA)
+    question = Question(k=1, verify=when, camera=CAMERA)
     keypoints = traverse.keypoints
     asked = [Query(traverse.encodings[number], question, partial(keypoints.__getitem__, number)) for number in queries]
     answers = locate(map_, encoder, asked)
@@ -168,11 +170,13 @@ def main(
     data: Annotated[Path, typer.Option(help="Folder of eval/.")] = Path("../shared/datasets"),
     spacings: Annotated[str, typer.Option(help="Frames from place to place, separated by commas.")] = SPACINGS,
     starts: Annotated[int, typer.Option(min=1, help="Maps of each spacing, which begin at different frames.")] = 2,
+    auto: Annotated[bool, typer.Option(help="Verify where the scores leave doubt or a pose is wanted.")] = False,
 ) -> None:
     """Measure, print a table and write JSON."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     traverse = measured_traverse(encoder, data / "eval" / "kitti_short")
-    found = {int(spacing): outcome(encoder, traverse, int(spacing), starts) for spacing in spacings.split(",")}
+    when: Verify = "auto" if auto else "always"
+    found = {int(spacing): outcome(encoder, traverse, int(spacing), starts, when) for spacing in spacings.split(",")}
     rows = [{"frames apart": spacing, **one.row()} for spacing, one in found.items() if one.distances]
     columns = list(rows[0]) if rows else []
     figures = {
@@ -189,7 +193,9 @@ def main(
         },
     }
     title = "Poses in maps of kitti_short with places far apart"
-    report("pose_spacing", title, columns, [list(row.values()) for row in rows], figures)
+    report(
+        "pose_spacing_auto" if auto else "pose_spacing", title, columns, [list(row.values()) for row in rows], figures
+    )
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from core.geometry.keypoints import Keypoints
 from core.geometry.pose import LEAST_EVIDENCE, RelativeView, Sighting, relative_view, sighting_of
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
+from core.judgement.position import APART, BUNDLE_REACH
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
@@ -32,7 +33,10 @@ VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 frame so few that they would say nothing."""
 
 MOST_VIEWS = 1
-"""The most places whose geometry gives the pose: two directions meet in a point, and each takes some 20 ms."""
+"""The most places whose turn and shift give the pose, or where a search for it begins; each takes some 20 ms."""
+
+NEIGHBOURS = 2
+"""Places beside the best match that are compared for the sake of the pose where no others were verified."""
 
 CANDIDATES = 10
 """How many places are verified at most: five lose 0.027 of the recall@1 on lip6, and fifteen gain 0.002."""
@@ -176,22 +180,43 @@ def relative_views(
 def sightings(map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None) -> list[Sighting | None]:
     """The points that the query shares with places that were verified, however far they are from the best match.
 
+    If only the best match was, its neighbours are compared as well: one place does not tell how far the query is.
+
     Returns:
         One for each of the first candidates; None where the intrinsics of a camera are not known or do not fit.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
     """
     query = stage.keypoints
     if verifier is None or query is None or (camera := map_.cameras.intrinsics(verifier.camera)) is None:
         return []
-    found: list[Sighting | None] = []
-    for row, one in zip(candidates.rows.tolist(), candidates.verifications, strict=False):
-        place, sighting = stage.stored.get(row), None
-        if one is not None and place is not None and one.evidence >= LEAST_EVIDENCE:
-            (known,) = map_.places_at([row])
+    compared = {at: one for at, one in enumerate(candidates.verifications) if one is not None}
+    stored = {at: stage.stored.get(int(candidates.rows[at])) for at in compared}
+    if list(compared) == [0] and compared[0].evidence >= LEAST_EVIDENCE:
+        around = _around(candidates)
+        there = zip(around, map_.keypoints_at(candidates.rows[around].tolist()), strict=True)
+        more = {at: keypoints for at, keypoints in there if keypoints is not None}
+        stored |= more
+        compared |= dict(zip(more, verify(query, list(more.values())), strict=True))
+    found: list[Sighting | None] = [None] * (max(compared, default=-1) + 1)
+    for at, one in compared.items():
+        place = stored[at]
+        if place is not None and one.evidence >= LEAST_EVIDENCE:
+            (known,) = map_.places_at([int(candidates.rows[at])])
             shown = map_.cameras.intrinsics(None if known is None else known.camera)
             with suppress(UnfitIntrinsics):
-                sighting = None if shown is None else sighting_of(query, place, one, camera, shown)
-        found.append(sighting)
+                found[at] = None if shown is None else sighting_of(query, place, one, camera, shown)
     return found
+
+
+def _around(candidates: Candidates) -> list[int]:
+    """The candidates nearest to the best match that do not stand where it does, at most NEIGHBOURS."""
+    places = candidates.whereabouts
+    distances = np.linalg.norm(places.position - places.position[0], axis=1)
+    usable = (places.kind == places.kind[0]) & (distances >= APART) & (distances <= BUNDLE_REACH)
+    order = np.argsort(np.where(usable, distances, np.inf), kind="stable")[:NEIGHBOURS]
+    return order[usable[order]].tolist()
 
 
 def verified(candidates: Candidates, found: Sequence[Verification | None]) -> Candidates:
