@@ -61,7 +61,7 @@ class MeasuredTraverse:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SpacingOutcome:
     """What was found at one spacing; distances to the best place in metres, one for each recognized frame."""
 
     asked: list[int] = field(default_factory=list)
@@ -113,9 +113,9 @@ def measured_traverse(encoder: Encoder, folder: Path) -> MeasuredTraverse:
     )
 
 
-def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify) -> Outcome:
+def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify) -> SpacingOutcome:
     """What is found with every ``spacing``-th frame as a place, in maps that begin at several frames."""
-    found = Outcome()
+    found = SpacingOutcome()
     for start in np.unique(np.linspace(0, spacing, starts, endpoint=False).astype(int)).tolist():
         with tempfile.TemporaryDirectory() as folder:
             ask(encoder, traverse, list(range(start, len(traverse.frames), spacing)), Path(folder), when, found)
@@ -123,7 +123,7 @@ def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: 
 
 
 def ask(
-    encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, when: Verify, found: Outcome
+    encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, when: Verify, found: SpacingOutcome
 ) -> None:
     """Add what is found with some frames as places and the others between the first and the last one as queries."""
     atlas = Atlas(folder)

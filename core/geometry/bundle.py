@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, Sighting
+from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, SharedPoints
 from core.kernels import bundle as kernels
 
 Array = NDArray[np.float64]
@@ -265,7 +265,9 @@ class _Normal:
         return matrix, self.poses_gradient - shared.T @ self.nearness_gradient, diagonal
 
 
-def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting], start: Stand) -> Stand | None:
+def bundle_stand(
+    query: Stand, places: Sequence[Stand], sightings: Sequence[SharedPoints], start: Stand
+) -> Stand | None:
     """Where the query's camera stands, by the points that it shares with places.
 
     Args:
@@ -294,7 +296,7 @@ def bundle_stand(query: Stand, places: Sequence[Stand], sightings: Sequence[Sigh
     return None
 
 
-def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[Sighting]) -> _Bundle | None:
+def _bundle(query: Stand, places: Sequence[Stand], sightings: Sequence[SharedPoints]) -> _Bundle | None:
     """The points that are used; None if two places share too few, or a place has none of them."""
     best, *others = sightings
     if not best.usable().any():

@@ -121,7 +121,7 @@ class RelativeView:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class SharedPoints:
     """The points that a query and a place see.
 
     numbers: int64 [n], of the query's keypoints; ascending.
@@ -150,7 +150,7 @@ def sighting_of(
     verification: Verification,
     query_camera: Intrinsics | None = None,
     place_camera: Intrinsics | None = None,
-) -> Sighting | None:
+) -> SharedPoints | None:
     """The points that a query shares with a place that was verified; arguments and errors as :func:`relative_view`.
 
     Returns:
@@ -166,7 +166,7 @@ def sighting_of(
     )
     pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
     alike = np.einsum("nd,nd->n", query.descriptors[ours].astype(np.int64), place.descriptors[theirs]) / RESOLUTION**2
-    return Sighting(ours, at.bearings(seen), shown.bearings(known), verification.inliers, alike, float(pixel))
+    return SharedPoints(ours, at.bearings(seen), shown.bearings(known), verification.inliers, alike, float(pixel))
 
 
 def relative_view(

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.geometry.bundle import Stand, bundle_stand
-from core.geometry.pose import RelativeView, Sighting
+from core.geometry.pose import RelativeView, SharedPoints
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
@@ -154,7 +154,7 @@ def estimate_pose(
     reach: float,
     used: int = 20,
     views: Sequence[RelativeView | None] | None = None,
-    sightings: Sequence[Sighting | None] | None = None,
+    sightings: Sequence[SharedPoints | None] | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose of a frame from its matches.
 
@@ -273,7 +273,7 @@ def _bundled(
     axes: Vectors,
     on_earth: bool,
     view: RelativeView | None,
-    sightings: Sequence[Sighting | None],
+    sightings: Sequence[SharedPoints | None],
 ) -> PoseEstimate:
     """The estimate by the points of several places together; unchanged if they do not tell it."""
     local = (places.position - mean) @ axes.T

@@ -22,7 +22,7 @@ from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.geometry.pose import RelativeView, Sighting
+from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
@@ -294,7 +294,7 @@ def _put_together(
         judgement = replace(judgement, score=matches[0][0])
     log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
     views: list[RelativeView | None] = []
-    shared: list[Sighting | None] = []
+    shared: list[SharedPoints | None] = []
     note = None
     if judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE:
         views, note = relative_views(map_, candidates, stage, query.verifier)

@@ -17,7 +17,7 @@ import numpy as np
 
 from core.errors import UnfitIntrinsics
 from core.geometry.keypoints import Keypoints
-from core.geometry.pose import LEAST_EVIDENCE, RelativeView, Sighting, relative_view, sighting_of
+from core.geometry.pose import LEAST_EVIDENCE, RelativeView, SharedPoints, relative_view, sighting_of
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.position import APART, BUNDLE_REACH
@@ -177,7 +177,9 @@ def relative_views(
     return views, note
 
 
-def sightings(map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None) -> list[Sighting | None]:
+def sightings(
+    map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
+) -> list[SharedPoints | None]:
     """The points that the query shares with places that were verified, however far they are from the best match.
 
     If only the best match was, its neighbours are compared as well: one place does not tell how far the query is.
@@ -199,7 +201,7 @@ def sightings(map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Ve
         more = {at: keypoints for at, keypoints in there if keypoints is not None}
         stored |= more
         compared |= dict(zip(more, verify(query, list(more.values())), strict=True))
-    found: list[Sighting | None] = [None] * (max(compared, default=-1) + 1)
+    found: list[SharedPoints | None] = [None] * (max(compared, default=-1) + 1)
     for at, one in compared.items():
         place = stored[at]
         if place is not None and one.evidence >= LEAST_EVIDENCE:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.geometry.bundle import Stand, _Bundle, _State, bundle_stand
-from core.geometry.pose import BODY, Sighting
+from core.geometry.pose import BODY, SharedPoints
 
 Array = NDArray[np.float64]
 PIXEL = 1 / 280
@@ -53,7 +53,7 @@ def seen(scene: Array, camera: Stand, random: np.random.Generator, pixels: float
 
 def sightings(
     query: Stand, places: list[Stand], random: np.random.Generator, pixels: float = 0.7, wrong: float = 0.0
-) -> list[Sighting]:
+) -> list[SharedPoints]:
     """The points that the query shares with each place; a share of the matches is wrong, but for the first place."""
     scene = street(random)
     ours = seen(scene, query, random, pixels)
@@ -67,7 +67,7 @@ def sightings(
         shown = theirs[kept]
         shown[mixed] = shown[random.permutation(mixed)]
         count = len(kept)
-        made.append(Sighting(kept, ours[kept], shown, np.ones(count, np.bool_), np.full(count, 0.9), PIXEL))
+        made.append(SharedPoints(kept, ours[kept], shown, np.ones(count, np.bool_), np.full(count, 0.9), PIXEL))
     return made
 
 
