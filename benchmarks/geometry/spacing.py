@@ -1,4 +1,4 @@
-"""How far off a pose is where the places of a map are far apart, and whether its covariance says so.
+"""The errors of poses where the places of a map are far apart, and whether their covariance covers them.
 
     python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2] [--auto]
 
@@ -62,7 +62,7 @@ class MeasuredTraverse:
 
 @dataclass(frozen=True)
 class SpacingOutcome:
-    """What was found at one spacing; distances to the best place in metres, one for each recognized frame."""
+    """The answers at one spacing; distances to the best place in metres, one for each recognized frame."""
 
     asked: list[int] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
@@ -114,7 +114,7 @@ def measured_traverse(encoder: Encoder, folder: Path) -> MeasuredTraverse:
 
 
 def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify) -> SpacingOutcome:
-    """What is found with every ``spacing``-th frame as a place, in maps that begin at several frames."""
+    """The answers with every ``spacing``-th frame as a place, in maps that begin at several frames."""
     found = SpacingOutcome()
     for start in np.unique(np.linspace(0, spacing, starts, endpoint=False).astype(int)).tolist():
         with tempfile.TemporaryDirectory() as folder:
@@ -125,7 +125,7 @@ def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: 
 def ask(
     encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, when: Verify, found: SpacingOutcome
 ) -> None:
-    """Add what is found with some frames as places and the others between the first and the last one as queries."""
+    """Add the answers with some frames as places and the others between the first and the last one as queries."""
     atlas = Atlas(folder)
     settings = MapSettings(keep="none")
     map_ = atlas.create("spaced", encoder.identity, encoder.dimension, settings, encoder.local_shape)
