@@ -58,6 +58,7 @@ PARTS = {
     "day": Part("benchmarks.day", "--datasets {data} --short --json {results}/day.json", "data sets"),
     "alignment": Part("benchmarks.maps.aligned_maps", "--datasets {data}", "data sets"),
     "poses": Part("benchmarks.geometry.pose", "--data {data}", "data sets"),
+    "spacing": Part("benchmarks.geometry.spacing", "--data {data}", "data sets"),
     "encoding": Part("benchmarks.encode"),
     "service": Part("benchmarks.service"),
     "verification": Part("benchmarks.geometry.requests", "--data {data}", "data sets"),

@@ -34,9 +34,9 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.preprocessing import Pixels
 from core.frames.traverses import SUPPORTED_SUFFIXES, read_ground_truth
 from core.geometry.detection import find_keypoints
-from core.geometry.pose import RelativeView, relative_view
+from core.geometry.pose import RelativeView, relative_view, sighting_of
 from core.geometry.verification import verify
-from core.judgement.position import PoseEstimate, estimate_pose
+from core.judgement.position import BUNDLE_REACH, PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -61,7 +61,7 @@ PICTURES = 15
 """Photographs of each folder for each turn."""
 HALLS = 4
 SPACING = 2.0
-CANDIDATES = 3
+CANDIDATES = 10
 """Places near the best match that are verified."""
 
 
@@ -269,26 +269,28 @@ def estimates(encoder: Encoder, network: XFeat, traverse: PosedTraverse) -> Iter
         reach = neighborhood_of(map_).radius
         for frame, answer, true in zip(traverse.queries, answers, traverse.true, strict=True):
             candidates = answer.candidates
-            best = answer.candidates.whereabouts.position[0, 0]
-            if answer.pose is None or answer.judgement.verdict != "recognized" or abs(best - true[0]) > reach:
+            there = answer.candidates.whereabouts.position[0, 0]
+            if answer.pose is None or answer.judgement.verdict != "recognized" or abs(there - true[0]) > reach:
                 continue
             query = find_keypoints(network, frame)
             log_odds = decision_slope(answer.calibration) * candidates.ordered.astype(np.float64)
             x = candidates.whereabouts.position[:, 0]
-            near = np.flatnonzero(np.abs(x - x[0]) <= reach)[:CANDIDATES].tolist()
+            near = np.flatnonzero(np.abs(x - x[0]) <= BUNDLE_REACH)[:CANDIDATES].tolist()
             numbers = {row: int(np.abs(traverse.poses[:, 0] - x[row]).argmin()) for row in near}
             verified = dict(zip(near, verify(query, [keypoints[number] for number in numbers.values()]), strict=True))
-
-            made: list[PoseEstimate | None] = []
-            for camera in (None, traverse.camera):
-                views = [
-                    relative_view(query, keypoints[numbers[row]], verified[row], camera, camera)
+            best = keypoints[numbers[0]]
+            views = [relative_view(query, best, verified[0])]
+            made = [estimate_pose(candidates.whereabouts, log_odds, reach, views=views), None]
+            if (camera := traverse.camera) is not None:
+                views = [relative_view(query, best, verified[0], camera, camera)]
+                shared = [
+                    sighting_of(query, keypoints[numbers[row]], verified[row], camera, camera)
                     if row in verified
                     else None
                     for row in range(near[-1] + 1)
                 ]
-                made.append(estimate_pose(candidates.whereabouts, log_odds, reach, views=views))
-            yield true, answer.pose, made[0], None if traverse.camera is None else made[1]
+                made[1] = estimate_pose(candidates.whereabouts, log_odds, reach, views=views, sightings=shared)
+            yield true, answer.pose, made[0], made[1]
         atlas.close()
 
 

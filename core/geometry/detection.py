@@ -7,6 +7,7 @@ heat and reliability (Potje et al., 2024, section 3).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import cv2
 import numpy as np
@@ -19,8 +20,11 @@ from core.frames.preprocessing import Pixels
 from core.geometry.keypoints import MOST, RESOLUTION, SHARES, Keypoints
 from core.networks.xfeat import CELL, MULTIPLE, XFeat
 
-LONGEST_SIDE = 320
-"""Pixels of the longer side of the network's input; a smaller frame is enlarged, so that it gives keypoints, too."""
+AREA = 320 * 240
+"""Pixels of the network's input, about; a smaller frame is enlarged, so that it gives keypoints, too.  By its area
+rather than by a side a wide frame gives as much as another."""
+LONGEST_SIDE = 960
+"""Pixels of a side of the network's input at most."""
 LEAST_HEAT = 0.05
 """The heat from which on a pixel is a keypoint: the authors' choice."""
 NEIGHBORHOOD = 5
@@ -51,9 +55,14 @@ class ScaledFrame:
         return cls(np.asarray(shown, np.uint8), width, height, mask)
 
 
+def shown_scale(width: int, height: int) -> float:
+    """By how much a frame is enlarged before its sides are rounded."""
+    return min(sqrt(AREA / (width * height)), LONGEST_SIDE / max(width, height))
+
+
 def shown_size(width: int, height: int) -> tuple[int, int]:
-    """Width and height at which the network sees a frame: the longer side LONGEST_SIDE, both multiples of MULTIPLE."""
-    scale = LONGEST_SIDE / max(width, height)
+    """Width and height at which the network sees a frame: about AREA, both multiples of MULTIPLE."""
+    scale = shown_scale(width, height)
     columns, rows = (max(1, round(side * scale / MULTIPLE)) * MULTIPLE for side in (width, height))
     return columns, rows
 

@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.intrinsics import Intrinsics
-from core.geometry.detection import LONGEST_SIDE
-from core.geometry.keypoints import Keypoints
+from core.geometry.detection import shown_scale
+from core.geometry.keypoints import RESOLUTION, Keypoints
 from core.geometry.verification import CONFIDENCE, ITERATIONS, THRESHOLD, Verification
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ LEAST_EVIDENCE = 25.0
 MOST_MATCHES = 200
 """More matches are thinned out evenly: their errors are not independent, and each costs time."""
 NOISE = 0.7
-"""Pixels by which a keypoint is off, where the longer side of the picture is LONGEST_SIDE; measured afterwards."""
+"""Pixels by which a keypoint is off, of the picture as the network of keypoints sees it; measured afterwards."""
 NOISE_LIMITS = 0.4, 4.0
 """Factors of NOISE within which the measured noise is believed."""
 OUTLYING = 4.0
@@ -87,7 +87,7 @@ FIRST_STEPS, MOST_STEPS = 5, 15
 ENOUGH = 0.05
 """The cost is twice a logarithm of a likelihood; a step that lowers it by less is the last."""
 
-_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """From a camera's optical frame (right, down, ahead) to the axes of ROS (ahead, left, up)."""
 
 
@@ -120,6 +120,55 @@ class RelativeView:
         return float(np.degrees(np.sqrt(self.covariance[2, 2])))
 
 
+@dataclass(frozen=True)
+class SharedPoints:
+    """The points that a query and a place see.
+
+    numbers: int64 [n], of the query's keypoints; ascending.
+    query, place: unit vectors in the optical frames (right, down, ahead), float64 [n, 3]; NaN where not known.
+    fitting: bool [n], the inliers of the verification.
+    likeness: float64 [n], the cosine of both descriptors.
+    pixel: the angle in radians that a pixel covers, of a frame as the network of keypoints sees it.
+    """
+
+    numbers: NDArray[np.int64]
+    query: Array
+    place: Array
+    fitting: NDArray[np.bool_]
+    likeness: Array
+    pixel: float
+
+    def usable(self) -> NDArray[np.bool_]:
+        """Which points fit and are seen in known directions, bool [n]."""
+        known = np.isfinite(self.place).all(axis=1) & np.isfinite(self.query).all(axis=1)
+        return np.asarray(self.fitting & known)
+
+
+def sighting_of(
+    query: Keypoints,
+    place: Keypoints,
+    verification: Verification,
+    query_camera: Intrinsics | None = None,
+    place_camera: Intrinsics | None = None,
+) -> SharedPoints | None:
+    """The points that a query shares with a place that was verified; arguments and errors as :func:`relative_view`.
+
+    Returns:
+        None if the evidence is less than LEAST_EVIDENCE.
+    """
+    if verification.evidence < LEAST_EVIDENCE:
+        return None
+    ours, theirs = verification.matches.T
+    seen, known = query.pixels()[ours], place.pixels()[theirs]
+    at, shown = (
+        _pinhole(frame) if camera is None else camera.of_size(frame.width, frame.height)
+        for camera, frame in ((query_camera, query), (place_camera, place))
+    )
+    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
+    alike = np.einsum("nd,nd->n", query.descriptors[ours].astype(np.int64), place.descriptors[theirs]) / RESOLUTION**2
+    return SharedPoints(ours, at.bearings(seen), shown.bearings(known), verification.inliers, alike, float(pixel))
+
+
 def relative_view(
     query: Keypoints,
     place: Keypoints,
@@ -138,18 +187,11 @@ def relative_view(
     Raises:
         UnfitIntrinsics: intrinsics do not fit the frame.
     """
-    if verification.evidence < LEAST_EVIDENCE:
+    sighting = sighting_of(query, place, verification, query_camera, place_camera)
+    if sighting is None:
         return None
-    ours, theirs = verification.matches.T
-    seen, known = query.pixels()[ours], place.pixels()[theirs]
-    cameras = [
-        None if camera is None else camera.of_size(frame.width, frame.height)
-        for camera, frame in ((query_camera, query), (place_camera, place))
-    ]
-    at, shown = (camera or _pinhole(frame) for camera, frame in zip(cameras, (query, place), strict=True))
-    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
-    view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
-    return _by_assumed_field(view) if view is not None and None in cameras else view
+    view = view_of_bearings(sighting.place, sighting.query, sighting.pixel)
+    return _by_assumed_field(view) if view is not None and None in (query_camera, place_camera) else view
 
 
 def _by_assumed_field(view: RelativeView) -> RelativeView:
@@ -167,8 +209,8 @@ def _pinhole(frame: Keypoints) -> Intrinsics:
 
 
 def _enlargement(frame: Keypoints) -> float:
-    """Pixels of the frame per pixel of a frame with a longer side of LONGEST_SIDE."""
-    return max(frame.width, frame.height) / LONGEST_SIDE
+    """Pixels of the frame per pixel of a frame as the network of keypoints sees it."""
+    return 1 / shown_scale(frame.width, frame.height)
 
 
 def view_of_bearings(place: Array, query: Array, pixel: float) -> RelativeView | None:
@@ -176,7 +218,7 @@ def view_of_bearings(place: Array, query: Array, pixel: float) -> RelativeView |
 
     Args:
         place, query: unit vectors in the optical frames (right, down, ahead), float64 [n, 3]; NaN where not known.
-        pixel: the angle in radians that a pixel covers, of a frame with a longer side of LONGEST_SIDE.
+        pixel: the angle in radians that a pixel covers, of a frame as the network of keypoints sees it.
 
     Returns:
         None if fewer than LEAST_INLIERS fit.
@@ -467,9 +509,9 @@ def _view(p: Array, q: Array, model: _Model, noise: float) -> RelativeView:
     inliers = int((np.square(residuals).sum(axis=1) < (3 * noise) ** 2).sum())
     # A rotation that precedes R by -Rᵀ ω is one that follows it by ω; both in the axes of ROS.
     change = np.zeros((6, 6))
-    change[:3, :3], change[3:, 3:] = -_BODY @ model.rotation.T, _BODY
-    turn = _BODY @ model.rotation.T @ _BODY.T
-    return RelativeView(turn, _BODY @ centre, change @ covariance @ change.T, inliers, "intrinsics")
+    change[:3, :3], change[3:, 3:] = -BODY @ model.rotation.T, BODY
+    turn = BODY @ model.rotation.T @ BODY.T
+    return RelativeView(turn, BODY @ centre, change @ covariance @ change.T, inliers, "intrinsics")
 
 
 def _mixture(views: Sequence[tuple[float, RelativeView]]) -> RelativeView:

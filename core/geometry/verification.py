@@ -40,13 +40,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from core.geometry.detection import LONGEST_SIDE
+from core.geometry.detection import shown_scale
 from core.geometry.keypoints import Keypoints
 from core.geometry.matching import mutual_matches
 from core.threads import each
 
 THRESHOLD = 1.0
-"""Pixels by which an inlier may miss its epipolar line, where the longer side of the picture is LONGEST_SIDE."""
+"""Pixels by which an inlier may miss its epipolar line, of the picture as the network of keypoints sees it."""
 CONFIDENCE, ITERATIONS = 0.999, 100
 """They find a homography that half of the matches fit in 998 of 1000 cases.  Three times as many take twice the time
 for a fundamental matrix, and tell places apart no better."""
@@ -184,12 +184,12 @@ def _verify(
 
 
 def points_of(keypoints: Keypoints) -> NDArray[np.float64]:
-    """Positions in pixels of the frame with a longer side of LONGEST_SIDE, float64 [n, 2]."""
-    return keypoints.pixels() * (LONGEST_SIDE / max(keypoints.width, keypoints.height))
+    """Positions in pixels of the frame as the network sees it, float64 [n, 2]."""
+    return keypoints.pixels() * shown_scale(keypoints.width, keypoints.height)
 
 
 def chance_of(keypoints: Keypoints) -> float:
     """α, the share of a picture that lies within the threshold of its longest line."""
-    scale = LONGEST_SIDE / max(keypoints.width, keypoints.height)
+    scale = shown_scale(keypoints.width, keypoints.height)
     width, height = keypoints.width * scale, keypoints.height * scale
     return min(0.5, 2 * THRESHOLD * hypot(width, height) / (width * height))

@@ -13,6 +13,9 @@ agree with each place's shift s and turn t,
 
 with the place's position a, its heading φ and its attitude W.  The errors of views are not independent, as they share
 the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).
+
+Where the best match and another place share points with the query and the intrinsics are known, that estimate is only
+where a bundle adjustment begins (:mod:`core.geometry.bundle`).  It gets the mean of the places as a prior that is wide.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.geometry.pose import RelativeView
+from core.geometry.bundle import Stand, bundle_stand
+from core.geometry.pose import RelativeView, SharedPoints
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
@@ -50,6 +54,16 @@ covariance says."""
 CONTRADICTION = 30.0
 """Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
 _STEPS = 8
+BUNDLED = 4
+"""The most places whose points are adjusted together."""
+BUNDLE_REACH = 30.0
+"""Metres from the best match within which places are."""
+APART = 0.2
+"""Metres that they are apart at least: looks from one position say nothing of distances."""
+BUNDLE_HEADING = float(np.radians(0.5))
+"""Deviation of the errors of places' headings, where several places show them."""
+SLOPE = float(np.radians(4))
+"""Deviation of the slope of the ground, by which heights of places that poses do not give are off."""
 
 
 def _unknown() -> Vectors:
@@ -140,6 +154,7 @@ def estimate_pose(
     reach: float,
     used: int = 20,
     views: Sequence[RelativeView | None] | None = None,
+    sightings: Sequence[SharedPoints | None] | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose of a frame from its matches.
 
@@ -154,6 +169,8 @@ def estimate_pose(
         reach: metres from the best match within which other matches belong to its answer.
         views: how the query's camera stands to those of the first places, in their order; None where a place was not
             verified.  The heading of a place is taken for the direction in which its camera looks.
+        sightings: the points that the query shares with the first places, however far they are from the best match, by
+            the intrinsics of both cameras; None where these are not known or a place was not verified.
 
     Returns:
         None if there is no match, or the best one has no pose.
@@ -194,6 +211,8 @@ def estimate_pose(
         yaw = float(np.radians(90 - heading if on_earth else heading))
         place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
         found = _fused(found, place_views, yaw, mean, axes, on_earth)
+    if heading is not None and sightings and sightings[0] is not None:
+        found = _bundled(found, covariance, places, mean, axes, on_earth, seen.get(0), sightings)
     return found.without_height() if on_earth else found
 
 
@@ -234,11 +253,7 @@ def _fused(
     posterior = np.linalg.inv(normal)
     which = [0, 1, 2, 5]
     covariance[np.ix_(which, which)] = posterior[:4, :4]
-    position, degrees = mean + state[:3] @ axes, float(np.degrees(state[3]))
-    if on_earth:
-        pose = _geographic(position, (90 - degrees) % 360)
-    else:
-        pose = Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
+    pose = _pose_at(mean + state[:3] @ axes, float(np.degrees(state[3])), on_earth)
     sources = {place_views.views[number].source for number in retained}
     return replace(
         found,
@@ -248,6 +263,87 @@ def _fused(
         covariance=covariance,
         source="field-of-view" if "field-of-view" in sources else "intrinsics",
     )
+
+
+def _bundled(
+    found: PoseEstimate,
+    prior: Vectors,
+    places: Whereabouts,
+    mean: Vectors,
+    axes: Vectors,
+    on_earth: bool,
+    view: RelativeView | None,
+    sightings: Sequence[SharedPoints | None],
+) -> PoseEstimate:
+    """The estimate by the points of several places together; unchanged if they do not tell it."""
+    local = (places.position - mean) @ axes.T
+    directions = _directions(places, axes, on_earth)
+    shared = {
+        row: sighting
+        for row, sighting in enumerate(sightings)
+        if sighting is not None
+        and places.kind[row] == places.kind[0]
+        and np.isfinite(directions[row])
+        and np.linalg.norm(local[row] - local[0]) <= BUNDLE_REACH
+    }
+    if 0 not in shared:
+        return found
+    rows: list[int] = []
+    for row in sorted(shared, key=lambda row: (row > 0, -int(shared[row].fitting.sum()))):
+        if len(rows) < BUNDLED and all(np.linalg.norm(local[row] - local[other]) >= APART for other in rows):
+            rows.append(row)
+    if len(rows) < 2:
+        return found
+
+    def place(row: int) -> Stand:
+        height = PLACE_POSITION + SLOPE * float(np.linalg.norm(local[row] - local[0]))
+        covariance = np.diag(np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height]))
+        return Stand(local[row], _level(directions[row]), covariance)
+
+    stands = [place(row) for row in rows]
+    position, yaw = _of(found.pose, mean, axes, on_earth)
+    attitude = _level(yaw) if view is None else stands[0].attitude @ view.turn
+    loose = np.zeros((6, 6))
+    loose[:3, :3] = np.diag(np.full(3, LEVEL**2))
+    loose[2, 2] = TURN**2
+    loose[3:, 3:] = prior[:3, :3] * 4 + np.eye(3)
+    best = Stand(np.zeros(3), _level(yaw), loose)
+    stand = bundle_stand(best, stands, [shared[row] for row in rows], Stand(position, attitude, loose))
+    if stand is None:
+        return found
+    covariance = found.covariance.copy()
+    which = [3, 4, 5, 2]
+    covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = stand.covariance[np.ix_(which, which)]
+    ahead = stand.attitude[:, 0]
+    made = _pose_at(mean + stand.position @ axes, float(np.degrees(np.arctan2(ahead[1], ahead[0]))), on_earth)
+    return replace(
+        found,
+        pose=made,
+        spread=float(np.sqrt(covariance[0, 0] + covariance[1, 1])),
+        heading_spread=float(np.degrees(np.sqrt(covariance[5, 5]))),
+        covariance=covariance,
+        places=len(rows),
+        source="intrinsics",
+    )
+
+
+def _pose_at(position: Vectors, degrees: float, on_earth: bool) -> Pose:
+    """The pose at a position, [3], with a heading counter-clockwise from the first axis."""
+    if on_earth:
+        return _geographic(position, (90 - degrees) % 360)
+    return Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
+
+
+def _level(angle: float) -> Vectors:
+    """The attitude of a level camera that looks in a direction counter-clockwise from x, [3, 3]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def _of(pose: Pose, mean: Vectors, axes: Vectors, on_earth: bool) -> tuple[Vectors, float]:
+    """The position of a pose from the mean, [3], and its heading counter-clockwise from x, in radians."""
+    assert pose.heading is not None
+    return (pose.position() - mean) @ axes.T, float(np.radians(90 - pose.heading if on_earth else pose.heading))
 
 
 def _missed(state: Vectors, place_views: _PlaceViews, number: int) -> tuple[Vectors, Vectors, Vectors]:

@@ -22,7 +22,7 @@ from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.geometry.pose import RelativeView
+from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
@@ -33,7 +33,7 @@ from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
 from core.recognition.question import Query, Question
 from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, no_candidates, rank_places
-from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, third_stage
+from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, sightings, third_stage
 
 ATTEMPTS = 3
 """How often a query is searched for if places that it finds are deleted in the meantime."""
@@ -294,10 +294,12 @@ def _put_together(
         judgement = replace(judgement, score=matches[0][0])
     log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
     views: list[RelativeView | None] = []
+    shared: list[SharedPoints | None] = []
     note = None
     if judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE:
         views, note = relative_views(map_, candidates, stage, query.verifier)
-    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views)
+        shared = sightings(map_, candidates, stage, query.verifier)
+    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views, sightings=shared)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     rivals = _rivals(map_, candidates, judgement)
     return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -20,9 +21,10 @@ from numpy.typing import NDArray
 from core.errors import UnfitIntrinsics
 from core.geometry.keypoints import Keypoints
 from core.geometry.matching import GLANCED
-from core.geometry.pose import RelativeView, relative_view
-from core.geometry.verification import Verification
+from core.geometry.pose import LEAST_EVIDENCE, RelativeView, SharedPoints, relative_view, sighting_of
+from core.geometry.verification import Verification, verify
 from core.judgement.geometry import Geometry, final_gains, final_order
+from core.judgement.position import APART, BUNDLE_REACH
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
@@ -35,8 +37,11 @@ VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 """Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if no candidate has any, or the
 frame so few that they would say nothing."""
 
-MOST_VIEWS = 2
-"""The most places whose geometry gives the pose: two directions meet in a point, and each takes some 20 ms."""
+MOST_VIEWS = 1
+"""The most places whose turn and shift give the pose, or where a search for it begins; each takes some 20 ms."""
+
+NEIGHBOURS = 2
+"""Places beside the best match that are compared for the sake of the pose where no others were verified."""
 
 OF_TWO_STAGES, OF_THE_FIRST, OF_GLANCES = 6, 2, 4
 """How many places are candidates for being the best of two stages, the best of the first, and by their matches."""
@@ -248,6 +253,50 @@ def relative_views(
         views.append(view)
         used += view is not None
     return views, note
+
+
+def sightings(
+    map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
+) -> list[SharedPoints | None]:
+    """The points that the query shares with places that were verified, however far they are from the best match.
+
+    If only the best match was, its neighbours are compared as well: one place does not tell how far the query is.
+
+    Returns:
+        One for each of the first candidates; None where the intrinsics of a camera are not known or do not fit.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    query = stage.keypoints
+    if verifier is None or query is None or (camera := map_.cameras.intrinsics(verifier.camera)) is None:
+        return []
+    compared = {at: one for at, one in enumerate(candidates.verifications) if one is not None}
+    stored = {at: stage.stored.get(int(candidates.rows[at])) for at in compared}
+    if list(compared) == [0] and compared[0].evidence >= LEAST_EVIDENCE:
+        around = _around(candidates)
+        there = zip(around, map_.keypoints_at(candidates.rows[around].tolist()), strict=True)
+        more = {at: keypoints for at, keypoints in there if keypoints is not None}
+        stored |= more
+        compared |= dict(zip(more, verify(query, list(more.values())), strict=True))
+    found: list[SharedPoints | None] = [None] * (max(compared, default=-1) + 1)
+    for at, one in compared.items():
+        place = stored[at]
+        if place is not None and one.evidence >= LEAST_EVIDENCE:
+            (known,) = map_.places_at([int(candidates.rows[at])])
+            shown = map_.cameras.intrinsics(None if known is None else known.camera)
+            with suppress(UnfitIntrinsics):
+                found[at] = None if shown is None else sighting_of(query, place, one, camera, shown)
+    return found
+
+
+def _around(candidates: Candidates) -> list[int]:
+    """The candidates nearest to the best match that do not stand where it does, at most NEIGHBOURS."""
+    places = candidates.whereabouts
+    distances = np.linalg.norm(places.position - places.position[0], axis=1)
+    usable = (places.kind == places.kind[0]) & (distances >= APART) & (distances <= BUNDLE_REACH)
+    order = np.argsort(np.where(usable, distances, np.inf), kind="stable")[:NEIGHBOURS]
+    return order[usable[order]].tolist()
 
 
 def verified(candidates: Candidates, found: Mapping[int, Verification]) -> Candidates:

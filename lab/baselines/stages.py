@@ -69,7 +69,7 @@ def about_verified(about: About, verify: Verify = "always") -> About:
     constants = {
         "verify": verify,
         "keypoints": keypoints.MOST,
-        "longest_side": detection.LONGEST_SIDE,
+        "area": detection.AREA,
         "least_cosine": matching.LEAST_COSINE,
         "candidates": CANDIDATES,
         "similarity": SIMILARITY,

@@ -98,9 +98,9 @@ class ScoreParts(BaseModel):
     )
     geometry: float | None = Field(
         default=None,
-        description="If more than the best match was verified: 0.75 times the share of inliers (`inliers` / `keypoints`) and, for "
-        "an encoder with a second stage, `similarity` less half of `agreement`, for geometry says better what "
-        "cells say; 0 if the best match alone was verified. Null if none was.",
+        description="If more than the best match was verified: 0.75 times the share of inliers (`inliers` / "
+        "`keypoints`) and, for an encoder with a second stage, `similarity` less half of `agreement`, for geometry "
+        "says better what cells say; 0 if the best match alone was verified. Null if none was.",
     )
     inliers: int | None = Field(
         description="Keypoints of both frames that match and fit one rigid scene; null if the match was not verified."

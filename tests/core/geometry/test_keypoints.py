@@ -62,11 +62,12 @@ def test_keypoints_lie_on_the_corners_of_what_is_drawn(network: XFeat) -> None:
         (160, 120, (320, 256)),
         (240, 192, (320, 256)),
         (480, 640, (256, 320)),
-        (4000, 20, (320, 32)),
-        (16, 16, (320, 320)),
+        (4000, 20, (960, 32)),
+        (1226, 370, (512, 160)),
+        (16, 16, (288, 288)),
     ],
 )
-def test_the_network_sees_a_side_of_320(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
+def test_the_network_sees_an_area_of_320_by_240(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
     assert shown_size(width, height) == shown
     made = find_keypoints(network, sample_frame(1, width, height))
     assert (made.width, made.height) == (width, height)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from core.geometry.pose import RelativeView
 from core.judgement.position import UNKNOWN_ANGLE, UNKNOWN_HEIGHT, PoseEstimate, circular_mean, estimate_pose
 from core.places import EARTH_RADIUS, Pose
+from tests.core.geometry.test_bundle import sightings, stand
 from tests.core.judgement.test_priors import places
 
 REACH = 5.0
@@ -238,3 +239,39 @@ def test_views_of_places_out_of_reach_or_not_verified_take_no_part() -> None:
     far = view_from(Pose(x=90, y=0, heading=0), 91, 0, 40, 8)
     found = estimate_pose(places(poses), [0, 0, 0], REACH, views=[None, far])
     assert found is not None and found.source == "places" and found.heading_offset is None
+
+
+@pytest.mark.parametrize("frame", ["metres", "degrees"])
+def test_points_of_places_beyond_reach_tell_how_far_the_query_is(frame: str) -> None:
+    random, spacing = np.random.default_rng(3), 9.0
+    query, stands = stand((3.5, 0.3, 0), 3), [stand((x, 0, 0)) for x in (0.0, spacing, -spacing)]
+    shared = sightings(query, stands, random)
+    ahead = [float(one.position[0]) for one in stands]
+    if frame == "metres":
+        poses: list[Pose | None] = [Pose(x=x, y=0, heading=0) for x in ahead]
+    else:  # to the east along the equator
+        poses = [Pose(latitude=0, longitude=math.degrees(x / EARTH_RADIUS), heading=90) for x in ahead]
+    view = RelativeView(rotated(3), np.array([0.4, 0.0, 0]), np.diag([1e-4] * 3 + [1e-2] * 3), 100, "intrinsics")
+    alone = estimate_pose(places(poses), [0] * 3, REACH, views=[view])
+    found = estimate_pose(places(poses), [0] * 3, REACH, views=[view], sightings=shared)
+    assert alone is not None and found is not None and found.source == "intrinsics" and found.places == 3
+    if frame == "metres":
+        assert [found.pose.x, found.pose.y] == pytest.approx([3.5, 0.3], abs=0.5)
+        assert found.pose.heading == pytest.approx(3, abs=1)
+    else:
+        assert found.pose.longitude is not None and found.pose.latitude is not None
+        east, north = (math.radians(angle) * EARTH_RADIUS for angle in (found.pose.longitude, found.pose.latitude))
+        assert [east, north] == pytest.approx([3.5, 0.3], abs=0.5)
+        assert found.pose.heading == pytest.approx(87, abs=1) and found.pose.z is None
+    assert found.spread < alone.spread / 2 and np.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_points_say_nothing_where_the_best_match_has_none_or_places_coincide() -> None:
+    random = np.random.default_rng(4)
+    query, stands = stand((1, 0.3, 0), 3), [stand((0, 0, 0)), stand((3, 0, 0))]
+    shared = sightings(query, stands, random)
+    apart: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=3, y=0, heading=0)]
+    together: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=0.1, y=0, heading=0)]
+    for poses, seen in ((apart, [None, shared[1]]), (together, shared), (apart, [shared[0]])):
+        found = estimate_pose(places(poses), [0, 0], REACH, sightings=seen)
+        assert found is not None and found.source == "places"
