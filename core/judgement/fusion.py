@@ -7,8 +7,10 @@ was taken.  With the probability e it says nothing at all, so that it contribute
 
     log((1 - e) · exp(x) + e)  >=  log e,
 
-and the log odds of a place are the sum over the cameras.  Cameras are assumed to be independent given the place, which
-is not quite true, since they share the light and the weather.  A rig of one camera is a plain query.
+and the log odds of a place are the sum over the cameras.  Where a camera's candidates were verified, x has the evidence
+of the place as well (``geometry.py``), which is 0 of a place that was left out as one that could not win.  Cameras are
+assumed to be independent given the place, which is not quite true, since they share the light and the weather.  A rig
+of one camera is a plain query.
 
 *Maps.*  Each map's best match has the log odds x_m of being right.  At most one of the maps' matches can be right, and
 perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
@@ -23,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.background import GUARD_FACTOR
+from core.judgement.geometry import Geometry
 from core.judgement.priors import decision_slope, log_odds
 from core.judgement.probability import FARTHEST
-from core.judgement.verdict import Calibration, Judgement, Verdict
+from core.judgement.verdict import MOST_RIVALS, Calibration, Judgement, Rivals, Verdict
 from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
@@ -50,6 +53,7 @@ class CameraRanking:
     whereabouts: of the n places.
     examined: bool [n], which of them the second stage has compared; none if the encoder has no second stage.
     weights: float64 [n], log prior of the places, the same for all cameras; None: there is no prior.
+    geometry: the results of verification for the n places; None: none was verified.
     """
 
     rows: NDArray[np.int64]
@@ -57,6 +61,13 @@ class CameraRanking:
     whereabouts: Whereabouts
     examined: NDArray[np.bool_]
     weights: Values | None = None
+    geometry: Geometry | None = None
+
+    @property
+    def values(self) -> Values:
+        """The scores of all stages, float64 [n]."""
+        values = self.scores.astype(np.float64)
+        return values if self.geometry is None else values + self.geometry.gain
 
     def listed(self) -> NDArray[np.int64]:
         """The positions of the places whose scores can be compared with each other, int64."""
@@ -69,7 +80,7 @@ class Fused:
 
     rows: int64 [n], rows of the map, best first.
     whereabouts: of the n places.
-    scores: float32 [n], the best score that any camera gives to each place.
+    scores: float32 [n], the best score of all stages that any camera gives to each place.
     log_odds: float64 [n], descending, by all cameras and the prior.
     weights: float64 [n], log prior of the places; zeros without a prior.
     """
@@ -94,15 +105,20 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     )
     parts = [view.whereabouts.take(part) for view, part in zip(views, listed, strict=True)]
     places = Whereabouts.joined(parts).take(first)
-    scores = np.full((len(views), len(rows)), -np.inf)
+    scores, values = np.full((2, len(views), len(rows)), -np.inf)
+    evidence = np.full((len(views), len(rows)), np.nan)
     for camera, (view, part) in enumerate(zip(views, listed, strict=True)):
-        scores[camera, np.searchsorted(rows, view.rows[part])] = view.scores[part]
+        at = np.searchsorted(rows, view.rows[part])
+        scores[camera, at], values[camera, at] = view.scores[part], view.values[part]
+        if view.geometry is not None:
+            evidence[camera] = 0.0  # of places that are not worth verifying
+            evidence[camera, at] = np.nan_to_num(view.geometry.evidence[part])
     near = np.stack([places.near(i, neighborhood) for i in range(len(rows))])
     beside = np.stack([places.near(i, neighborhood.times(GUARD_FACTOR)) for i in range(len(rows))])
     counts = [len(view.rows) for view in views]
     of_place = _added(
         np.stack(
-            [_camera_log_odds(row, near, beside, count, calibration) for row, count in zip(scores, counts, strict=True)]
+            [_camera_log_odds(*one, near, beside, calibration) for one in zip(scores, evidence, counts, strict=True)]
         )
     )
     prior = np.concatenate(
@@ -114,27 +130,35 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     of_place += np.where(near, prior, -np.inf).max(axis=1)
     steepness = decision_slope(calibration)
     # The frames of one place share its evidence; among them, those with the best scores of their own come first.
-    lowest = np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
-    own = np.where(np.isfinite(scores), scores, lowest)
+    lowest = np.where(np.isfinite(values), values, np.inf).min(axis=1, keepdims=True)
+    own = np.where(np.isfinite(values), values, lowest)
     behind = np.stack([np.where(near, row, -np.inf).max(axis=1) for row in own]) - own
     total = of_place - steepness * behind.mean(axis=0)
     # Places that lead for no camera have the same odds and are ranked by their scores.
     order = np.lexsort((-own.mean(axis=0), -np.round(total, 9)))
-    found = scores.max(axis=0)[order].astype(np.float32)
-    judgement = _judged(of_place[order], found, near[order[0]][order], calibration, steepness)
+    found = values.max(axis=0)[order].astype(np.float32)
+    of_best = evidence[:, near[order[0]]]
+    best_evidence = None if np.isnan(of_best).all() else float(np.nanmax(of_best))
+    judgement = _judged(of_place[order], found, near[np.ix_(order, order)], calibration, steepness, best_evidence)
     return Fused(judgement, rows[order], places.take(order), found, total[order], prior[order])
 
 
 def _camera_log_odds(
-    scores: Values, near: NDArray[np.bool_], beside: NDArray[np.bool_], places: int, calibration: Calibration
+    scores: Values,
+    evidence: Values,
+    places: int,
+    near: NDArray[np.bool_],
+    beside: NDArray[np.bool_],
+    calibration: Calibration,
 ) -> Values:
     """The log odds of each place by one camera, float64 [n].
 
     Args:
         scores: float64 [n], -inf for places that the camera does not list.
+        evidence: float64 [n]; NaN if none of the camera's places was verified.
+        places: how many the camera's ranking has.
         near: bool [n, n], which places are the same place.
         beside: bool [n, n], which places may overlap.
-        places: how many the camera's ranking has.
     """
     found = np.empty(len(scores))
     for place, same in enumerate(near):
@@ -145,6 +169,8 @@ def _camera_log_odds(
         apart = scores[~beside[place] & np.isfinite(scores)]
         behind = calibration.background(rest, places - int(same.sum()), apart)
         found[place] = log_odds(behind.decision(best), calibration, behind.imagined)
+        if calibration.geometry is not None and not np.isnan(evidence[same]).any():
+            found[place] = calibration.geometry.log_odds(found[place], evidence[same].max())
     return found
 
 
@@ -158,34 +184,48 @@ def _added(parts: Values) -> Values:
 def _judged(
     log_odds_of_places: Values,
     scores: NDArray[np.float32],
-    same: NDArray[np.bool_],
+    near: NDArray[np.bool_],
     calibration: Calibration,
     steepness: float,
+    evidence: float | None,
 ) -> Judgement:
-    """Judge the first of the ranked places; ``same`` says which of the others are the same place.
+    """Judge the first of the ranked places; ``near`` says which of them are the same place, bool [n, n].
 
     The verdict is ambiguous if the margin is too small, and also if the best rival alone would be recognized.
     """
     best = float(log_odds_of_places[0])
-    others = np.flatnonzero(~same)
+    others = np.flatnonzero(~near[0])
     rival, margin = None, None
     if len(others):
         rival = int(others[np.argmax(log_odds_of_places[others])])
         margin = max(0.0, (best - float(log_odds_of_places[rival])) / steepness)
     least = log_odds(calibration.threshold, calibration)
     decision = calibration.threshold + (best - least) / decision_slope(calibration)
+    if evidence is not None:
+        least = max(0.0, least)
+    # Of places that the cameras prefer each alone is close, or would be believed.
+    close = (log_odds_of_places >= least) | (best - log_odds_of_places < calibration.margin * steepness)
     verdict: Verdict = "recognized"
+    rivals: tuple[Rivals, ...] = ()
     if best < least:
         verdict = "unknown"
-    elif margin is not None and margin < calibration.margin:
+    elif rival is not None and close[rival]:
         verdict = "ambiguous"
-    elif rival is not None and log_odds_of_places[rival] >= least:
-        verdict = "ambiguous"  # two cameras disagree, and each alone would be believed
+        rivals = tuple(Rivals((head,), False) for head in _heads(others[close[others]], near))
     probability = None
     if calibration.curve is not None:
-        rivals = () if rival is None else (float(log_odds_of_places[rival]),)
-        probability = float(joint_probabilities([best, *rivals])[0])
-    return Judgement(verdict, float(scores[0]), decision, margin, rival, probability)
+        against = () if rival is None else (float(log_odds_of_places[rival]),)
+        probability = float(joint_probabilities([best, *against])[0])
+    return Judgement(verdict, float(scores[0]), decision, margin, rival, probability, rivals=rivals, evidence=evidence)
+
+
+def _heads(places: NDArray[np.int64], near: NDArray[np.bool_]) -> list[int]:
+    """The first of some places, int64 [k], without those that are the same place as a better one."""
+    heads: list[int] = []
+    while len(places) and len(heads) < MOST_RIVALS:
+        heads.append(int(places[0]))
+        places = places[~near[heads[-1], places]]
+    return heads
 
 
 def joint_probabilities(log_odds_of_matches: Sequence[float]) -> Values:

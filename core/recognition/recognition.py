@@ -13,6 +13,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -244,21 +245,23 @@ def locate(map_: Map, encoder: Encoder, queries: Sequence[Query]) -> list[Answer
     return [replace(answer, search=milliseconds) for answer in answers]
 
 
+def judgement_of(map_: Map, encoder: Encoder, candidates: Candidates) -> Judgement:
+    """The judgement of the candidates of one query."""
+    return judge(
+        candidates.ordered,
+        candidates.whereabouts,
+        calibration_of(map_, encoder),
+        neighborhood_of(map_),
+        candidates.examined,
+        lambda positions: likeness(map_, encoder, candidates, positions),
+        candidates.geometry,
+    )
+
+
 def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -> Answer:
     """Verify and judge the candidates, and look up the best places; again if one was deleted since the search."""
 
-    def judged(candidates: Candidates) -> Judgement:
-        return judge(
-            candidates.ordered,
-            candidates.whereabouts,
-            calibration_of(map_, encoder),
-            neighborhood_of(map_),
-            candidates.examined,
-            lambda positions: likeness(map_, encoder, candidates, positions),
-            candidates.geometry,
-        )
-
-    k = query.question.k
+    k, judged = query.question.k, partial(judgement_of, map_, encoder)
     ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
     attempt = 1
     while None in (places := _places(map_, ranked, k)) and attempt < ATTEMPTS:
@@ -301,11 +304,11 @@ def _put_together(
         shared = sightings(map_, candidates, stage, query.verifier)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views, sightings=shared)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
-    rivals = _rivals(map_, candidates, judgement)
+    rivals = rival_places(map_, candidates, judgement)
     return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
 
 
-def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalPlaces, ...]:
+def rival_places(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalPlaces, ...]:
     """The rivals by id; places that were deleted since the search are left out."""
     groups = []
     for group in judgement.rivals:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from core.geometry.verification import Verification
 from core.judgement.fusion import CameraRanking, Fused, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.question import Query
-from core.recognition.recognition import ATTEMPTS, Answer, locate
+from core.recognition.recognition import ATTEMPTS, Answer, judgement_of, locate, rival_places
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
+from core.recognition.verification import Judge, ThirdStage, VerificationState, third_stage
 
 
 def locate_rig(
@@ -27,7 +30,8 @@ def locate_rig(
 
     Args:
         encoder: the map's encoder.
-        queries: the rig's frames that have regions, with one question; at least one.  Several are never verified.
+        queries: the rig's frames that have regions, with one question; at least one.  With ``auto`` the candidates of
+            each camera are verified whose own scores leave doubt.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -41,7 +45,12 @@ def locate_rig(
         ranked = rank_places(map_, encoder, encodings, question.selection)
         if not len(ranked[0].rows):
             return locate(map_, encoder, queries[:1])[0]  # no place is allowed, or there is none
-        views = [CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights) for one in ranked]
+        verified = [third_stage(map_, encoder, *one) for one in _judged_alone(map_, encoder, ranked, queries)]
+        finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
+        views = [
+            CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry)
+            for one in finals
+        ]
         fused = fuse(views, calibration, neighborhood)
         places = map_.places_at(fused.rows[: question.k].tolist())
         if None not in places:
@@ -54,15 +63,40 @@ def locate_rig(
     matches = [
         (float(fused.scores[position]), place) for position in retained if (place := places[position]) is not None
     ]
-    candidates = _candidates_of_rig(fused, ranked[0], decision_slope(calibration))
+    candidates = _candidates_of_rig(fused, finals, decision_slope(calibration))
     weights = None if ranked[0].weights is None else np.exp(fused.weights[retained]).tolist()
     pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
-    milliseconds = 1e3 * (time.perf_counter() - began)
-    return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates)
+    rivals = rival_places(map_, candidates, judgement)
+    milliseconds = 1e3 * (time.perf_counter() - began) - stage.milliseconds
+    return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates, stage, rivals)
 
 
-def _candidates_of_rig(fused: Fused, one: Candidates, steepness: float) -> Candidates:
-    """The fused ranking as if it were one camera's: ordered by the scores that would give it the same log odds."""
+def _judged_alone(
+    map_: Map, encoder: Encoder, ranked: Sequence[Candidates], queries: Sequence[Query]
+) -> Iterator[tuple[Candidates, Judge, Query]]:
+    """What the third stage needs of each camera."""
+    for candidates, query in zip(ranked, queries, strict=True):
+        yield candidates, partial(judgement_of, map_, encoder), query
+
+
+def _joint_stage(stages: Sequence[ThirdStage]) -> ThirdStage:
+    """The outcome of the third stage for all cameras: ``verified`` if any was."""
+    order: tuple[VerificationState, ...] = ("verified", "not-needed", "no-keypoints", "never")
+    state = min((stage.state for stage in stages), key=order.index)
+    return ThirdStage(state, milliseconds=sum(stage.milliseconds for stage in stages))
+
+
+def _candidates_of_rig(fused: Fused, views: Sequence[Candidates], steepness: float) -> Candidates:
+    """The fused ranking as if it were one camera's: ordered by the scores that would give it the same log odds.
+
+    Of several verifications of one place it has the one with the most evidence.
+    """
+    one = views[0]
+    found: dict[int, Verification] = {}
+    for view in views:
+        for row, result in zip(view.rows.tolist(), view.verifications, strict=False):
+            if result is not None and (row not in found or result.evidence > found[row].evidence):
+                found[row] = result
     return replace(
         one,
         rows=fused.rows,
@@ -72,4 +106,6 @@ def _candidates_of_rig(fused: Fused, one: Candidates, steepness: float) -> Candi
         examined=np.full(len(fused.rows), one.examined.any()),
         weights=fused.weights,
         ordered=(fused.log_odds / steepness).astype(np.float32),
+        geometry=None,
+        verifications=tuple(found.get(row) for row in fused.rows.tolist()) if found else (),
     )

@@ -91,7 +91,7 @@ async def locate_in_maps(
     """Locate the frames of a rig in each of several maps; call it within ``queue.place``.
 
     Args:
-        question: its camera does not count; each frame has its own.  Several frames are never verified.
+        question: its camera does not count; each frame has its own.
 
     Returns:
         One report for each map, in the order of the ids.
@@ -109,23 +109,30 @@ async def locate_in_maps(
         except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
     encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=question.verify != "never")
-    finders: dict[str, Callable[[], Keypoints]] = {}  # by mask, the same for every encoder
+    finders: dict[tuple[int, str], Callable[[], Keypoints]] = {}  # by frame and mask, the same for every encoder
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
         if isinstance(outcome, Exception):
             reports[map_id] = MapReport(map_id, map_, error=outcome)
             continue
-        seen = [one for one in outcome if isinstance(one, Encoded) and len(one.encoding.regions)]
+        seen = [
+            (index, one) for index, one in enumerate(outcome) if isinstance(one, Encoded) and len(one.encoding.regions)
+        ]
         failure = next((one for one in outcome if isinstance(one, MAP_ERRORS)), None)
         report = MapReport(map_id, map_, error=failure, frames=tuple(outcome))
         if seen and failure is None:
             try:
-                queries = [one.query(question) for one in seen]
-                if len(seen) == 1:
-                    camera = frames[outcome.index(seen[0])].camera
-                    find = finders.setdefault(_key(seen[0].mask), cache(seen[0].find_keypoints))
-                    queries = [Query(seen[0].encoding, replace(question, camera=camera), find)]
-                answer = await in_thread(locate_rig, map_, seen[0].encoder, queries)
+                # The pose of a rig does not come from the geometry of one of its cameras.
+                camera = frames[seen[0][0]].camera if len(seen) == 1 else None
+                queries = [
+                    Query(
+                        one.encoding,
+                        replace(question, camera=camera),
+                        finders.setdefault((index, _key(one.mask)), cache(one.find_keypoints)),
+                    )
+                    for index, one in seen
+                ]
+                answer = await in_thread(locate_rig, map_, seen[0][1].encoder, queries)
                 report = replace(report, answer=answer)
             except MAP_ERRORS as error:
                 report = replace(report, error=error)

@@ -188,6 +188,7 @@ def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None)
         threshold=answer.threshold,
         reason=answer.reason,
         verification=answer.verification,
+        rivals=answer.rivals,
         revision=answer.revision,
         encoder=encoder,
     )

@@ -349,6 +349,7 @@ class MapAnswer(BaseModel):
     threshold: float | None = None
     reason: Reason | None = Field(default=None, description="Why there is nothing to compare, if so.")
     verification: VerificationView | None = None
+    rivals: list[RivalGroup] = Field(default_factory=list, description="Why the map's own verdict is `ambiguous`.")
     revision: int | None = None
     encoder: str | None = None
     problem: Problem | None = None

@@ -943,6 +943,7 @@ class MapAnswer(Model):
     threshold: float | None = None
     reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
     verification: VerificationView | None = None
+    rivals: list[RivalGroup] = Field(default_factory=list)
     revision: int | None = None
     encoder: str | None = None
     problem: Problem | None = None

@@ -67,7 +67,7 @@ def test_keypoints_lie_on_the_corners_of_what_is_drawn(network: XFeat) -> None:
         (16, 16, (288, 288)),
     ],
 )
-def test_the_network_sees_an_area_of_320_by_240(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
+def test_the_network_sees_320_by_240_pixels(network: XFeat, width: int, height: int, shown: tuple[int, int]) -> None:
     assert shown_size(width, height) == shown
     made = find_keypoints(network, sample_frame(1, width, height))
     assert (made.width, made.height) == (width, height)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from core.judgement.fusion import BLIND, CameraRanking, Fused, fuse, joint_probabilities, log_odds_of
+from core.judgement.geometry import TERMS, Geometry
 from core.judgement.probability import Curve, sigmoid
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.places import Neighborhood, Pose
@@ -68,6 +71,47 @@ def test_two_that_contradict_each_other_are_ambiguous() -> None:
     found = fused(view({3: 0.5, **BACKGROUND}), view({5: 0.5, **BACKGROUND}))
     assert found.judgement.verdict == "ambiguous" and set(found.rows[:2].tolist()) == {3, 5}
     assert found.judgement.probability is not None and found.judgement.probability <= 0.5
+    assert [(found.rows[list(one.positions)].tolist(), one.same_place) for one in found.judgement.rivals] == [
+        ([int(found.rows[1])], False)
+    ]
+    assert not fused(view({3: 0.5, **BACKGROUND})).judgement.rivals
+
+
+def verified(one: CameraRanking, evidence: dict[int, float]) -> CameraRanking:
+    """A camera whose candidates were verified, with the evidence of some rows; a hundredth of it is their gain."""
+    found = np.array([evidence.get(row, np.nan) for row in one.rows.tolist()])
+    return replace(one, geometry=Geometry(found, np.nan_to_num(found) / 1000))
+
+
+def test_the_evidence_of_a_camera_joins_its_log_odds() -> None:
+    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
+    plain = view({3: 0.32, **BACKGROUND})
+    before = fuse([plain], weighing, NEIGHBORHOOD)
+    fits, fails = (fuse([verified(plain, {3: evidence})], weighing, NEIGHBORHOOD) for evidence in (300.0, 0.0))
+    assert before.rows[0] == fits.rows[0] == 3
+    assert fits.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 300.0)))
+    assert fails.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 0.0)))
+    assert fits.judgement.verdict == "recognized" and fits.judgement.evidence == 300.0
+    assert fails.judgement.verdict == "unknown" and before.judgement.evidence is None
+    assert fits.scores[0] == pytest.approx(0.62)
+
+
+def test_geometry_settles_what_two_cameras_disagree_about() -> None:
+    """The right camera prefers another place in score; its keypoints fit the one that the left camera knows."""
+    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
+    left = verified(view({3: 0.5, **BACKGROUND}), {3: 300.0})
+    right = view({5: 0.42, 3: 0.36, **BACKGROUND})
+    assert fuse([left, right], CALIBRATION, NEIGHBORHOOD).judgement.verdict == "ambiguous"
+    settled = fuse([left, verified(right, {3: 200.0, 5: 0.0})], weighing, NEIGHBORHOOD)
+    assert settled.rows[0] == 3 and settled.judgement.verdict == "recognized"
+
+
+def test_a_place_that_a_verified_camera_left_out_has_no_evidence() -> None:
+    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
+    one = view({3: 0.4, 5: 0.39, **BACKGROUND})
+    found = fuse([verified(one, {3: 150.0})], weighing, NEIGHBORHOOD)
+    assert found.rows.tolist()[:2] == [3, 5]
+    assert found.log_odds[1] < float(TERMS.log_odds(0.0, 0.0)) + 4
 
 
 def test_what_each_takes_for_one_of_two_both_take_for_the_third() -> None:

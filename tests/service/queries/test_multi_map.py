@@ -199,6 +199,23 @@ def test_two_cameras_are_more_certain_than_one(server: Server, rig_map: str) -> 
 def test_cameras_that_contradict_each_other_are_not_believed(server: Server, rig_map: str) -> None:
     answer = ask_rig(server, {"a": again(1), "b": again(204)}, maps=rig_map)
     assert answer["verdict"] != "recognized"
+    for verify in ("auto", "always"):
+        (report,) = ask_rig(server, {"a": again(1), "b": again(204)}, maps=rig_map, verify=verify)["maps"]
+        assert report["verdict"] == "ambiguous", verify
+        rivals = {place for group in report["rivals"] for place in group["places"]}
+        assert rivals <= {"front-1", "left-4"} and rivals
+
+
+def test_the_cameras_of_a_rig_are_verified(server: Server, rig_map: str) -> None:
+    frames = {"a": again(4), "b": again(204)}
+    states = {}
+    for verify in ("never", "auto", "always"):
+        answer = ask_rig(server, frames, maps=rig_map, verify=verify)
+        assert answer["verdict"] == "recognized" and answer["place"]["pose"]["x"] == 40
+        (states[verify],) = [report["verification"] for report in answer["maps"]]
+    assert states["never"]["state"] == "never" and states["always"]["state"] == "verified"
+    assert states["auto"]["state"] in ("verified", "not-needed")
+    assert states["always"]["candidates"] > 1
 
 
 def test_each_part_may_name_its_camera(server: Server, rig_map: str) -> None:
