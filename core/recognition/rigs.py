@@ -74,7 +74,7 @@ def locate_rig(
 def _judged_alone(
     map_: Map, encoder: Encoder, ranked: Sequence[Candidates], queries: Sequence[Query]
 ) -> Iterator[tuple[Candidates, Judge, Query]]:
-    """What the third stage needs of each camera."""
+    """The arguments of the third stage, of each camera."""
     for candidates, query in zip(ranked, queries, strict=True):
         yield candidates, partial(judgement_of, map_, encoder), query
 
