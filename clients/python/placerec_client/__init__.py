@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         InvalidOdometry,
         InvalidParameter,
         JobCancelled,
+        NotReadyInTime,
         PlacerecError,
         Problem,
         Renamed,
@@ -72,6 +73,7 @@ __all__ = [
     "Map",
     "MapEvent",
     "NewPlace",
+    "NotReadyInTime",
     "Odometry",
     "Picture",
     "PlacerecError",
@@ -102,6 +104,7 @@ _MODULES = {
         *(
             "InvalidParameter",
             "JobCancelled",
+            "NotReadyInTime",
             "PlacerecError",
             "Problem",
             "Renamed",

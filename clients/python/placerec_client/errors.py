@@ -24,6 +24,10 @@ class ClientClosed(PlacerecError):
         super().__init__("The client was closed; make another one to go on.")
 
 
+class NotReadyInTime(PlacerecError):
+    """The service was not ready within the time that it was waited for; ``__cause__`` is what it said last."""
+
+
 class DeadlineExceeded(PlacerecError):
     """No answer came before the deadline of the call."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from placerec_client import retry
-from placerec_client._sync import connection, numbering
+from placerec_client._sync import client, connection, numbering
 
 
 class Moments:
@@ -16,6 +16,7 @@ class Moments:
         monkeypatch.setattr(retry, "time", self)
         monkeypatch.setattr(numbering, "time", self)
         monkeypatch.setattr(connection, "sleep", self.sleep)
+        monkeypatch.setattr(client, "sleep", self.sleep)
 
     def monotonic(self) -> float:
         return self.now

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import itertools
 import json
 import random
@@ -16,11 +18,14 @@ import httpx
 import pytest
 
 from placerec_client import (
+    AsyncClient,
     Client,
     ClientClosed,
     ConnectionFailed,
     DeadlineExceeded,
+    InvalidParameter,
     Map,
+    NotReadyInTime,
     PlacerecError,
     Problem,
     Retry,
@@ -470,3 +475,48 @@ def test_a_session_whose_answer_was_lost_is_not_begun_twice(server: Server) -> N
             with lab.sessions.begin(lag=1) as other:
                 assert other.id != session.id, "it is another request"
         assert way.happened["lose-answer"] == 1
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_a_service_that_is_not_there_yet_is_waited_for(server: Server, half: Any) -> None:
+    fates: list[Fault] = ["cut-before", "lose-answer"]
+
+    async def work(url: str) -> Any:
+        client = half(url, retry=Retry(0))
+        try:
+            ready = client.wait_ready(60)
+            return await ready if inspect.isawaitable(ready) else ready
+        finally:
+            if inspect.isawaitable(closed := client.close()):
+                await closed
+
+    with FaultProxy(server.port, choose=lambda _: fates.pop(0) if fates else "none") as way:
+        assert set(asyncio.run(work(way.url)).checks.values()) == {"ok"}
+        assert way.happened["requests"] == 3
+
+
+def test_a_service_that_says_it_is_not_ready_is_asked_until_the_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    moments = Moments(monkeypatch)
+    answers = itertools.chain([httpx.Response(502, content=b"a proxy")], itertools.repeat(problem(503, "not-ready")))
+    with (
+        Client("http://robot", transport=httpx.MockTransport(lambda _: next(answers))) as client,
+        pytest.raises(NotReadyInTime, match=r"^http://robot was not ready within 20 s: It is not-ready\.$") as told,
+    ):
+        client.wait_ready(20)
+    assert isinstance(told.value.__cause__, problems.NotReady)
+    assert 18 < moments.now <= 20
+
+
+def test_a_service_that_will_not_become_ready_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    moments = Moments(monkeypatch)
+    handle, asked = in_turn(problem(401, "key-refused"), httpx.Response(404, content=b"a page"))
+    with Client("http://robot", transport=httpx.MockTransport(handle)) as client:
+        for kind in (problems.KeyRefused, UnexpectedAnswer):
+            with pytest.raises(kind):
+                client.wait_ready(20)
+        for seconds in (0, -1, "20", float("nan")):
+            with pytest.raises(InvalidParameter, match="seconds has to be"):
+                client.wait_ready(seconds)  # type: ignore[arg-type]
+    with pytest.raises(ClientClosed):
+        client.wait_ready(20)
+    assert (len(asked), moments.now) == (2, 0)

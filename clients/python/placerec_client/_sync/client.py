@@ -9,13 +9,27 @@ from typing import Any, Literal, Self, Unpack
 
 from placerec_client import models, parameters
 from placerec_client._http import httpx
+from placerec_client._sync.concurrency import sleep
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.jobs import Jobs
 from placerec_client._sync.keys import Keys
 from placerec_client._sync.maps import Maps
+from placerec_client.answers import OVERLOADED
+from placerec_client.errors import (
+    ConnectionFailed,
+    DeadlineExceeded,
+    InvalidParameter,
+    NotReadyInTime,
+    PlacerecError,
+    Problem,
+    UnexpectedAnswer,
+)
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import Part, form
-from placerec_client.retry import Retry
+from placerec_client.requests import Part, form, seconds_of
+from placerec_client.retry import Clock, Retry
+
+FIRST_ATTEMPT_SECONDS = 5.0
+"""How long the first answer to ``wait_ready`` is waited for; each further one may take twice as long."""
 
 
 class Client:
@@ -186,6 +200,42 @@ class Client:
         """
         return self.connection.ask(models.Readiness, "GET", "/readyz")
 
+    def wait_ready(self, seconds: float = 60.0) -> models.Readiness:
+        """Wait until the service is ready to answer queries, and return what it checks of itself.
+
+        It is asked about once a second while it cannot be reached, is overloaded, or says that it is not ready.
+
+        Args:
+            seconds: to wait at most, more than 0.
+
+        Raises:
+            NotReadyInTime: it was not ready in this time; the text says why.
+            Problem: it refuses the request, which waiting does not change, such as for want of a key.
+            UnexpectedAnswer: something else than a placerec service answers.
+            InvalidParameter: ``seconds`` is no number, or not more than 0.
+            ClientClosed: the client was closed.
+        """
+        seconds = seconds_of("seconds", seconds)
+        if seconds <= 0:
+            raise InvalidParameter(f"seconds has to be more than 0, not {seconds:g}.")
+        clock = Clock(seconds, Retry(seconds, first_pause=0.1, longest_pause=1.0))
+        once = self.connection.patient(Retry(0))
+        limit = FIRST_ATTEMPT_SECONDS
+        while True:
+            clock.attempts += 1
+            try:
+                left = clock.left() or 0.0
+                return once.ask(models.Readiness, "GET", "/readyz", deadline=min(left, limit))
+            except PlacerecError as error:
+                if not _may_become_ready(error):
+                    raise
+                failure, pause = error, clock.pause()
+            if pause is None:
+                name = self.connection.name
+                raise NotReadyInTime(f"{name} was not ready within {seconds:g} s: {failure}") from failure
+            limit *= 2
+            sleep(pause)
+
     def version(self) -> models.Version:
         """Return the versions of the service and its libraries."""
         return self.connection.ask(models.Version, "GET", "/version")
@@ -231,6 +281,13 @@ class Encoders:
 
     def __iter__(self) -> Iterator[models.EncoderSummary]:
         return self.list()
+
+
+def _may_become_ready(error: PlacerecError) -> bool:
+    """Whether a service that answered so may be ready in a moment."""
+    if isinstance(error, Problem | UnexpectedAnswer):
+        return error.status in OVERLOADED
+    return isinstance(error, ConnectionFailed | DeadlineExceeded)
 
 
 def _two(a: Frame, b: Frame) -> tuple[bytes, str]:
