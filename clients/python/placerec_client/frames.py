@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from array import array
 from dataclasses import dataclass
+from importlib import import_module
+from io import BytesIO
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeAlias
 
 from placerec_client.errors import InvalidFrame
@@ -14,39 +17,69 @@ if TYPE_CHECKING:
     import numpy
     from numpy.typing import NDArray
 
-    Pixels: TypeAlias = NDArray[numpy.uint8]
+    Pixels: TypeAlias = NDArray[numpy.uint8] | NDArray[numpy.uint16]
+
+Order: TypeAlias = Literal["bgr", "rgb"]
+Encoding: TypeAlias = Literal["png", "jpeg"]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An array as a frame, with the order of its channels.
+    """An array as a frame, with the order of its channels, and as which file it is sent.
 
     Args:
-        pixels: uint8, [height, width] or [height, width, 3].
-        order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``.
+        pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4].
+        order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``; a fourth one, of opacity, is left out.
+        encoding: ``png`` loses nothing; ``jpeg`` takes a fraction of the time and of the bytes, loses a little, and
+            needs OpenCV or Pillow.
+        quality: of a JPEG file, from 1 to 100.
+
+    Raises:
+        InvalidFrame: ``order``, ``encoding`` or ``quality`` is none of these.
     """
 
     pixels: Pixels
-    order: Literal["bgr", "rgb"] = "bgr"
+    order: Order = "bgr"
+    encoding: Encoding = "png"
+    quality: int = 90
+
+    def __post_init__(self) -> None:
+        if self.order not in ("bgr", "rgb"):
+            raise InvalidFrame(f"The order of channels is 'bgr' or 'rgb', not {ascii(self.order)[:140]}.")
+        if self.encoding not in ("png", "jpeg"):
+            raise InvalidFrame(f"The encoding of a picture is 'png' or 'jpeg', not {ascii(self.encoding)[:140]}.")
+        if not isinstance(self.quality, int) or not 1 <= self.quality <= 100:
+            raise InvalidFrame(f"The quality is a whole number from 1 to 100, not {ascii(self.quality)[:140]}.")
 
 
-Frame: TypeAlias = "bytes | bytearray | memoryview | str | os.PathLike[str] | BinaryIO | Pixels | Picture"
-"""The bytes of a JPEG, PNG or WebP file; the path of one; one opened for reading; or pixels, in OpenCV's order BGR."""
+Frame: TypeAlias = "bytes | bytearray | memoryview | array[int] | str | os.PathLike[str] | BinaryIO | Pixels | Picture"
+"""The bytes of a JPEG, PNG or WebP file, also in an array; the path of one; one opened for reading; or pixels, in
+OpenCV's order BGR."""
+
+LONGEST_SIDE = 65500
+"""Pixels that a side of a JPEG file may have at most."""
 
 
 def frame_bytes(frame: Frame) -> bytes:
-    """Return the bytes of the file that is sent for a frame: pixels become a PNG, which loses nothing.
+    """Return the bytes of the file that is sent for a frame: pixels become a PNG, if nothing else is wanted.
 
     Raises:
-        InvalidFrame: the file cannot be read, or the array is not uint8 of shape [H, W] or [H, W, 3].
+        InvalidFrame: the file cannot be read; the array has no such type and shape; or a JPEG is wanted where nothing
+            that writes one is installed.
     """
     if isinstance(frame, bytes):
         return frame
     if isinstance(frame, bytearray | memoryview):
         return bytes(frame)
     if isinstance(frame, Picture):
+        if frame.encoding == "jpeg":
+            return jpeg(frame.pixels, frame.order, frame.quality)
         return png(frame.pixels, frame.order)
+    if isinstance(frame, array):
+        return _file_of(frame, frame.typecode == "B")
     if hasattr(frame, "__array_interface__"):
+        if frame.ndim == 1:
+            return _file_of(frame, str(frame.dtype) == "uint8")
         return png(frame)
     try:
         if isinstance(frame, str | os.PathLike):
@@ -72,22 +105,34 @@ def media_type(data: bytes) -> str:
     return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "image/jpeg"
 
 
+def _file_of(data: Any, is_bytes: bool) -> bytes:
+    """The bytes of a picture file in an array, as ROS has them in a CompressedImage.
+
+    Raises:
+        InvalidFrame: they are none.
+    """
+    found = data.tobytes() if is_bytes else b""
+    if media_type(found) == "image/jpeg" and not found.startswith(b"\xff\xd8\xff"):
+        raise InvalidFrame(
+            f"An array of {len(data)} numbers is no picture: it has to be uint8 and hold a JPEG, PNG or WebP file, or "
+            "have rows and columns of pixels."
+        )
+    return found
+
+
 def png(pixels: Any, order: str = "bgr") -> bytes:
     """Encode pixels as a PNG file.
 
     Args:
-        pixels: NumPy array uint8, [height, width] or [height, width, 3].
+        pixels: NumPy array uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4].
         order: of the channels, ``bgr`` or ``rgb``.
 
     Raises:
         InvalidFrame: the array has another type or shape.
     """
-    shape = tuple(pixels.shape)
-    if str(pixels.dtype) != "uint8" or not (len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)) or 0 in shape:
-        raise InvalidFrame(f"An array {pixels.dtype} of shape {list(shape)} is no picture: uint8 [H, W] or [H, W, 3].")
-    grey = len(shape) == 2
-    rows = pixels if grey or order == "rgb" else pixels[..., ::-1]
-    rows = rows.reshape(shape[0], -1)
+    found = _in_red_green_blue(pixels, order)
+    shape, grey = found.shape, found.ndim == 2
+    rows = found.reshape(shape[0], -1)
     # Each row is stored as its difference from the one above (the filter "up"), which compresses better.
     filtered = rows.copy()
     filtered[1:] -= rows[:-1]
@@ -101,6 +146,64 @@ def png(pixels: Any, order: str = "bgr") -> bytes:
             _chunk(b"IEND", b""),
         ]
     )
+
+
+def jpeg(pixels: Any, order: str = "bgr", quality: int = 90) -> bytes:
+    """Encode pixels as a JPEG file, by OpenCV if it is installed, else by Pillow.
+
+    Args:
+        pixels: as of ``png``.
+        order: of the channels, ``bgr`` or ``rgb``.
+        quality: from 1 to 100.
+
+    Raises:
+        InvalidFrame: the array has another type or shape, or is too large for a JPEG file; or neither is installed.
+    """
+    found = _in_red_green_blue(pixels, order)
+    if max(found.shape) > LONGEST_SIDE:
+        raise InvalidFrame(
+            f"An array of shape {list(found.shape)} cannot be a JPEG file: a side has at most {LONGEST_SIDE} pixels."
+        )
+    try:
+        cv2: Any = import_module("cv2")
+    except ImportError:
+        return _jpeg_by_pillow(found, quality)
+    ordered = found if found.ndim == 2 else found[..., ::-1]
+    is_written, data = cv2.imencode(".jpg", ordered.copy(), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not is_written:
+        raise InvalidFrame(f"OpenCV writes no JPEG file of an array of shape {list(found.shape)}.")
+    return bytes(data)
+
+
+def _jpeg_by_pillow(found: Any, quality: int) -> bytes:
+    try:
+        image: Any = import_module("PIL.Image")
+    except ImportError as error:
+        raise InvalidFrame("A picture becomes a JPEG file by OpenCV or Pillow; neither is installed.") from error
+    file = BytesIO()
+    image.fromarray(found.copy()).save(file, "JPEG", quality=quality)
+    return file.getvalue()
+
+
+def _in_red_green_blue(pixels: Any, order: str) -> Any:
+    """Pixels as uint8, [height, width] or [height, width, 3] in the order RGB; of 16 bits the upper 8 are used.
+
+    Raises:
+        InvalidFrame: the array has another type or shape.
+    """
+    if not hasattr(pixels, "__array_interface__"):
+        raise InvalidFrame(f"A {type(pixels).__name__} is no array of pixels.")
+    shape, kind = tuple(pixels.shape), pixels.dtype
+    has_channels = len(shape) == 3 and shape[2] in (3, 4)
+    if kind.kind != "u" or kind.itemsize > 2 or not (len(shape) == 2 or has_channels) or 0 in shape:
+        raise InvalidFrame(
+            f"An array {kind} of shape {list(shape)} is no picture: uint8 or uint16, [H, W], [H, W, 3] or [H, W, 4]."
+        )
+    if kind.itemsize == 2:
+        pixels = (pixels >> 8).astype("uint8")
+    if not has_channels:
+        return pixels
+    return pixels[..., :3] if order == "rgb" else pixels[..., 2::-1]
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import sys
+from array import array
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,61 @@ def test_the_order_of_the_channels_and_views_of_arrays() -> None:
     assert read is not None and np.array_equal(read, pixels[10:50:2, 5:60])
 
 
+def test_opacity_and_the_lower_bits_are_left_out() -> None:
+    pixels = np.random.default_rng(0).integers(0, 1 << 16, (31, 7, 4), np.uint16)
+    upper = (pixels >> 8).astype(np.uint8)
+    expected = frame_bytes(np.ascontiguousarray(upper[..., :3]))
+    for given in (upper, pixels[..., :3], pixels, pixels.astype(">u2")):
+        assert frame_bytes(given) == expected
+    assert frame_bytes(Picture(pixels[..., [2, 1, 0, 3]], order="rgb")) == expected
+    assert frame_bytes(pixels[..., 0]) == frame_bytes(upper[..., 0])
+
+
+def test_the_bytes_of_a_file_in_an_array() -> None:
+    """ROS has the data of a CompressedImage so."""
+    for data in (jpeg(1, 64, 48), png(scene(1))):
+        assert frame_bytes(np.frombuffer(data, np.uint8)) == data
+        assert frame_bytes(array("B", data)) == data
+
+
+@pytest.mark.parametrize("missing", [(), ("cv2",)])
+@pytest.mark.parametrize("order", ["bgr", "rgb"])
+def test_pixels_as_a_jpeg(missing: tuple[str, ...], order: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in missing:
+        monkeypatch.setitem(sys.modules, name, None)
+    pixels = cv2.GaussianBlur(scene(1), (0, 0), 3)
+    given = pixels if order == "bgr" else pixels[..., ::-1]
+    data = frame_bytes(Picture(given, order, encoding="jpeg", quality=95))
+    assert media_type(data) == "image/jpeg"
+    assert len(frame_bytes(Picture(given, order, encoding="jpeg", quality=20))) < len(data) < len(png(pixels))
+    read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert read is not None and np.abs(read.astype(int) - pixels).mean() < 3
+    grey = frame_bytes(Picture(pixels[..., 1], encoding="jpeg"))
+    read = cv2.imdecode(np.frombuffer(grey, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read is not None and read.shape == pixels.shape[:2]
+
+
+def test_a_jpeg_without_what_writes_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("cv2", "PIL.Image"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InvalidFrame, match="OpenCV or Pillow"):
+        frame_bytes(Picture(scene(1), encoding="jpeg"))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"order": "grb"}, "'bgr' or 'rgb', not 'grb'"),
+        ({"encoding": "gif"}, "'png' or 'jpeg', not 'gif'"),
+        ({"quality": 0}, "from 1 to 100, not 0"),
+        ({"quality": 9.5}, "whole number"),
+    ],
+)
+def test_a_picture_that_cannot_be_sent_is_refused_when_it_is_made(options: Any, told: str) -> None:
+    with pytest.raises(InvalidFrame, match=told):
+        Picture(scene(1), **options)
+
+
 def test_files_and_bytes(tmp_path: Path) -> None:
     data = jpeg(1, 64, 48)
     path = tmp_path / "frame.jpg"
@@ -49,7 +106,17 @@ def test_files_and_bytes(tmp_path: Path) -> None:
     [
         ("/no/such/frame.jpg", "cannot be read: No such file"),
         (np.zeros((4, 4), np.float32), r"float32 of shape \[4, 4\] is no picture"),
-        (np.zeros((4, 4, 4), np.uint8), r"shape \[4, 4, 4\]"),
+        (np.zeros((4, 4, 5), np.uint8), r"shape \[4, 4, 5\]"),
+        (np.zeros((4, 4, 1), np.uint8), r"shape \[4, 4, 1\]"),
+        (np.zeros((4, 4), np.int16), r"int16 of shape \[4, 4\] is no picture: uint8 or uint16"),
+        (np.zeros((4, 4), np.uint32), "uint32"),
+        (np.zeros(16, np.uint8), "An array of 16 numbers is no picture"),
+        (np.zeros(0, np.uint8), "An array of 0 numbers"),
+        (np.frombuffer(jpeg(1, 64, 48), np.int8), "it has to be uint8 and hold a JPEG"),
+        (array("B", b"GIF89a"), "An array of 6 numbers"),
+        (array("h", [7]), "An array of 1 numbers"),
+        (Picture([[1]]), "A list is no array of pixels"),  # type: ignore[arg-type]
+        (Picture(np.zeros((1, 70000), np.uint8), encoding="jpeg"), "cannot be a JPEG file"),
         (np.zeros((0, 4), np.uint8), r"shape \[0, 4\]"),
         (7, "A int is no frame"),
         (io.StringIO("text"), "not opened in binary mode"),
@@ -70,8 +137,14 @@ def test_the_content_type_is_that_of_the_bytes() -> None:
 def test_the_service_takes_pixels(lab: Map) -> None:
     lab.places.put("grey", np.ascontiguousarray(scene(1)[..., 1]))
     lab.places.put("colour", scene(2))
-    answer = lab.query(Picture(scene(2)[..., ::-1], order="rgb"))
-    assert answer.place is not None and answer.place.id == "colour"
+    for frame in (
+        Picture(scene(2)[..., ::-1], order="rgb"),
+        Picture(scene(2), encoding="jpeg"),
+        np.dstack([scene(2), scene(2)[..., 0]]),
+        np.frombuffer(jpeg(2), np.uint8),
+    ):
+        answer = lab.query(frame)
+        assert answer.place is not None and answer.place.id == "colour"
 
 
 def test_parameters_as_text() -> None:
