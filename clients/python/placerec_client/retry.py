@@ -6,6 +6,7 @@ import random
 import time
 from dataclasses import dataclass
 
+from placerec_client.errors import InvalidParameter
 from placerec_client.requests import seconds_of
 
 LEAVE_SECONDS = 1.0
@@ -28,11 +29,19 @@ class Retry:
         patience: seconds after the first attempt in which further ones may begin; 0 sends once. A call with a deadline
             is repeated until its deadline instead.
         first_pause, longest_pause: seconds.
+
+    Raises:
+        InvalidParameter: one of them is no number, or less than 0.
     """
 
     patience: float = 30.0
     first_pause: float = 0.1
     longest_pause: float = 8.0
+
+    def __post_init__(self) -> None:
+        for name in ("patience", "first_pause", "longest_pause"):
+            if seconds_of(name, getattr(self, name)) < 0:
+                raise InvalidParameter(f"{name} has to be 0 seconds or more, not {getattr(self, name):g}.")
 
     def pause(self, attempt: int) -> float:
         """Seconds to wait after failed attempts, at random between half and one and a half of the nominal."""

@@ -113,3 +113,38 @@ def test_a_client_of_what_is_no_service(half: Any) -> None:
         half("robot", key=b"secret")
     with pytest.raises(InvalidParameter, match="timeout has to be a number of seconds, not '5'"):
         half("robot", timeout="5")
+    for timeout in (0, -1.5):
+        with pytest.raises(InvalidParameter, match="timeout has to be more than 0 seconds, not"):
+            half("robot", timeout=timeout)
+    with pytest.raises(InvalidParameter, match=r"retry has to be a Retry, .* not a int"):
+        half("robot", retry=0)
+    with pytest.raises(InvalidParameter, match="retry has to be a Retry"):
+        half("robot").patient(5)
+    with pytest.raises(InvalidParameter, match="The key has characters that no key has") as told:
+        half("robot", key="secret\n")
+    assert "secret" not in str(told.value)
+    with pytest.raises(ConnectionFailed, match="no password of a user") as refused:
+        half("http://me:secret@robot")
+    assert "secret" not in str(refused.value)
+
+
+@pytest.mark.parametrize("options", [{"patience": -1}, {"first_pause": -0.1}, {"longest_pause": -1}, {"patience": "5"}])
+def test_a_rule_that_cannot_be_followed_is_refused_when_it_is_made(options: Any) -> None:
+    with pytest.raises(InvalidParameter, match=r"^(patience|first_pause|longest_pause) has to be"):
+        Retry(**options)
+
+
+def test_an_endless_timeout(url: str) -> None:
+    with Client(url, timeout=float("inf")) as client:
+        assert client.liveness().status == "ok"
+
+
+@pytest.mark.parametrize("half", [Client, AsyncClient])
+def test_a_client_shows_its_service_and_not_its_key(half: Any) -> None:
+    client = half("robot:8000", key="secret")
+    assert repr(client) == f"<{half.__name__} of http://robot:8000, with a key>"
+    assert repr(half("robot")) == f"<{half.__name__} of http://robot>"
+    if inspect.isawaitable(closed := client.close()):
+        asyncio.run(finished(closed))
+    assert repr(client) == f"<{half.__name__} of http://robot:8000, with a key, closed>"
+    assert "secret" not in repr(client.connection)

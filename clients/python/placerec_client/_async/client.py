@@ -51,6 +51,10 @@ class AsyncClient:
         transport: of httpx, to reach the service otherwise than by the network.
         name: of the service in errors; its URL if left out.
 
+    Raises:
+        ConnectionFailed: the URL is none of a service, or the environment names a proxy that is none.
+        InvalidParameter: the key, ``timeout`` or ``retry`` cannot be used.
+
     Attributes:
         maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
@@ -68,7 +72,7 @@ class AsyncClient:
         transport: httpx.AsyncBaseTransport | None = None,
         name: str | None = None,
     ) -> None:
-        self._bind(AsyncConnection(url, key, timeout, retry or Retry(), transport, name))
+        self._bind(AsyncConnection(url, key, timeout, Retry() if retry is None else retry, transport, name))
 
     def _bind(self, connection: AsyncConnection) -> None:
         self.connection = connection
@@ -76,6 +80,9 @@ class AsyncClient:
         self.jobs = AsyncJobs(connection)
         self.encoders = AsyncEncoders(connection)
         self.keys = AsyncKeys(connection)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.connection.state}>"
 
     async def __aenter__(self) -> Self:
         self.connection.check_open()

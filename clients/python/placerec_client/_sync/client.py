@@ -52,6 +52,10 @@ class Client:
         transport: of httpx, to reach the service otherwise than by the network.
         name: of the service in errors; its URL if left out.
 
+    Raises:
+        ConnectionFailed: the URL is none of a service, or the environment names a proxy that is none.
+        InvalidParameter: the key, ``timeout`` or ``retry`` cannot be used.
+
     Attributes:
         maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
@@ -69,7 +73,7 @@ class Client:
         transport: httpx.BaseTransport | None = None,
         name: str | None = None,
     ) -> None:
-        self._bind(Connection(url, key, timeout, retry or Retry(), transport, name))
+        self._bind(Connection(url, key, timeout, Retry() if retry is None else retry, transport, name))
 
     def _bind(self, connection: Connection) -> None:
         self.connection = connection
@@ -77,6 +81,9 @@ class Client:
         self.jobs = Jobs(connection)
         self.encoders = Encoders(connection)
         self.keys = Keys(connection)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.connection.state}>"
 
     def __enter__(self) -> Self:
         self.connection.check_open()

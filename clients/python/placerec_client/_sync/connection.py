@@ -44,6 +44,9 @@ SILENCE_SECONDS = 30.0
 LEAST_SECONDS, MOST_SECONDS = 0.001, 3600.0
 """Bounds of X-Request-Timeout."""
 
+LONGEST_TIMEOUT = 86400.0
+"""Seconds; a longer ``timeout``, such as infinity, is as good as this one."""
+
 PAGE = 500
 """Items of one page of a listing, if the caller does not say."""
 
@@ -68,8 +71,8 @@ class Connection:
 
     Raises:
         ConnectionFailed: the URL is none of a service.
-        InvalidParameter: the key is no text, or ``timeout`` no number.
-        PlacerecError: the key has characters that none has, such as the end of the line after it in a file.
+        InvalidParameter: the key is no text, or has characters that none has, such as the end of the line after it in a
+            file; ``timeout`` is no number, or not more than 0; ``retry`` is no ``Retry``.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Connection:
         name: str | None = None,
     ) -> None:
         self.url = service_url(url)
-        self.name, self.timeout, self.retry = name or self.url, seconds_of("timeout", timeout), retry
+        self.name, self.timeout, self.retry = name or self.url, _timeout(timeout), _rule(retry)
         parsed_url = httpx.URL(self.url)
         self._closed = threading.Event()  # shared with the connections that differ in patience
         self._transport = transport or Lanes(parsed_url, IDLE_SECONDS)
@@ -94,14 +97,27 @@ class Connection:
             if not isinstance(key, str):
                 raise InvalidParameter(f"The key has to be a text, not {type(key).__name__}.")
             if not KEY.fullmatch(key):  # httpx would show it in its error
-                raise PlacerecError("The key has characters that no key has, such as a space or the end of a line.")
+                raise InvalidParameter("The key has characters that no key has, such as a space or the end of a line.")
             self.headers.append((b"Authorization", f"Bearer {key}".encode()))
         self._urls: dict[str, httpx.URL] = {}
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.state}>"
+
+    @property
+    def state(self) -> str:
+        """The service and the state in words, without the key."""
+        has_key = any(name == b"Authorization" for name, _ in self.headers)
+        return self.name + ", with a key" * has_key + ", closed" * self._closed.is_set()
+
     def patient(self, retry: Retry) -> Connection:
-        """The same connection with another rule of when a request is sent again."""
+        """The same connection with another rule of when a request is sent again.
+
+        Raises:
+            InvalidParameter: the rule is no ``Retry``.
+        """
         other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__, retry=retry)
+        other.__dict__.update(self.__dict__, retry=_rule(retry))
         return other
 
     def lasting(self, patience: float) -> Connection:
@@ -296,6 +312,29 @@ class Connection:
             raise self._failure("cannot be reached", error) from error
 
 
+def _timeout(timeout: object) -> float:
+    """The seconds to wait for one answer, which a socket can count.
+
+    Raises:
+        InvalidParameter: it is no number, or not more than 0.
+    """
+    seconds = seconds_of("timeout", timeout)
+    if seconds <= 0:
+        raise InvalidParameter(f"timeout has to be more than 0 seconds, not {seconds:g}.")
+    return min(seconds, LONGEST_TIMEOUT)
+
+
+def _rule(retry: object) -> Retry:
+    """Return the rule of when a request is sent again.
+
+    Raises:
+        InvalidParameter: it is none.
+    """
+    if not isinstance(retry, Retry):
+        raise InvalidParameter(f"retry has to be a Retry, as in Retry(patience=5), not a {type(retry).__name__}.")
+    return retry
+
+
 def service_url(url: str) -> str:
     """The URL of a service in full, without a slash at its end; a host, with a port or without, is one by ``http``.
 
@@ -311,6 +350,10 @@ def service_url(url: str) -> str:
         )
     try:
         parsed_url = httpx.URL(full)
+        if parsed_url.userinfo:  # perhaps a secret, which is not shown
+            raise ConnectionFailed(
+                "The URL of a service has no name and no password of a user; a key is given as key=."
+            )
         check_address(parsed_url)
     except (httpx.InvalidURL, ValueError) as error:
         raise ConnectionFailed(f"{url!r} is not a URL: {error}.") from error
