@@ -34,7 +34,15 @@ def test_what_is_not_used_is_not_imported() -> None:
         subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     )
     assert {"httpx", "pydantic"} <= loaded
-    assert not loaded & {"rich", "click", "pygments", "numpy", "websockets", "placerec_client._async.client"}
+    unused = {"rich", "click", "pygments", "numpy", "cv2", "PIL", "asyncio", "anyio", "websockets"}
+    assert not loaded & {*unused, "placerec_client._async.client"}
+
+
+def test_the_package_alone_imports_nothing_of_others() -> None:
+    program = "import sys; import placerec_client; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "placerec_client" in loaded
+    assert not set(loaded) & {"httpx", "pydantic", "numpy", "cv2", "asyncio", "placerec_client.models"}
 
 
 def test_every_name_can_be_imported() -> None:
