@@ -78,9 +78,8 @@ def frame_bytes(frame: Frame) -> bytes:
     if isinstance(frame, array):
         return _file_of(frame, frame.typecode == "B")
     if hasattr(frame, "__array_interface__"):
-        if frame.ndim == 1:
-            return _file_of(frame, str(frame.dtype) == "uint8")
-        return png(frame)
+        found: Any = frame
+        return _file_of(found, str(found.dtype) == "uint8") if found.ndim == 1 else png(found)
     try:
         if isinstance(frame, str | os.PathLike):
             with open(frame, "rb") as file:

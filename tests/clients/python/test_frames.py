@@ -59,7 +59,7 @@ def test_the_bytes_of_a_file_in_an_array() -> None:
 def test_pixels_as_a_jpeg(missing: tuple[str, ...], order: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in missing:
         monkeypatch.setitem(sys.modules, name, None)
-    pixels = cv2.GaussianBlur(scene(1), (0, 0), 3)
+    pixels = np.asarray(cv2.GaussianBlur(scene(1), (0, 0), 3), np.uint8)
     given = pixels if order == "bgr" else pixels[..., ::-1]
     data = frame_bytes(Picture(given, order, encoding="jpeg", quality=95))
     assert media_type(data) == "image/jpeg"
