@@ -31,6 +31,8 @@ GUIDE = ROOT / "docs/how-to/run-a-cluster.md"
 MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
 VERSION = "1.31"
 """Of Kubernetes, the oldest that the manifests are meant for."""
+RAY_SECRET = ("ray", "token")
+"""Name and key of the secret of Kubernetes that no file has."""
 
 
 @cache
@@ -99,6 +101,23 @@ def test_no_password_stands_in_a_file() -> None:
         assert {value for value in found["stringData"].values() if "change-me" not in value} <= {""}, name
 
 
+def test_all_that_speak_ray_share_a_token_that_no_file_has() -> None:
+    speaking = {name: found for name, found in compose()["services"].items() if found.get("image") == "placerec:cluster"}
+    assert {"placerec-1", "placerec-2", "ray-head", "ray-worker"} <= set(speaking)
+    for name, found in speaking.items():
+        assert found["environment"]["RAY_AUTH_MODE"] == "token", name
+        required = re.fullmatch(r"\$\{RAY_TOKEN:\?(.*)\}", found["environment"]["RAY_AUTH_TOKEN"])
+        assert required and "openssl rand -hex 32" in required[1], name
+    for name in ("placerec", "ray-head", "ray-worker"):
+        given = {one["name"]: one for one in container_of("Deployment", name)["env"]}
+        assert given["RAY_AUTH_MODE"]["value"] == "token", name
+        reference = given["RAY_AUTH_TOKEN"]["valueFrom"]["secretKeyRef"]
+        assert reference == dict(zip(("name", "key"), RAY_SECRET, strict=True)), "it is missing, or may be missing"
+    assert RAY_SECRET[0] not in objects("Secret"), "a token in a file is known to everybody"
+    for line in ("export RAY_TOKEN=$(openssl rand -hex 32)", "--from-literal=token=$(openssl rand -hex 32)"):
+        assert line in GUIDE.read_text(), "the guide does not say how it is made"
+
+
 def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
     replica, told = compose()["services"]["placerec-1"], objects("ConfigMap")["placerec"]["data"]
     given = replica["environment"]
@@ -151,7 +170,8 @@ def test_what_names_a_deployment_finds_it() -> None:
         for variable in container_of(kind, name).get("env", [])
         if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
     }
-    assert named == {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
+    in_files = {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
+    assert named == in_files | {RAY_SECRET}
 
 
 def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
