@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +19,7 @@ from typing import Any
 
 import httpx
 import kubernetes_validate
+import psycopg
 import pytest
 import yaml
 from compose_spec import PyCompose
@@ -26,6 +30,7 @@ from core.postgres.pictures.objects import Objects
 from service.settings import Settings
 from tests.project.test_container import seconds, service
 from tests.servers.object_store import WEED
+from tests.servers.postgres import Postgres
 from tests.servers.process import Server, fixed_ports
 from tests.service.balancer import balanced, nginx_with
 from tests.service.server import free_port
@@ -34,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
 COMPOSE = DOCKER / "compose.cluster.yaml"
 GUIDE = ROOT / "docs/how-to/run-a-cluster.md"
-MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
+MANIFESTS = sorted((DOCKER / "kubernetes").rglob("*.yaml"))
 VERSION = "1.31"
 """Of Kubernetes, the oldest that the manifests are meant for."""
 RAY_SECRET = ("ray", "token")
@@ -52,6 +57,17 @@ def objects(kind: str) -> dict[str, dict[str, Any]]:
     """All objects of a kind by name."""
     found = [one for path in MANIFESTS for one in yaml.safe_load_all(path.read_text())]
     return {one["metadata"]["name"]: one for one in found if one["kind"] == kind}
+
+
+@cache
+def pods() -> dict[str, dict[str, Any]]:
+    """The templates of all pods by the name of what makes them."""
+    found = {
+        name: one["spec"]["template"]
+        for kind in ("Deployment", "StatefulSet", "Job")
+        for name, one in objects(kind).items()
+    }
+    return found | {name: one["spec"]["jobTemplate"]["spec"]["template"] for name, one in objects("CronJob").items()}
 
 
 def settings_in(variables: dict[str, Any]) -> set[str]:
@@ -82,13 +98,19 @@ def test_every_container_is_confined_and_returns() -> None:
     for name, found in compose()["services"].items():
         assert found["restart"] == "unless-stopped" and found["cap_drop"] == ["ALL"], name
         assert found["security_opt"] == ["no-new-privileges:true"] and "mem_limit" in found, name
-    for kind in ("Deployment", "StatefulSet"):
-        for name, found in objects(kind).items():
-            pod = found["spec"]["template"]["spec"]
-            assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"], name
-            for container in pod["containers"]:
-                assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
-                assert "memory" in container["resources"]["limits"], name
+    for name, template in pods().items():
+        pod = template["spec"]
+        assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"], name
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}, name
+        for container in pod["containers"]:
+            may = container["securityContext"]
+            assert may["capabilities"] == {"drop": ["ALL"]} and not may["allowPrivilegeEscalation"], name
+            assert may["readOnlyRootFilesystem"] and "memory" in container["resources"]["limits"], name
+            if container["image"] == "placerec:cluster":
+                assert pod["securityContext"]["runAsUser"] == 10001, name
+                assert "/tmp" in [mount["mountPath"] for mount in container["volumeMounts"]], name
+    labels = objects("Namespace")["placerec"]["metadata"]["labels"]
+    assert labels["pod-security.kubernetes.io/enforce"] == "restricted"
 
 
 def test_variables_are_settings_of_the_service() -> None:
@@ -188,7 +210,8 @@ def test_the_object_store_takes_pictures_and_refuses_strangers(tmp_path: Path) -
 
 
 def container_of(kind: str, name: str) -> dict[str, Any]:
-    (found,) = objects(kind)[name]["spec"]["template"]["spec"]["containers"]
+    assert name in objects(kind)
+    (found,) = pods()[name]["spec"]["containers"]
     container: dict[str, Any] = found
     return container
 
@@ -219,18 +242,105 @@ def test_what_names_a_deployment_finds_it() -> None:
     for found in objects("PodDisruptionBudget").values():
         labels = found["spec"]["selector"]["matchLabels"]
         assert labels in [one["spec"]["template"]["metadata"]["labels"] for one in deployments.values()]
-    pods = deployments | objects("StatefulSet")
     for name, found in objects("Service").items():
-        assert found["spec"]["selector"] == {"app": name} and name in pods
+        assert found["spec"]["selector"] == {"app": name} and name in pods()
     named = {
         (key["name"], key["key"])
-        for kind in ("Deployment", "StatefulSet")
-        for name in objects(kind)
-        for variable in container_of(kind, name).get("env", [])
+        for template in pods().values()
+        for variable in template["spec"]["containers"][0].get("env", [])
         if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
     }
     in_files = {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
     assert named == in_files | {RAY_SECRET}
+
+
+def test_what_is_not_allowed_in_the_network_is_refused() -> None:
+    policies = {name: found["spec"] for name, found in objects("NetworkPolicy").items()}
+    everyone = policies["all"]
+    assert everyone["podSelector"] == {} and set(everyone["policyTypes"]) == {"Ingress", "Egress"}
+    assert "ingress" not in everyone and all(rule["to"] for rule in everyone["egress"])
+    apps = {template["metadata"]["labels"]["app"] for template in pods().values()}
+    assert apps_of(policies["ray"]["podSelector"]) == {"placerec", "ray-head", "ray-worker"}
+    for name in ("ray", "stores"):
+        ((sender,),) = (rule["from"] for rule in policies[name]["ingress"])
+        assert apps_of(policies[name]["podSelector"]) | apps_of(sender["podSelector"]) <= apps
+    assert apps_of(policies["stores"]["podSelector"]) == set(objects("StatefulSet"))
+    (robots,) = policies["placerec"]["ingress"]
+    assert [port["port"] for port in robots["ports"]] == ["http"] and "podSelector" not in robots["from"][0]
+
+
+def apps_of(selector: dict[str, Any]) -> set[str]:
+    (expression,) = selector["matchExpressions"]
+    assert (expression["key"], expression["operator"]) == ("app", "In")
+    return set(expression["values"])
+
+
+def test_ray_has_cheap_probes_and_time_to_stop() -> None:
+    for name, seconds_needed in (("ray-head", 33), ("ray-worker", 22)):
+        container = container_of("Deployment", name)
+        assert not [probe for probe in container if probe.endswith("Probe") and "exec" in container[probe]]
+        grace = pods()[name]["spec"]["terminationGracePeriodSeconds"]
+        assert grace >= 1.3 * seconds_needed and seconds(compose()["services"][name]["stop_grace_period"]) == grace
+    test = compose()["services"]["ray-head"]["healthcheck"]["test"]
+    assert test[:2] == ["CMD", "python"] and "import socket;" in test[-1]
+
+
+def test_alerts_count_by_series_of_the_service() -> None:
+    """The reference has every series, which a test of its own compares with /metrics."""
+    described = set(re.findall(r"`(placerec_\w+)`", (ROOT / "docs/reference/metrics-and-logs.md").read_text()))
+    paths = set(json.loads((ROOT / "openapi.json").read_text())["paths"])
+    (group,) = yaml.safe_load((DOCKER / "alerts.yaml").read_text())["groups"]
+    assert len(group["rules"]) == 4
+    for rule in group["rules"]:
+        assert set(rule) == {"alert", "expr", "for", "labels", "annotations"}
+        expression = rule["expr"]
+        assert expression.count("(") == expression.count(")")
+        bare = re.sub(r"\{[^}]*\}", "", expression)
+        series = {name.removesuffix("_count") for name in re.findall(r"\bplacerec_\w+", bare)}
+        assert series and series <= described
+        assert set(re.findall(r'route!?="([^"]*)"', expression)) <= paths
+        chosen = {label for inside in re.findall(r"placerec\w+\{([^}]*)\}", expression) for label in labels_in(inside)}
+        assert chosen <= {"route", "method", "status"}
+
+
+def labels_in(selector: str) -> list[str]:
+    return re.findall(r"(\w+)(?:=~|!=|=)", selector)
+
+
+def script_of(name: str) -> list[str]:
+    """The command of a pod as a plain process, whose programs are those of this machine."""
+    (container,) = pods()[name]["spec"]["containers"]
+    words = [*container["command"], *container.get("args", [])]
+    return [str(Path(sys.executable).parent / "placerec"), *words[1:]] if words[0] == "placerec" else words
+
+
+def run_as(name: str, **variables: str) -> str:
+    return subprocess.run(
+        script_of(name), env={**os.environ, **variables}, check=True, stdout=subprocess.PIPE, text=True, timeout=300
+    ).stdout
+
+
+@pytest.mark.skipif(shutil.which("pg_dump") is None, reason="PostgreSQL's programs are not installed")
+def test_jobs_make_a_key_back_it_up_and_restore_it(postgres: Postgres, tmp_path: Path) -> None:
+    postgres.empty()
+    given = {"PLACEREC_DATABASE": postgres.address, "FOLDER": str(tmp_path), "DUMP": ""}
+    key = run_as("first-key", PLACEREC_DATA_DIR=str(tmp_path / "own"), **given).strip()
+    assert re.fullmatch(r"\S{30,}", key), "it prints more than a key"
+
+    (tmp_path / "placerec-20200101T000000Z.dump").touch()
+    (tmp_path / "placerec-20200101T000000Z.dump.part").touch()
+    os.utime(tmp_path / "placerec-20200101T000000Z.dump", (0, 0))
+    run_as("backup", **given)
+    (dump,) = tmp_path.glob("placerec-*")
+    assert re.fullmatch(r"placerec-\d{8}T\d{6}Z\.dump", dump.name)
+
+    tables = "SELECT table_name FROM information_schema.tables WHERE table_schema = 'public'"
+    with psycopg.connect(postgres.address) as connection:
+        before = set(connection.execute(tables))
+    postgres.empty()
+    assert dump.name in run_as("restore", **given)
+    with psycopg.connect(postgres.address) as connection:
+        assert set(connection.execute(tables)) == before and before
 
 
 def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
