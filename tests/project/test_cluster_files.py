@@ -7,14 +7,18 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
@@ -144,6 +148,51 @@ def test_all_that_speak_ray_share_a_token_that_no_file_has() -> None:
     assert RAY_SECRET[0] not in objects("Secret"), "a token in a file is known to everybody"
     for line in ("export RAY_TOKEN=$(openssl rand -hex 32)", "--from-literal=token=$(openssl rand -hex 32)"):
         assert line in GUIDE.read_text(), "the guide does not say how it is made"
+
+
+@pytest.fixture
+def ray_folder() -> Iterator[Path]:
+    """A folder with a short name: Ray's sockets are in it."""
+    with TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+def test_head_and_worker_find_each_other_by_the_token_and_strangers_do_not(ray_folder: Path) -> None:
+    """By the commands and variables of their files, with another port, as processes of this machine."""
+    services = compose()["services"]
+    (port,) = fixed_ports(1)
+    address = f"{socket.gethostbyname(socket.gethostname())}:{port}"
+    token = {**services["ray-head"]["environment"], "RAY_AUTH_TOKEN": "5c" * 32}
+    check = [word.replace("6379", str(port)) for word in services["ray-head"]["healthcheck"]["test"][1:]]
+    check[0] = sys.executable
+
+    def node(name: str, *options: str) -> Server:
+        folder = ray_folder / name
+        folder.mkdir()
+        words = [*services[name]["entrypoint"], *services[name]["command"], *options]
+        words = [word.replace("ray-head:6379", address).replace("6379", str(port)) for word in words]
+        command: list[str | Path] = [Path(sys.executable).parent / words[0], *words[1:]]
+
+        def answers() -> None:
+            checked = subprocess.run(check, stderr=subprocess.DEVNULL)
+            if checked.returncode or "Ray runtime started" not in (folder / "output.log").read_text():
+                raise StorageFailure("not yet")
+
+        return Server(command, folder, answers, variables=token)
+
+    head, worker = node("ray-head", f"--temp-dir={ray_folder}/r"), node("ray-worker")
+    try:
+        head.start()
+        worker.start()  # it waits for the head to take it
+        command = [str(Path(sys.executable).parent / "ray"), "health-check", "--address", address]
+        stranger = {**os.environ, "RAY_AUTH_MODE": "disabled"}
+        refused = subprocess.run(command, env=stranger, capture_output=True, text=True)
+        assert refused.returncode != 0 and "InvalidAuthToken" in refused.stdout + refused.stderr
+    finally:
+        for server in (worker, head):
+            with suppress(AssertionError):  # it was not started
+                server.kill()
 
 
 def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
