@@ -134,7 +134,9 @@ def test_no_password_stands_in_a_file() -> None:
 
 
 def test_all_that_speak_ray_share_a_token_that_no_file_has() -> None:
-    speaking = {name: found for name, found in compose()["services"].items() if found.get("image") == "placerec:cluster"}
+    speaking = {
+        name: found for name, found in compose()["services"].items() if found.get("image") == "placerec:cluster"
+    }
     assert {"placerec-1", "placerec-2", "ray-head", "ray-worker"} <= set(speaking)
     for name, found in speaking.items():
         assert found["environment"]["RAY_AUTH_MODE"] == "token", name
@@ -157,6 +159,8 @@ def ray_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
+@pytest.mark.cluster
+@pytest.mark.timeout(900)
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
 def test_head_and_worker_find_each_other_by_the_token_and_strangers_do_not(ray_folder: Path) -> None:
     """By the commands and variables of their files, with another port, as processes of this machine."""
@@ -222,6 +226,7 @@ def test_both_run_the_same_object_store() -> None:
     assert set(given["environment"]) == {variable["name"] for variable in container["env"]}
 
 
+@pytest.mark.cluster
 @pytest.mark.skipif(not WEED.exists(), reason="SeaweedFS is not installed; scripts/cluster installs it")
 def test_the_object_store_takes_pictures_and_refuses_strangers(tmp_path: Path) -> None:
     """As its file starts it, with other ports, and on the loopback address alone."""
@@ -369,6 +374,7 @@ def run_as(name: str, **variables: str) -> str:
     ).stdout
 
 
+@pytest.mark.postgres
 @pytest.mark.skipif(shutil.which("pg_dump") is None, reason="PostgreSQL's programs are not installed")
 def test_jobs_make_a_key_back_it_up_and_restore_it(postgres: Postgres, tmp_path: Path) -> None:
     postgres.empty()
