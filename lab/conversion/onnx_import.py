@@ -1,9 +1,9 @@
 """Importing a network that was exported to the ONNX format.
 
 Such a file is a program.  It is read in a process of its own (``lab.conversion.isolation``), which takes it only if it
-is made of the standard's own operators, without loops and chance, and if its weights lie in the file or beside it; and
-which then lets it compute three frames, within the same limits of memory and time.  What the process gives back is the
-graph with all its weights in it, and nothing else of the file.
+is made of the standard's own operators, without graphs within it, chance, or sizes that depend on the picture, and if
+its weights lie in the file or beside it; and which then lets it compute three frames, within the same limits of memory
+and time.  What the process gives back is the graph with all its weights in it, and nothing else of the file.
 """
 
 from __future__ import annotations
