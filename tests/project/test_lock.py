@@ -99,7 +99,10 @@ def test_opencv_still_reads_caffe() -> None:
     assert version(locked("service")["opencv-python-headless"]).startswith("4.")
 
 
-OWN = {f"http://{host}" for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "minio", "placerec")}
+OWN = {
+    f"http://{host}"
+    for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "minio", "placerec", "seaweedfs")
+}
 OWN |= {"https://the-host", "postgresql://placerec", "s3://pictures"}
 """Addresses of this machine and of parts of a cluster."""
 
