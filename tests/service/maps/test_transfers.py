@@ -309,6 +309,7 @@ def large(server: Server) -> bytes:
     manifest, parts = parts_of(export(server, "seed").content)
     assert server.client.delete("/v1/maps/seed").status_code == 204
     line, width = json.loads(parts["places-000001.jsonl"]), len(parts["descriptors-000001.bin"])
+    length = np.linalg.norm(np.frombuffer(parts["descriptors-000001.bin"], "<f2").astype(np.float64))
     random = np.random.default_rng(1)
     made: Parts = {name: parts[name] for name in ("sequences.jsonl", "cameras.jsonl")}
     made["sequences.jsonl"] = json.dumps({"name": None, "next_ordinal": MANY}).encode() + b"\n"
@@ -318,7 +319,8 @@ def large(server: Server) -> bytes:
             json.dumps({**line, "id": f"p{n}", "ordinal": n, "keypoints": None}) + "\n"
             for n in range(first, first + 1000)
         ]
-        halves = random.standard_normal((1000, width // 2)).astype("<f2")
+        drawn = random.standard_normal((1000, width // 2))
+        halves = (length * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)).astype("<f2")
         for name, data in zip(group_names(group), ("".join(lines).encode(), halves.tobytes(), b"", b""), strict=True):
             made[name] = data
             listed.append({"name": name, "rows": 1000})

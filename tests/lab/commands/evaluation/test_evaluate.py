@@ -142,8 +142,9 @@ def test_the_default_is_judged_as_the_service_answers(
         found[verify] = {retrieved: score for _, retrieved, score, _ in rows}
         with (tmp_path / "out.m-region-vlad.two-stages.csv").open() as file:
             stages = {int(row["retrieved"]): float(row["score"]) for row in csv.DictReader(file)}
-        assert (found[verify] == stages) == (verify == "never")
-    assert all(found["always"][place] > score for place, score in found["never"].items())
+        if verify != "auto":  # which leaves the scores if the best match alone settles an answer
+            assert (found[verify] == stages) == (verify == "never")
+    assert found["always"].keys() == found["never"].keys() and found["always"] != found["never"]
     told = placerec("evaluate", "--reference", traverses[0], "--query", traverses[1], *two).stdout
     assert re.search(r"^encoder +verified +AUC-PR", told, re.MULTILINE)
     assert re.search(r"^m-region-vlad +auto ", told, re.MULTILINE)

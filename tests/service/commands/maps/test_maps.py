@@ -83,7 +83,7 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
 
     delete = ("maps", "places", "delete", name, "1", "2")
     told = placerec(*delete, "11", "1\u200b", "--yes", *where, status=1).stderr
-    assert f"The map {name} has no place 11, '1\\u200b'; nothing was deleted." in told, "the space is seen"
+    assert f"The map {name} has no place 11, 1\\u200b; nothing was deleted." in told, "the space is seen"
     asked = placerec(*delete, *where, status=1, stdin="n\n")
     assert f"Delete from the map {name}: 1, 2?" in asked.output
     assert len(json.loads(placerec("maps", "places", "list", name, "--json", *where).stdout)) == 4
