@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,7 +18,7 @@ from core.method.encoder import Encoder
 from core.recognition.question import Query
 from core.recognition.recognition import ATTEMPTS, Answer, judgement_of, locate, rival_places
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
-from core.recognition.verification import Judge, ThirdStage, VerificationState, third_stage
+from core.recognition.verification import ThirdStage, VerificationState, third_stage
 
 
 def locate_rig(
@@ -41,11 +41,15 @@ def locate_rig(
     question, encodings = queries[0].question, [query.encoding for query in queries]
     began = time.perf_counter()
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
+    judged = partial(judgement_of, map_, encoder)
     for _attempt in range(ATTEMPTS):  # again, if places were deleted during the search
         ranked = rank_places(map_, encoder, encodings, question.selection)
         if not len(ranked[0].rows):
             return locate(map_, encoder, queries[:1])[0]  # no place is allowed, or there is none
-        verified = [third_stage(map_, encoder, *one) for one in _judged_alone(map_, encoder, ranked, queries)]
+        verified = [
+            third_stage(map_, encoder, candidates, judged, query)
+            for candidates, query in zip(ranked, queries, strict=True)
+        ]
         finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
         views = [
             CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry)
@@ -69,14 +73,6 @@ def locate_rig(
     rivals = rival_places(map_, candidates, judgement)
     milliseconds = 1e3 * (time.perf_counter() - began) - stage.milliseconds
     return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates, stage, rivals)
-
-
-def _judged_alone(
-    map_: Map, encoder: Encoder, ranked: Sequence[Candidates], queries: Sequence[Query]
-) -> Iterator[tuple[Candidates, Judge, Query]]:
-    """The arguments of the third stage, of each camera."""
-    for candidates, query in zip(ranked, queries, strict=True):
-        yield candidates, partial(judgement_of, map_, encoder), query
 
 
 def _joint_stage(stages: Sequence[ThirdStage]) -> ThirdStage:

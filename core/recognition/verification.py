@@ -123,7 +123,7 @@ def verify_candidates(
         comparison: of the query with the candidates.
         tells_pose: whether they are verified after a judgement for the sake of the pose.
     """
-    judgement = judged(candidates)
+    before = judgement = judged(candidates)
     if verifier.when == "never" or not len(candidates.rows):
         return candidates, judgement, NOT_VERIFIED
     automatic = verifier.when == "auto"
@@ -140,7 +140,7 @@ def verify_candidates(
         judgement = judged(ranked)
     milliseconds = 1e3 * (time.perf_counter() - began)
     if not trial.found:
-        return candidates, judged(candidates), ThirdStage("no-keypoints", milliseconds=milliseconds)
+        return candidates, before, ThirdStage("no-keypoints", milliseconds=milliseconds)
     return ranked, judgement, ThirdStage("verified", verifier.keypoints, milliseconds=milliseconds)
 
 
