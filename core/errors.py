@@ -112,6 +112,18 @@ class UnknownPlace(PlacerecError):
     """The map has no place with this id."""
 
 
+class UnknownLook(PlacerecError):
+    """The place has no look of this name."""
+
+
+class RepeatedLook(PlacerecError):
+    """The frame of a look is the one with which its place was enrolled."""
+
+
+class TooManyLooks(PlacerecError):
+    """The place has as many looks as it may have."""
+
+
 class TooManyToDelete(PlacerecError):
     """More places fulfil the conditions than may be forgotten at once; none was."""
 

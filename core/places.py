@@ -1,4 +1,4 @@
-"""A place: its id, pose, time, sequence and metadata, and where the places of a map are."""
+"""A place: its id, pose, time, sequence and metadata, its looks, and where the places of a map are."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core import names
+from core.errors import InvalidIdentifier
 
 MAP_IDS = names.file_names("a map", but="import")
 PLACE_IDS = names.words("a place", 128)
 SEQUENCES, CAMERAS = names.texts("a sequence"), names.words("a camera", 64)
 MAP_ID, PLACE_ID = MAP_IDS.pattern, PLACE_IDS.pattern
+LOOK = r"[0-9a-f]{16}"
+"""The pattern of a look's name: the first digits of its frame's SHA-256, so that a frame gives a place one look."""
 EARTH_RADIUS = 6_371_008.8  # metres, mean
 
 NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
 """The kinds of poses in a :class:`Whereabouts`: none, metres in the map's frame, degrees on the Earth."""
 
 NO_SEQUENCE = -1
-"""The code of the places that belong to no sequence."""
+"""The code of the places that belong to no sequence; each of them has an ordinal that no other has."""
 
 SAME_VIEW = 3
 """Frames at one position of a sequence, which show one view, are the same place up to this many times the radius.
@@ -55,6 +58,30 @@ def check_place_id(text: str) -> str:
         InvalidIdentifier: it cannot.
     """
     return PLACE_IDS.check(text)
+
+
+def look_address(place_id: str, look: str) -> str:
+    """The name under which a map stores a look, which no place can have."""
+    return f"{place_id}/{look}"
+
+
+def place_and_look(address: str) -> tuple[str, str | None]:
+    """The id of a place and, if the address is that of a look, the look's name."""
+    place_id, _, look = address.partition("/")
+    return place_id, look or None
+
+
+def check_address(text: str) -> str:
+    """Return ``text`` if it can be the id of a place or the address of a look.
+
+    Raises:
+        InvalidIdentifier: it cannot.
+    """
+    place_id, slash, look = text.partition("/")
+    check_place_id(place_id)
+    if slash and not re.fullmatch(LOOK, look):
+        raise InvalidIdentifier(f"{look[:140]!a} cannot name a look: a name has 16 hexadecimal digits in small letters.")
+    return text
 
 
 def check_sequence(text: str) -> str:
@@ -159,10 +186,18 @@ class PlaceFields(BaseModel):
 
 
 class Place(PlaceFields):
-    """One enrolled reference frame; its sequence may have a name from before the rule for names, and keeps it."""
+    """One enrolled place; its sequence may have a name from before the rule for names, and keeps it."""
 
     id: str
     sequence: str | None = None
+    look: str | None = Field(
+        default=None,
+        exclude_if=lambda name: name is None,
+        description="In a match: the look whose frame it is; left out for the frame with which it was enrolled.",
+    )
+    looks: int = Field(
+        default=0, ge=0, exclude_if=lambda count: count == 0, description="How many looks it has besides its first."
+    )
     pose_of: str | None = Field(default=None, description="The place whose pose it got from an alignment.")
     regions: int = Field(ge=0, description="Regions of interest found in the frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="The stored form of the frame.")
@@ -172,6 +207,20 @@ class Place(PlaceFields):
     def fields(self) -> PlaceFields:
         """The statements of a caller about the frame, when it was enrolled or later."""
         return PlaceFields.model_construct(**{name: getattr(self, name) for name in PlaceFields.model_fields})
+
+
+class Look(BaseModel):
+    """A picture of a place under some condition, beside the frame with which the place was enrolled."""
+
+    model_config = ConfigDict(frozen=True)
+
+    name: str = Field(pattern=f"^{LOOK}$", description="The first 16 digits of the SHA-256 of its frame.")
+    timestamp: Timestamp | None = Field(description="When its frame was taken.")
+    camera: Camera | None = Field(description="Whose mask was applied to its frame.")
+    run: str | None = Field(description="The run from which it was learnt; null: an operator added it.")
+    regions: int = Field(ge=0, description="Regions of interest found in its frame.")
+    picture: Literal["none", "thumbnail", "image"] = Field(description="The stored form of its frame.")
+    created_at: Timestamp
 
 
 @dataclass(frozen=True)
@@ -195,7 +244,8 @@ class Whereabouts:
     sequence: int32 [n], a code for the sequence's name; NO_SEQUENCE for places without one.
     ordinal: int64 [n], the position in the sequence.  Positions count views, not frames: a new frame gets the position
         of a frame shortly before it if both show the same view, else the next free position (``core.maps.views``).  So
-        positions need not grow from frame to frame, and some may be empty.  Without a sequence they say nothing.
+        positions need not grow from frame to frame, and some may be empty.  The looks of a place are at its position.
+        Without a sequence only they share one, and what is between positions says nothing.
     heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
     track, station: int32 [n] and int64 [n], the sequence and the ordinal at which another traverse shows the same, as
@@ -252,13 +302,14 @@ class Whereabouts:
         """Which of the places are the same place as ``row``, itself included; bool [n].
 
         Two poses of one kind are compared by distance; other places must be of one sequence and few positions apart, or
-        at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own.
+        at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own,
+        with its looks.
         Frames at one position of a sequence show one view.  They are the same place up to ``SAME_VIEW`` radii.
         """
         near = np.zeros(len(self), np.bool_)
         for sequence, ordinal in ((self.sequence, self.ordinal), (self.track, self.station)):
-            if sequence[row] != NO_SEQUENCE:
-                near |= (sequence == sequence[row]) & (np.abs(ordinal - ordinal[row]) <= neighborhood.frames)
+            frames = neighborhood.frames if sequence[row] != NO_SEQUENCE else 0
+            near |= (sequence == sequence[row]) & (np.abs(ordinal - ordinal[row]) <= frames)
         kind = self.kind[row]
         if kind != NO_POSE:
             x, y, z = (self.position - self.position[row]).T
@@ -290,13 +341,13 @@ class Whereabouts:
         return _repeated(self.sequence[order], self.ordinal[order])
 
     def view_keys(self) -> NDArray[np.int64]:
-        """A number for the position of each place, int64 [n]; that of a place without a sequence means nothing."""
+        """A number for the position of each place, int64 [n]: frames with the same number show one view."""
         return _position_keys(self.sequence, self.ordinal)
 
     def of_views(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the places show a view that one of ``rows``, int64 [k], shows; bool [n]."""
         keys = self.view_keys()
-        return (self.sequence != NO_SEQUENCE) & np.isin(keys, keys[rows])
+        return np.isin(keys, keys[rows])
 
 
 def _position_keys(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -304,14 +355,13 @@ def _position_keys(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> N
 
 
 def _repeated(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of n positions in sequences are those of an earlier one; bool [n].  Without a sequence none is."""
+    """Which of n positions in sequences are those of an earlier one; bool [n]."""
     keys = _position_keys(sequence, ordinal)
     repeated = np.zeros(len(keys), np.bool_)
     ordered = np.sort(keys)
     if (ordered[1:] == ordered[:-1]).any():
         repeated[:] = True
         repeated[np.unique(keys, return_index=True)[1]] = False
-        repeated &= sequence != NO_SEQUENCE
     return repeated
 
 

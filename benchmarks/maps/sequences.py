@@ -38,7 +38,7 @@ from core.belief import (
 from core.frames.images import decode
 from core.judgement.verdict import judge
 from core.maps import MapSettings
-from core.maps.views import MOST_HIDDEN, LatestViews, Look
+from core.maps.views import MOST_HIDDEN, LatestViews, ViewedFrame
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import METRIC, Neighborhood, Whereabouts
@@ -83,7 +83,7 @@ def positions(references: Encodings) -> NDArray[np.int64]:
     """The position of each frame of a traverse, int64 [n], which counts views."""
     views, found, end = LatestViews(None, {}, min(MOST_HIDDEN, SAME_PLACE.frames)), [], 0
     for descriptor, local in zip(references.descriptors, references.local, strict=True):
-        look = Look(descriptor, local)
+        look = ViewedFrame(descriptor, local)
         position = views.position_of(look)
         if position is None:
             position, end = end, end + 1

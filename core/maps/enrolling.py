@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from core.errors import NoRegions
 from core.maps.records import Enrolment, Keep
-from core.places import check_place_id
+from core.places import check_address
 
 LARGEST_HALF = 65504.0
 """The largest number in half precision."""
@@ -34,7 +34,7 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
         NoRegions: the descriptor is all zero.
         ValueError: descriptors or a digest of the wrong kind, which is a programming error.
     """
-    check_place_id(item.id)
+    check_address(item.id)
     descriptor = item.descriptor
     if descriptor.dtype != np.float32 or descriptor.shape != (dimension,):
         raise ValueError(f"a descriptor of this map is float32 [{dimension}]")

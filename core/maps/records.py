@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
-from core.places import PlaceFields, Timestamp
+from core.places import PlaceFields, Timestamp, place_and_look
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -149,15 +149,23 @@ class SequenceSummary(BaseModel):
     last_at: Timestamp | None
 
 
+MOST_LOOKS = 32
+"""Looks that a place has at most besides its first."""
+
+
 @dataclass(frozen=True, eq=False)
 class Enrolment:
-    """One frame to be stored as a place.
+    """One frame to be stored as a place, or as a look of a place.
+
+    id: of the place; or the address of the look (:func:`core.places.look_address`), of whose fields camera and
+        timestamp are those of its frame, and the others are its place's, whatever they say here.
 
     descriptor, local: float32 [D] and int8 [C, L], made by the map's encoder; local is [0, 0] without a second stage.
     regions: how many regions of interest the frame has.
     digest: SHA-256 of the image's bytes, 32 bytes.
     thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
     keypoints: of the frame; stored if the map's setting ``verification`` says so.  None: they were not looked for.
+    run: the run from which a look was learnt; None: it was not.
     """
 
     id: str
@@ -169,6 +177,7 @@ class Enrolment:
     thumbnail: bytes | None = None
     image: bytes | None = None
     keypoints: Keypoints | None = None
+    run: str | None = None
 
 
 @dataclass(frozen=True)
@@ -215,13 +224,16 @@ class History:
 
 @dataclass(frozen=True)
 class Outline:
-    """A place in brief: enough to see whether two maps hold the same place in the same state.
+    """A place or a look in brief: enough to see whether two maps hold the same one in the same state.
+
+    id: of a look its address.
 
     number: grows in the order of enrolment.
     row: of its descriptor.
     digest: SHA-256 of its image, 32 bytes.
     picture: the kind of its stored picture.
     ordinal: its position in its sequence.
+    run: the run from which a look was learnt.
     """
 
     number: int
@@ -233,6 +245,12 @@ class Outline:
     sequence: str | None
     ordinal: int
     updated_at: str
+    run: str | None = None
+
+    @property
+    def is_look(self) -> bool:
+        """Whether it is a look of a place."""
+        return place_and_look(self.id)[1] is not None
 
     def same_as(self, other: Outline) -> bool:
         """Whether both are the same place in the same state; they may be of different maps."""

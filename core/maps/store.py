@@ -38,7 +38,7 @@ from core.maps.review import Review
 from core.maps.selection import Selection
 from core.maps.status import IndexStatus, Progress, StorageStatus, no_progress
 from core.maps.transfer import Transfer
-from core.places import Neighborhood, Place, PlaceFields, Whereabouts
+from core.places import Look, Neighborhood, Place, PlaceFields, Whereabouts
 
 Rows = NDArray[np.int64]
 
@@ -233,7 +233,10 @@ class Map(Protocol):
         """The places that a query may find at this moment; None: all."""
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
+        """The places of rows that a search returned; None where a place was deleted or got another frame since.
+
+        Of the row of a look it is its place, with the camera and the picture of the look, which it names.
+        """
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
         """The keypoints of those places; None also where none are stored."""
@@ -247,7 +250,7 @@ class Map(Protocol):
     # Reading
 
     def count_places(self) -> int:
-        """How many places the map has."""
+        """How many places the map has; their looks do not count."""
 
     def place(self, place_id: str) -> Place:
         """One place.
@@ -334,9 +337,9 @@ class Map(Protocol):
     def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
 
     def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
-        """Store frames as places in the order given, all of them or, if this raises, none.
+        """Store frames as places, or as looks of places, in the order given, all of them or, if this raises, none.
 
-        An id that exists keeps its place and creation time: if the frame's digest is the same, only its fields are
+        A place whose frame is replaced loses the looks that were learnt from runs.  An id that exists keeps its place and creation time: if the frame's digest is the same, only its fields are
         stored (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
 
         Returns:
@@ -344,6 +347,7 @@ class Map(Protocol):
 
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
+            UnknownPlace, RepeatedLook, TooManyLooks: a look is of no place, or of one that cannot have it.
             NoRegions: a descriptor is all zero.
             ValueError: descriptors or a digest of the wrong kind.
         """
@@ -373,11 +377,28 @@ class Map(Protocol):
         """
 
     def forget(self, place_id: str) -> None:
-        """Delete a place.
+        """Delete a place with its looks.
 
         Raises:
             UnknownPlace.
         """
+
+    def looks(self, place_id: str) -> list[Look]:
+        """The looks of a place besides its first, in the order in which they were added.
+
+        Raises:
+            UnknownPlace: there is no such place.
+        """
+
+    def forget_look(self, place_id: str, look: str) -> None:
+        """Delete a look of a place.
+
+        Raises:
+            UnknownPlace, UnknownLook.
+        """
+
+    def forget_learnt(self, run: str) -> int:
+        """Delete the looks that were learnt from a run, all or, if this raises, none; returns how many there were."""
 
     def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
         """Delete the places that fulfil some conditions, all or none; returns their ids.

@@ -13,8 +13,12 @@ from core.places import Place
 class Transfer(Protocol):
     """Reads, copies and deletes many places of one map at once.  Any thread may use it."""
 
-    def outline(self) -> list[Outline]:
-        """All places in the order of their enrolment."""
+    def outline(self, looks: bool = False) -> list[Outline]:
+        """All places in the order of their enrolment.
+
+        Args:
+            looks: their looks as well, each behind its place.
+        """
 
     def count_without_image(self) -> int:
         """How many places keep no original image."""
@@ -23,7 +27,10 @@ class Transfer(Protocol):
         """The ordinal that the next place of each sequence will get; the key None is for places without a sequence."""
 
     def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
-        """Places by id, each with its descriptor row; ids that do not exist are left out."""
+        """Places by id, each with its descriptor row; ids that do not exist are left out.
+
+        Of the address of a look it is its place, with the camera, the time and the picture of its own frame.
+        """
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
         """Store places of another map with their history, all of them or, if this raises, none.

@@ -49,7 +49,7 @@ MOST_HIDDEN = 8
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewedFrame:
     """One frame's content and where it was taken: descriptor, float32 [D], local descriptors, int8 [C, L], and pose."""
 
     descriptor: NDArray[np.float32]
@@ -69,7 +69,7 @@ def are_apart(one: Pose | None, other: Pose | None, reach: float) -> bool:
     return float(np.linalg.norm(one.position() - other.position())) > reach
 
 
-def shows_same(one: Look, other: Look, about: bool = False) -> bool:
+def shows_same(one: ViewedFrame, other: ViewedFrame, about: bool = False) -> bool:
     """Whether two frames of one map show nearly the same, or ``about`` the same."""
     if one.local.size and other.local.size:
         alike = cosines(one.local, other.local)
@@ -121,11 +121,11 @@ class LatestViews:
     """
 
     def __init__(
-        self, last: tuple[int, Look] | None, first: Mapping[int, Look], positions: int, reach: float = math.inf
+        self, last: tuple[int, ViewedFrame] | None, first: Mapping[int, ViewedFrame], positions: int, reach: float = math.inf
     ) -> None:
         self._last, self._first, self._positions, self._reach = last, dict(first), positions, reach
 
-    def position_of(self, look: Look) -> int | None:
+    def position_of(self, look: ViewedFrame) -> int | None:
         """The position of a next frame if it shows a view that is there already, else None."""
         if self._last is None:
             return None
@@ -138,7 +138,7 @@ class LatestViews:
                 return position
         return None
 
-    def note(self, position: int, look: Look) -> None:
+    def note(self, position: int, look: ViewedFrame) -> None:
         """Add the next frame, which is at a position."""
         self._last = position, look
         self._first.setdefault(position, look)
@@ -151,7 +151,7 @@ def latest_views(
     first: Mapping[int, int],
     positions: int,
     reach: float,
-    looks: Callable[[list[int]], list[Look]],
+    looks: Callable[[list[int]], list[ViewedFrame]],
 ) -> LatestViews:
     """The end of a sequence, whose frames are read by row.
 
@@ -167,7 +167,7 @@ def latest_views(
     return LatestViews((last[0], shown[0]), dict(zip(first, shown[1:], strict=True)), positions, reach)
 
 
-def leaves_view(pose: Pose | None, look: Look | None, first: Look, beside: Sequence[Look], reach: float) -> bool:
+def leaves_view(pose: Pose | None, look: ViewedFrame | None, first: ViewedFrame, beside: Sequence[ViewedFrame], reach: float) -> bool:
     """Whether a frame that was changed does not belong to its position in its sequence any more.
 
     It keeps its position, even if it shows something else now, so that a stop whose frames are enrolled again one after

@@ -77,10 +77,10 @@ class MilvusMap(PostgresMap):
             progress: called with the number of places done and of all; its exceptions end the work, and the part done
                 until then stays.
         """
-        done, after, total = 0, -1, self.count_places()
+        done, after, total = 0, -1, self.latest().searched
         while True:
             with self.rebuilding() as write:
-                stored = places.listed(write.connection, after, REBUILT_AT_ONCE)
+                stored = places.listed_with_looks(write.connection, after, REBUILT_AT_ONCE)
                 for place in stored:
                     write.renew_entity(place)
                 if not stored:

@@ -21,7 +21,7 @@ from core.maps.selection import Conditions, Selection
 from core.maps.store import Ranking, Rows, merged
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.expressions import all_of, any_row, bounds_of, with_tokens
-from core.places import NO_POSE, Neighborhood, Whereabouts
+from core.places import NO_POSE, Neighborhood, Whereabouts, place_and_look
 from core.postgres import rows as stored_rows
 from core.postgres.forms import Form
 
@@ -56,7 +56,7 @@ class MilvusSnapshot:
     _known: dict[int, StoredPlace] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return self.state.places
+        return self.state.searched
 
     @property
     def rows(self) -> int:
@@ -109,7 +109,7 @@ class MilvusSnapshot:
     def all_entries(self) -> list[StoredPlace]:
         """All places of the rows of the snapshot."""
         with self.database.reading() as whole:
-            entries = places.listed(MapConnection(whole, self.state.number), -1, 1 << 62)
+            entries = places.listed_with_looks(MapConnection(whole, self.state.number), -1, 1 << 62)
         found = [entry for entry in entries if entry.row < self.rows]
         self.note(found)
         return found
@@ -283,13 +283,13 @@ def scope_of(connection: MapConnection, snapshot: MilvusSnapshot, selection: Sel
     tokens = wanted_tokens(filters.metadata)
     expressions += with_tokens(tokens)
     if selection.excluded is not None:
-        row = places.rows_of(connection, [selection.excluded]).get(selection.excluded)
-        expressions += [] if row is None else [f"row != {row}"]
+        rows = places.all_rows_of(connection, selection.excluded)
+        expressions += [f"row not in {rows}"] if rows else []
 
     def keep(entries: list[StoredPlace]) -> NDArray[np.bool_]:
         wanted = set(tokens)
         has = [wanted <= set(tokens_of(entry.place.metadata)) for entry in entries]
-        named = [entry.place.id != selection.excluded for entry in entries]
+        named = [place_and_look(entry.place.id)[0] != selection.excluded for entry in entries]
         return holding(constraints, whereabouts_of(entries)) & np.array(has, np.bool_) & np.array(named, np.bool_)
 
     prior = None

@@ -85,7 +85,7 @@ _MORE = [
 ]
 
 TABLES = (
-    Tables("maps", 2, schema.METADATA),
+    Tables("maps", 3, schema.METADATA),
     Tables("review", 1, review.METADATA),
     Tables("vectors", 1, _METADATA, more={"postgresql": _MORE}),
 )

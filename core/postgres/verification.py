@@ -40,11 +40,11 @@ def inspect(map_: PostgresMap, progress: Progress, searched: Searched = nothing_
         UnknownMap, StoreUnavailable, StorageFailure.
     """
     problems: list[str] = []
-    after, total, count, size = -1, map_.count_places(), 0, 0
+    after, total, looks, count, size = -1, map_.latest().searched, 0, 0, 0
     with map_.viewing() as (connection, _):
         problems += [f"PostgreSQL: place {name!r} does not match its checksum" for name in places.unsound(connection)]
         if problems:
-            return _report(problems, count, size)
+            return _report(problems, count, looks, size)
         problems += [
             f"PostgreSQL: sequence {name!r} is empty, or ends before its last place"
             for name in sequences.wrong(connection)
@@ -52,7 +52,7 @@ def inspect(map_: PostgresMap, progress: Progress, searched: Searched = nothing_
         problems += [f"PostgreSQL: {found}" for found in places.stale_tokens(connection)]
     while True:
         with map_.viewing() as (connection, state):
-            stored = places.listed(connection, after, AT_ONCE)
+            stored = places.listed_with_looks(connection, after, AT_ONCE)
             numbers = [one.row for one in stored]
             descriptors = rows.both_at(connection, numbers)
             damaged = _Damaged(set(), frames.damaged_keypoints_at(connection, numbers))
@@ -68,17 +68,18 @@ def inspect(map_: PostgresMap, progress: Progress, searched: Searched = nothing_
             unchanged = {one.row for one in stored if now.get(one.row) == one}
             problems += [why for row, why in found.items() if row in unchanged]
         count += len(stored)
+        looks += sum(one.look_of is not None for one in stored)
         size += content.size
         after = stored[-1].number
         progress(min(count, total), total)
-    return _report(problems, count, size)
+    return _report(problems, count, looks, size)
 
 
-def _report(problems: list[str], count: int, size: int) -> VerifyReport:
+def _report(problems: list[str], count: int, looks: int, size: int) -> VerifyReport:
     listed, more = problems[:MOST_LISTED], len(problems) - MOST_LISTED
     return VerifyReport(
         ok=not problems,
-        places=count,
+        places=count - looks,
         rows=count,
         checked_bytes=size,
         problems=listed + ([f"the same or another is true of {more} more places"] if more > 0 else []),

@@ -326,15 +326,15 @@ class Map(LedgerMap):
 
     def count_places(self) -> int:
         """How many places the map has; this does not read it from disk."""
-        snapshot = self._snapshot
-        return self._places if snapshot is None else len(snapshot)
+        state = self._state
+        return self._places if state is None else state.places
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
         found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
             with self._reading() as connection:
-                read = {row: stored.place for row, stored in places.at_rows(connection, missing).items()}
+                read = {row: stored.shown() for row, stored in places.at_rows(connection, missing).items()}
             self._recent_places.keep(state, read)
             found.update(read)
         return [found.get(row) for row in wanted]

@@ -222,8 +222,8 @@ def read_snapshot(
     entries = segment_entries(connection, layout)
     total, record = sum(segment.rows for segment in entries), state.record
     columns = read_columns(connection, total)
-    if (state.rows, state.places) != (total, len(columns.rows)):
-        counted = f"{state.places} places in {state.rows} rows"
+    if (state.rows, state.searched) != (total, len(columns.rows)):
+        counted = f"{state.searched} places and looks in {state.rows} rows"
         raise Damage(f"{FILE}: its record counts {counted}, but there are {len(columns.rows)} in {total}")
     whereabouts = columns.by_row(total)
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)

@@ -126,12 +126,11 @@ def inspect(
         state, layout = read_layout(connection, folder.name)
         segments = segment_entries(connection, layout)
         findings.rows = sum(segment.rows for segment in segments)
-        findings.places = places.count(connection)
-        if (state.places, state.rows) != (findings.places, findings.rows):
-            counted = f"{state.places} places in {state.rows} rows"
-            findings.problems.append(
-                f"{FILE}: its record counts {counted}, but there are {findings.places} in {findings.rows}"
-            )
+        findings.places, looks = places.count(connection)
+        if (state.places, state.looks, state.rows) != (findings.places, looks, findings.rows):
+            counted = f"{state.places} places and {state.looks} looks in {state.rows} rows"
+            found = f"{findings.places} and {looks} in {findings.rows}"
+            findings.problems.append(f"{FILE}: its record counts {counted}, but there are {found}")
         with findings.noting():
             _check_pictures(connection, findings)
         with findings.noting():

@@ -20,7 +20,7 @@ from core.maps import Enrolment, History, Map, Snapshot
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
-from core.places import check_place_id
+from core.places import check_place_id, look_address, place_and_look
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
@@ -44,7 +44,7 @@ ROUNDS = 3
 class MergePlan:
     """The steps of a merge.
 
-    coming: the places of the other map that are copied, each with its id in this map.
+    coming: the places and looks of the other map that are copied, each with its id in this map.
     known: how many places this map has already, with the same frame.
     skipped: ids of places that are not copied, because the id belongs to another frame here.
     renamed: how many places get another id.
@@ -60,10 +60,16 @@ class MergePlan:
     cameras: Mapping[str, str]
     conflicts: Sequence[str]
 
+    @property
+    def places(self) -> int:
+        """How many places are copied, their looks apart."""
+        return sum(not one.is_look for one, _ in self.coming)
+
     def report(self) -> dict[str, Any]:
         """The plan as JSON, for the result of the job."""
         return {
-            "coming": len(self.coming),
+            "coming": self.places,
+            "looks": len(self.coming) - self.places,
             "known": self.known,
             "skipped": {"count": len(self.skipped), "places": list(self.skipped[:MOST_LISTED])},
             "renamed": {"places": self.renamed, "sequences": dict(self.sequences), "cameras": dict(self.cameras)},
@@ -97,7 +103,14 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
     skipped, conflicts, known, renamed = [], [], 0, 0
     clashing: list[str] = []
     unnamed: list[Outline] = []  # places that should be copied, but have no free id
-    for place in other.transfer.outline():
+    called: dict[str, str] = {}  # the ids here of the places that are, or will be, in both maps
+    for place in other.transfer.outline(looks=True):
+        if place.is_look:
+            of, look = place_and_look(place.id)
+            if of in called and look is not None and (name := look_address(called[of], look)) not in here:
+                coming.append((place, name))
+            continue
+        called[place.id] = place.id
         present = here.get(place.id)
         if present is not None and present.digest == place.digest:
             known += 1
@@ -105,8 +118,9 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
             coming.append((place, place.id))
         elif rule == "skip":
             skipped.append(place.id)
+            del called[place.id]
         elif rule == "rename":
-            name = prefix + place.id
+            name = called[place.id] = prefix + place.id
             if (present := here.get(name)) is not None and present.digest == place.digest:
                 known += 1
             elif present is not None or not _can_name_a_place(name):
@@ -139,7 +153,8 @@ def _new_names(
     """New names for sequences and cameras whose names are taken here; others are added to conflicts."""
     rule, prefix = options["on_conflict"], options["prefix"]
     ours = {place.sequence for place in before}
-    shared = sorted({place.sequence for place in coming if place.sequence is not None} & (ours - {None}))
+    theirs = {place.sequence for place in coming if not place.is_look}
+    shared = sorted(name for name in theirs & ours if name is not None)
     sequences = {name: prefix + name for name in shared} if rule == "rename" else {}
     if shared and rule == "refuse":
         conflicts.append(f"Both maps have the sequences {_listed(shared)}.")
@@ -194,7 +209,7 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
                 _remove_copies(context, map_, None, error)
         raise
     if "after" not in context.notes:
-        outline = map_.transfer.outline()
+        outline = map_.transfer.outline(looks=True)
         plan = plan_merge(map_, other, context.arguments, outline)
         report = plan.report() | {
             "overlap": measure_overlap(engine, context, map_, other) if context.arguments["sample"] else None
@@ -215,7 +230,7 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         with engine.writing(map_.record.id):
             _remove_copies(context, map_, other, error)
         raise
-    tell_change(engine, map_, "created", len(context.notes["coming"]))
+    tell_change(engine, map_, "created", context.notes["report"]["coming"])
     return dict(context.notes["report"]) | {"places": map_.count_places()}
 
 
@@ -227,14 +242,14 @@ def _new_cameras(map_: Map, other: Map, plan: MergePlan) -> list[str]:
 
 
 def _places_before(context: JobContext, map_: Map) -> list[Outline]:
-    return [place for place in map_.transfer.outline() if place.number <= context.notes["after"]]
+    return [place for place in map_.transfer.outline(looks=True) if place.number <= context.notes["after"]]
 
 
 def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
     """Copy the places that are missing, then those that changed in the other map meanwhile, and their stations."""
     for _ in range(ROUNDS):
         context.check_cancelled()
-        here = {place.id: place.digest for place in map_.transfer.outline()}
+        here = {place.id: place.digest for place in map_.transfer.outline(looks=True)}
         plan = plan_merge(map_, other, context.arguments, _places_before(context, map_))
         coming = [(place, name) for place, name in plan.coming if name in context.notes["coming"]]
         due = [(place, name) for place, name in coming if here.get(name) != place.digest]
@@ -307,7 +322,11 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             thumbnail=picture if stored.picture == "thumbnail" else None,
             image=picture if stored.picture == "image" else None,
             keypoints=of_frame,
+            run=place.run,
         )
+        if place.is_look:
+            items.append((item, History(stored.picture, None, stored.created_at, stored.updated_at)))
+            continue
         end = ends.get(called["sequence"], 0)
         first, behind = ranges.setdefault(called["sequence"] or "", [end, end + theirs.get(stored.sequence, 0)])
         ordinal = first + place.ordinal
@@ -339,7 +358,7 @@ def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: Bas
                         noted[name].add(place.digest)
         copied = {
             place.id: place.digest
-            for place in map_.transfer.outline()
+            for place in map_.transfer.outline(looks=True)
             if place.id in context.notes["coming"]
             and place.number > context.notes["after"]
             and place.digest in noted[place.id]

@@ -18,6 +18,7 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
 from core.maps import Enrolment, History, Map
 from core.maps.records import Outline
+from core.places import place_and_look
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
 from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_after_requests
@@ -119,16 +120,22 @@ class _Reencoding:
 
     def _differences(self) -> tuple[list[Outline], dict[str, Outline], dict[str, bytes]]:
         """The places to copy, the places of the new map by id, and the digests of those to remove by id."""
-        ours, theirs = self.source.transfer.outline(), {place.id: place for place in self.made.transfer.outline()}
+        ours, theirs = self.source.transfer.outline(looks=True), self._outline_of_made()
         ids = {place.id for place in ours}
         due = [place for place in ours if not (self._is_left_out(place) or _is_same(place, theirs.get(place.id)))]
         gone = {place.id: place.digest for place in theirs.values() if place.id not in ids}
         self.context.progress(len(ours) - len(due), len(ours))
         return due, theirs, gone
 
+    def _outline_of_made(self) -> dict[str, Outline]:
+        return {place.id: place for place in self.made.transfer.outline(looks=True)}
+
     def _is_left_out(self, place: Outline) -> bool:
+        """Whether the place was left out, or it is a look of a place that was."""
         known = self.left_out.get(place.id)
-        return known is not None and known[0].same_frame(place)
+        if known is not None and known[0].same_frame(place):
+            return True
+        return place.is_look and place_and_look(place.id)[0] in self.left_out
 
     def _is_up_to_date(self) -> bool:
         due, _, gone = self._differences()
@@ -142,13 +149,13 @@ class _Reencoding:
         # A place that has another frame or camera now is encoded again.
         stale = {p.id: theirs[p.id].digest for p in due if p.id in theirs and not p.same_frame(theirs[p.id])}
         self.made.transfer.forget({**gone, **stale})
-        total = self.source.count_places()
+        total = len(theirs) + len(due)
         for first in range(0, len(due), PLACES_PER_COMMIT):
             self.context.check_cancelled()
-            chunk = due[first : first + PLACES_PER_COMMIT]
+            chunk = [place for place in due[first : first + PLACES_PER_COMMIT] if not self._is_left_out(place)]
             known = [place for place in chunk if place.id in theirs and place.id not in stale]
             self._copy([place for place in chunk if place not in known], known)
-            self.context.progress(total - len(due) + first + len(chunk), total)
+            self.context.progress(min(total - len(due) + first + PLACES_PER_COMMIT, total), total)
 
     def _copy(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
         """Copy places in one commit: encode the frames of new ones, update the fields and order of known ones."""
@@ -190,8 +197,9 @@ class _Reencoding:
     ) -> tuple[Enrolment, History]:
         stored = fields[place.id][0]
         item = Enrolment(
-            place.id, stored.fields(), descriptor, regions, place.digest, local, image=image, keypoints=keypoints
-        )
+            place.id, stored.fields(), descriptor, regions, place.digest, local, image=image, keypoints=keypoints,
+            run=place.run,
+        )  # fmt: skip
         return item, History("image", place.ordinal, stored.created_at, stored.updated_at)
 
     def _mask(self, camera: str | None) -> Mask | None:

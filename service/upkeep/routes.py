@@ -207,7 +207,7 @@ def merge_map(
     merging.check_same_encoder(map_, other)
     arguments = options.model_dump(by_alias=True) | {"prefix": options.prefix or f"{options.source}-"}
     if not options.dry_run:
-        plan = merging.plan_merge(map_, other, arguments, map_.transfer.outline())
+        plan = merging.plan_merge(map_, other, arguments, map_.transfer.outline(looks=True))
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
     return submit(engine, jobs, response, merging.KIND, arguments, map_, other)

@@ -93,11 +93,17 @@ def test_frames_of_one_view_are_one_place_and_count_once_elsewhere() -> None:
     assert where.repeats(np.array([9, 7, 3, 2])).tolist() == [False, True, False, True]
 
 
-def test_places_without_a_sequence_are_no_frames_of_one_view() -> None:
+def test_places_without_a_sequence_are_one_place_only_where_they_share_a_position() -> None:
     where = stood()
     where.sequence[:] = where.track[:] = NO_SEQUENCE
+    where.ordinal[:] = where.station[:] = np.arange(len(where))
     assert not where.repeats(np.arange(len(where))).any()
     assert where.others(3, NEARBY).sum() == len(where) - 1
+    where.ordinal[4] = where.station[4] = 3  # a look of the place at 3
+    assert np.flatnonzero(where.near(3, NEARBY)).tolist() == [3, 4]
+    assert np.flatnonzero(where.repeats(np.arange(len(where)))).tolist() == [4]
+    assert where.others(3, NEARBY).sum() == len(where) - 2
+    assert np.flatnonzero(where.of_views(np.array([4]))).tolist() == [3, 4]
 
 
 @pytest.mark.parametrize(("metres", "same"), [(4.0, True), (14.0, True), (16.0, False)])

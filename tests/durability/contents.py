@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from core.places import Neighborhood, place_and_look
 from core.storage import Atlas, Map
 from tests.durability.model import GONE
 
@@ -61,7 +62,7 @@ def _wait_for_index(map_: Map) -> None:
 
 
 def _places(map_: Map) -> list[dict[str, Any]]:
-    outline, snapshot = map_.transfer.outline(), map_.snapshot()
+    outline, snapshot = map_.transfer.outline(looks=True), map_.snapshot()
     rows = np.array([place.row for place in outline], np.int64)
     descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
     shown = {place.row: place.digest.hex() for place in outline}
@@ -72,23 +73,37 @@ def _places(map_: Map) -> list[dict[str, Any]]:
         by_id |= {place.id: place.model_dump(mode="json") for place in page}
         if cursor is None:
             break
-    assert list(by_id) == [place.id for place in outline], "the two listings differ"
+    assert list(by_id) == [place.id for place in outline if not place.is_look], "the two listings differ"
+    numbers: dict[str, int] = {}  # the positions of places by id
     found, rankings = [], snapshot.search_batch(descriptors)
     keypoints, where = map_.keypoints_at(rows.tolist()), snapshot.whereabouts.take(rows)
     tracks = {code: place.sequence for code, place in zip(where.sequence.tolist(), outline, strict=True)}
     own = (where.track == where.sequence) & (where.station == where.ordinal)
+    other_looks: dict[str, list[Any]] = {place_id: [] for place_id in by_id}
+    looks_of = {place_id: {one.name: one for one in map_.looks(place_id)} for place_id in by_id}
     for position, place in enumerate(outline):
         picture, of_frame = map_.picture(place.id), keypoints[position]
         track = [tracks.get(int(where.track[position]), GONE), int(where.station[position])]
+        of_row = {
+            "kept": None if picture is None else sha(picture),
+            "keypoints": None if of_frame is None else sha(of_frame.record()),
+            "descriptor": sha(descriptors[position].tobytes()),
+            "local": sha(local[position].tobytes()),
+            "found_first": shown[int(rankings[position][0][0])],
+        }
+        place_id, name = place_and_look(place.id)
+        if name is not None:
+            assert place.digest.hex().startswith(name)
+            assert where.take([position, numbers[place_id]]).near(0, Neighborhood(0, 0)).all(), "a look is elsewhere"
+            other_looks[place_id].append({**looks_of[place_id].pop(name).model_dump(mode="json"), **of_row})
+            continue
+        numbers[place_id] = position
         found.append({
             **by_id[place.id],
             "digest": place.digest.hex(),
             "ordinal": place.ordinal,
-            "kept": None if picture is None else sha(picture),
-            "keypoints": None if of_frame is None else sha(of_frame.record()),
             "track": None if own[position] else track,
-            "descriptor": sha(descriptors[position].tobytes()),
-            "local": sha(local[position].tobytes()),
-            "found_first": shown[int(rankings[position][0][0])],
+            **of_row,
         })  # fmt: skip
-    return found
+    assert not any(looks_of.values()), looks_of
+    return [{**place, "other_looks": other_looks[place["id"]]} for place in found]

@@ -61,12 +61,32 @@ Station = tuple[str, int]
 
 
 @dataclass
+class LookModel:
+    """One look of a place besides its first.
+
+    number: grows in the order in which places and looks were added.
+    """
+
+    shown: Shown
+    seen: Any
+    camera: str | None
+    run: str | None
+    kept: str
+    number: int
+    descriptor: Any
+    keypoints: Any = None
+    created: Any = ANY
+
+
+@dataclass
 class PlaceModel:
     """One place.
 
     track: where another traverse shows what it shows, as it was stored; None: at its own ordinal.
     pose_of: the place whose pose it got.
     picture: grows in the order in which the places of a map got their pictures.
+    looks: by their names, those besides the first.
+    number: as of a look.
     """
 
     shown: Shown
@@ -81,6 +101,8 @@ class PlaceModel:
     track: Station | None = None
     pose_of: str | None = None
     picture: int = 0
+    looks: dict[str, LookModel] = field(default_factory=dict)
+    number: int = 0
 
     @property
     def station(self) -> Station | None:
@@ -132,6 +154,7 @@ class MapModel:
     ends: dict[str | None, int] = field(default_factory=lambda: {None: 0})
     cameras: dict[str, Any] = field(default_factory=dict)
     pictures: int = 0
+    numbers: int = 0
 
     # Writes; each returns the answer that it must get
 
@@ -159,10 +182,12 @@ class MapModel:
             sequence = fields.get("sequence")
             self.ends.setdefault(sequence, 0)
             at = self._next(sequence, shown.digest, fields) if ordinal is None else ordinal
-            made = PlaceModel(shown, dict(fields), kept, at)
+            self.numbers += 1
+            made = PlaceModel(shown, dict(fields), kept, at, number=self.numbers)
             self.places[place_id] = made
         else:
             known.shown, known.kept = shown, kept
+            known.looks = {name: look for name, look in known.looks.items() if look.run is None}
             self._place_in(known, fields, replaced=True)
             known.track = known.pose_of = None
             made = known
@@ -170,6 +195,37 @@ class MapModel:
         made.picture, made.keypoints = self.pictures, keypoints
         made.descriptor, made.regions, made.updated = shown.descriptor.get(self.precision, ANY), shown.regions, ANY
         return "created" if known is None else "replaced"
+
+    def add_look(
+        self, place_id: str, shown: Shown, seen: Any, camera: str | None, run: str | None, keypoints: Any
+    ) -> str:
+        """Add a look to a place; created, or unchanged if the place has it."""
+        place, name = self.place(place_id), shown.digest[:16]
+        keypoints = keypoints if self.settings.get("verification", True) else None
+        if (known := place.looks.get(name)) is not None:
+            known.keypoints = keypoints if known.keypoints is None else known.keypoints
+            return "unchanged"
+        if place.shown.digest == shown.digest:
+            raise Refused("RepeatedLook")
+        self.numbers += 1
+        stored = shown.descriptor.get(self.precision, ANY)
+        place.looks[name] = LookModel(shown, seen, camera, run, self.settings["keep"], self.numbers, stored, keypoints)
+        return "created"
+
+    def forget_look(self, place_id: str, name: str) -> None:
+        """Remove a look of a place."""
+        if name not in self.place(place_id).looks:
+            raise Refused("UnknownLook")
+        del self.place(place_id).looks[name]
+
+    def forget_learnt(self, run: str) -> int:
+        """Remove the looks that were learnt from a run; their number."""
+        count = 0
+        for place in self.places.values():
+            left = {name: look for name, look in place.looks.items() if look.run != run}
+            count += len(place.looks) - len(left)
+            place.looks = left
+        return count
 
     def set_fields(self, place_id: str, fields: Fields) -> str:
         """Change the fields of a place and keep its frame."""
@@ -198,11 +254,14 @@ class MapModel:
 
     def fill_in(self, limit: int) -> int:
         """Find the keypoints of the first places that have none and keep a picture; how many were stored."""
-        lacking = [place for place in self.places.values() if place.keypoints is None and place.kept != "none"]
+        frames: list[PlaceModel | LookModel] = list(self.places.values())
+        frames += [look for place in self.places.values() for look in place.looks.values()]
+        frames.sort(key=lambda frame: frame.number)
+        lacking = [frame for frame in frames if frame.keypoints is None and frame.kept != "none"]
         if not self.settings.get("verification", True):
             return 0
-        for place in lacking[:limit]:
-            place.keypoints = place.shown.keypoints
+        for frame in lacking[:limit]:
+            frame.keypoints = frame.shown.keypoints
         return len(lacking[:limit])
 
     def store_counterparts(self, stations: Sequence[Sequence[str]], poses: Sequence[Sequence[str]]) -> None:
@@ -341,6 +400,25 @@ class MapModel:
             "descriptor": place.descriptor,
             "local": shown.local.get(self.precision, ANY),
             "found_first": shown.digest,
+            **({"looks": len(place.looks)} if place.looks else {}),
+            "other_looks": [self._expected_look(name, look) for name, look in place.looks.items()],
+        }
+
+    def _expected_look(self, name: str, look: LookModel) -> dict[str, Any]:
+        shown = look.shown
+        return {
+            "name": name,
+            "timestamp": canonical({"timestamp": look.seen})["timestamp"],
+            "camera": look.camera,
+            "run": look.run,
+            "regions": shown.regions,
+            "picture": look.kept,
+            "created_at": look.created,
+            "kept": {"none": None, "thumbnail": shown.thumbnail, "image": shown.image}[look.kept],
+            "keypoints": look.keypoints,
+            "descriptor": look.descriptor,
+            "local": shown.local.get(self.precision, ANY),
+            "found_first": shown.digest,
         }
 
     def told(self, places: Sequence[Mapping[str, Any]]) -> None:
@@ -364,6 +442,11 @@ class MapModel:
             place.created, place.updated = told["created_at"], told["updated_at"]
             place.descriptor, place.regions = told["descriptor"], told["regions"]
             place.keypoints = told["keypoints"]
+            for look in told["other_looks"]:
+                known = place.looks[look["name"]]
+                known.created, known.descriptor, known.keypoints = (
+                    look["created_at"], look["descriptor"], look["keypoints"],
+                )  # fmt: skip
 
 
 World = dict[str, MapModel]

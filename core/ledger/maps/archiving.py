@@ -68,11 +68,11 @@ class LedgerSource(ABC):
             yield written_line({"name": camera.name, **values, "updated_at": moment_text(camera.updated_at)})
 
     def places(self) -> Iterator[ArchivedPlace]:
-        """All places in the order of their enrolment."""
+        """All places and looks in the order in which they were added."""
         names = dict(self.connection.execute(_NAMES))
         lost: dict[int, int] = {}
         after = -1
-        while page := places.listed(self.connection, after, LINES_AT_ONCE):
+        while page := places.listed_with_looks(self.connection, after, LINES_AT_ONCE):
             pictures, records = frames.sizes_at(self.connection, [stored.row for stored in page])
             for stored in page:
                 track = None if stored.track is None else names.get(stored.track)
@@ -136,6 +136,8 @@ def _archived(
             "keypoints": count_of(keypoints) if keypoints else None,
             "created_at": moment_text(place.created_at),
             "updated_at": moment_text(place.updated_at),
+            "seen": stored.seen,
+            "run": stored.run,
         }
     )
     size = 0 if picture is None else picture[0]

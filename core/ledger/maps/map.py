@@ -16,6 +16,7 @@ from core.errors import (
     RevisionMismatch,
     StorageFailure,
     TooManyToDelete,
+    UnknownLook,
     UnknownPlace,
     UnknownSequence,
 )
@@ -43,7 +44,7 @@ from core.maps.records import (
     patched_fields,
     patched_record,
 )
-from core.places import Place, PlaceFields
+from core.places import Look, Place, PlaceFields, look_address
 
 
 class LedgerMap(ABC):
@@ -134,7 +135,7 @@ class LedgerMap(ABC):
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         with self._glancing() as connection:
             found = places.at_rows(connection, [int(row) for row in rows])
-        return [None if (stored := found.get(int(row))) is None else stored.place for row in rows]
+        return [None if (stored := found.get(int(row))) is None else stored.shown() for row in rows]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
@@ -275,6 +276,35 @@ class LedgerMap(ABC):
     def forget(self, place_id: str) -> None:
         with self._writing() as write:
             write.forget(places.expect(write.connection, place_id))
+
+    def looks(self, place_id: str) -> list[Look]:
+        """The looks of a place besides its first, in the order in which they were added.
+
+        Raises:
+            UnknownPlace.
+        """
+        with self._reading() as connection:
+            return [one.look() for one in places.looks_of(connection, places.expect(connection, place_id))]
+
+    def forget_look(self, place_id: str, look: str) -> None:
+        """Delete a look of a place.
+
+        Raises:
+            UnknownPlace, UnknownLook.
+        """
+        with self._writing() as write:
+            places.expect(write.connection, place_id)
+            if (stored := places.find(write.connection, look_address(place_id, look))) is None:
+                raise UnknownLook(f"Place {place_id!r} has no look {look[:80]!r}.")
+            write.forget(stored)
+
+    def forget_learnt(self, run: str) -> int:
+        """Delete the looks that were learnt from a run, all in one commit; returns how many there were."""
+        with self._writing() as write:
+            found = places.learnt_from(write.connection, run)
+            for stored in found:
+                write.forget(stored)
+        return len(found)
 
     def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
         """Delete the places that fulfil some conditions, all in one commit; returns their ids.

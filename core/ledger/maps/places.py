@@ -1,4 +1,4 @@
-"""Places: finding, listing and storing them."""
+"""Places and their looks: finding, listing and storing them."""
 
 from __future__ import annotations
 
@@ -29,11 +29,14 @@ from core.places import (
     METRIC,
     NO_POSE,
     NO_TIME,
+    Look,
     Place,
     PlaceFields,
     Pose,
     Whereabouts,
+    look_address,
     microseconds,
+    place_and_look,
 )
 
 LONGEST_TEXT = 512
@@ -46,14 +49,28 @@ _NAME = select(_S.name).where(_S.map == _P.map, _S.code == _P.sequence).scalar_s
 _WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
 _STORED = _WHOLE.where(_P.map == bindparam("map"))
 _NUMBERS = (
-    "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision",
+    "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision", "look_of",
+    "seen", "run",
 )  # fmt: skip
+
+_IS_PLACE = _P.look_of.is_(None)
 
 _BY_ID = Statement(_STORED.where(_P.id == bindparam("id")))
 _BY_IDS = Statement(_STORED.where(among(_P.id, "ids")))
 _BY_ROWS = Statement(_STORED.where(among(_P.row, "rows")))
+_LOOKS_OF = Statement(_STORED.where(_P.look_of == bindparam("place")).order_by(_P.number))
+_LEARNT_FROM = Statement(
+    _STORED.where(_P.look_of.is_not(None), _P.run == bindparam("run")).order_by(_P.number)
+)
 _BY_KEYS = Statement(_WHOLE.where(among(_P.key, "keys")))  # keys are those of one map
 _ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
+_NUMBERS_OF = Statement(select(_P.id, _P.number).where(_P.map == bindparam("map"), among(_P.id, "ids")))
+_ROWS_OF_PLACE = Statement(
+    select(_P.row).where(
+        _P.map == bindparam("map"),
+        (_P.number == bindparam("place")) | (_P.look_of == bindparam("place")),
+    )
+)
 _INSERT = Statement(
     lambda insert: insert(PLACES).values({name: bindparam(name) for name in ("map", *_COLUMNS, "seal")})
 )
@@ -78,22 +95,27 @@ _ROWS_WITH = Statement(select(joined(_T.row)).where(_T.map == bindparam("map"), 
 _ROWS_WITH_AMONG = Statement(
     select(joined(_T.row)).where(_T.map == bindparam("map"), _T.token == bindparam("token"), among(_T.row, "rows"))
 )
+_WITH_LOOKS = Statement(
+    _STORED.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most"))
+)
 _OUTLINES = Statement(
-    select(_P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at)
+    select(_P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at, _P.run)
     .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
     .where(_P.map == bindparam("map"))
     .order_by(_P.number)
 )
 _STATIONS = Statement(
     select(_P.id, _P.digest, _P.sequence, _P.ordinal, _P.track, _P.station, _P.pose_of)
-    .where(_P.map == bindparam("map"))
+    .where(_P.map == bindparam("map"), _IS_PLACE)
     .order_by(_P.number)
 )
-_HANDED_OVER = Statement(select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _P.pose_of.is_not(None)))
+_HANDED_OVER = Statement(select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _IS_PLACE, _P.pose_of.is_not(None)))
 _WITHOUT_IMAGE = Statement(
     select(func.count()).select_from(PLACES).where(_P.map == bindparam("map"), _P.picture != "image")
 )
-_COUNT = Statement(select(func.count()).select_from(PLACES).where(_P.map == bindparam("map")))
+_COUNT = Statement(
+    select(func.count(), func.count(_P.look_of)).select_from(PLACES).where(_P.map == bindparam("map"))
+)
 _CHECKSUMS = Statement(select(_P.row, _P.id, _P.checksum).where(_P.map == bindparam("map")))
 _PICTURED = Statement(
     select(_P.id, _P.row, _P.picture, _P.digest, _P.camera).where(_P.map == bindparam("map")).order_by(_P.number)
@@ -123,6 +145,8 @@ class StoredPlace:
     track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     key: of its entity in Milvus.
     revision: of the map's write that changed it last.
+    look_of: the number of the place whose look it is; None: it is a place.
+    seen: when a look's frame was taken, as text; run: the run from which it was learnt.
     """
 
     number: int
@@ -136,14 +160,41 @@ class StoredPlace:
     station: int | None = None
     key: int | None = None
     revision: int = 0
+    look_of: int | None = None
+    seen: str | None = None
+    run: str | None = None
+
+    def shown(self) -> Place:
+        """The place as an answer has it: that of a look's row has the place's id, and the name of the look."""
+        if self.look_of is None:
+            return self.place
+        place_id, look = place_and_look(self.place.id)
+        return self.place.model_copy(update={"id": place_id, "look": look})
+
+    def look(self) -> Look:
+        """The look of its row."""
+        _, name = place_and_look(self.place.id)
+        return Look.model_construct(
+            name=name,
+            timestamp=None if self.seen is None else datetime.fromisoformat(self.seen),
+            camera=self.place.camera,
+            run=self.run,
+            regions=self.place.regions,
+            picture=self.place.picture,
+            created_at=self.place.created_at,
+        )
 
     def outline(self) -> Outline:
         """The place in brief."""
         place = self.place
         return Outline(
             self.number, place.id, self.row, self.digest, place.picture, place.camera, place.sequence, self.ordinal,
-            moment_text(place.updated_at),
+            moment_text(place.updated_at), self.run,
         )  # fmt: skip
+
+    def of_frame(self) -> Place:
+        """The place as its frame was enrolled: the time of a look is that of its own frame."""
+        return self.place if self.look_of is None else self.place.model_copy(update={"timestamp": self.look().timestamp})
 
 
 def _stored(values: Sequence[Any]) -> StoredPlace:
@@ -161,6 +212,7 @@ def _from_columns(columns: Mapping[str, Any], sequence: str | None) -> StoredPla
             pose_of=columns["pose_of"],
             regions=columns["regions"],
             picture=columns["picture"],
+            looks=columns["looks"],
             pose=Pose(**pose) if pose else None,
             timestamp=None if columns["timestamp"] is None else datetime.fromisoformat(columns["timestamp"]),
             sequence=sequence,
@@ -181,6 +233,7 @@ def _columns_of(stored: StoredPlace) -> dict[str, Any]:
         "id": place.id,
         "regions": place.regions,
         "picture": place.picture,
+        "looks": place.looks,
         "pose_of": place.pose_of,
         "created_at": moment_text(place.created_at),
         "updated_at": moment_text(place.updated_at),
@@ -225,6 +278,29 @@ def of_keys(connection: MapConnection, keys: Sequence[int]) -> list[StoredPlace]
     return [_stored(values) for values in connection.execute(_BY_KEYS, keys=list(keys))]
 
 
+def looks_of(connection: MapConnection, stored: StoredPlace) -> list[StoredPlace]:
+    """The looks of a place besides its first, in the order in which they were added."""
+    if stored.look_of is not None or not stored.place.looks:
+        return []
+    return [_stored(values) for values in connection.execute(_LOOKS_OF, place=stored.number)]
+
+
+def learnt_from(connection: MapConnection, run: str) -> list[StoredPlace]:
+    """The looks that were learnt from a run."""
+    return [_stored(values) for values in connection.execute(_LEARNT_FROM, run=run)]
+
+
+def numbers_of(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, int]:
+    """The numbers of places by id; ids that do not exist are left out."""
+    return dict(connection.execute(_NUMBERS_OF, ids=list(place_ids)))
+
+
+def all_rows_of(connection: MapConnection, place_id: str) -> list[int]:
+    """The rows of a place and of its looks; none if there is no such place."""
+    number = numbers_of(connection, [place_id]).get(place_id)
+    return [] if number is None else [row for (row,) in connection.execute(_ROWS_OF_PLACE, place=number)]
+
+
 def rows_of(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, int]:
     """The rows of places by id; ids that do not exist are left out."""
     return dict(connection.execute(_ROWS_OF, ids=list(place_ids)))
@@ -234,6 +310,11 @@ def listed(connection: MapConnection, after: int, limit: int, wanted: PlaceFilte
     """Up to ``limit`` places behind number ``after`` that fulfil some conditions, in the order of their enrolment."""
     statement, values = _listing(_conditions(wanted), False), _values(wanted)
     return [_stored(found) for found in connection.execute(statement, after=after, most=limit, **values)]
+
+
+def listed_with_looks(connection: MapConnection, after: int, limit: int) -> list[StoredPlace]:
+    """Up to ``limit`` places and looks behind number ``after``, in the order in which they were added."""
+    return [_stored(found) for found in connection.execute(_WITH_LOOKS, after=after, most=limit)]
 
 
 def ids_of(connection: MapConnection, wanted: PlaceFilter, limit: int) -> list[str]:
@@ -275,6 +356,7 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
         "after": _P.timestamp >= bindparam("from_moment"),
         "before": _P.timestamp <= bindparam("to_moment"),
     }
+    query = query.where(_IS_PLACE)
     for name in names:
         query = query.where(all_conditions[name])
     for at in range(values):
@@ -285,9 +367,10 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 
 
-def outlines(connection: MapConnection) -> list[Outline]:
-    """All places in brief, in the order of their enrolment."""
-    return [Outline(*values) for values in connection.execute(_OUTLINES)]
+def outlines(connection: MapConnection, looks: bool) -> list[Outline]:
+    """All places in brief, and their looks if these are wanted, in the order in which they were added."""
+    found = [Outline(*values) for values in connection.execute(_OUTLINES)]
+    return found if looks else [one for one in found if not one.is_look]
 
 
 def stations(connection: MapConnection) -> dict[str, PlaceStation]:
@@ -300,9 +383,10 @@ def handed_over(connection: MapConnection) -> dict[int, str]:
     return dict(connection.execute(_HANDED_OVER))
 
 
-def count(connection: MapConnection) -> int:
-    """How many places there are."""
-    return int(connection.execute(_COUNT)[0][0])
+def count(connection: MapConnection) -> tuple[int, int]:
+    """How many places there are, and how many looks they have besides their first ones."""
+    ((rows, looks),) = connection.execute(_COUNT)
+    return int(rows - looks), int(looks)
 
 
 def count_without_image(connection: MapConnection) -> int:
@@ -341,7 +425,7 @@ def placed(item_id: str, fields: PlaceFields, sequence: int, ordinal: int, **val
     """
     columns = {
         "id": item_id, "sequence": sequence, "ordinal": ordinal, "track": None, "station": None, "pose_of": None,
-        "key": None, **values, **field_columns(fields),
+        "key": None, "look_of": None, "looks": 0, "seen": None, "run": None, **values, **field_columns(fields),
     }  # fmt: skip
     return _from_columns(columns, fields.sequence)
 

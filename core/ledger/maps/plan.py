@@ -28,7 +28,7 @@ _LISTED = (
             case((_P.pose_of.is_not(None), HANDED_OVER), else_=0) + case((_P.picture != "none", HAS_PICTURE), else_=0)
         ).label("flags"),
     )
-    .where(_P.map == bindparam("map"), (_P.number - 1) % bindparam("step") == 0)
+    .where(_P.map == bindparam("map"), _P.look_of.is_(None), (_P.number - 1) % bindparam("step") == 0)
     .order_by(_P.number)
     .subquery()
     .c

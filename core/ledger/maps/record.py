@@ -27,7 +27,8 @@ class MapState:
     """The state of a map without its places.
 
     number: never used for another map, also of the same id; 1 in a file.
-    places, rows: how many places there are; all their rows are below ``rows``.
+    places, looks: how many places there are, and how many looks they have besides their first ones.
+    rows: all their rows are below it.
     numbers: the number of the next place.
     revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
         and made again is told from the first one.
@@ -43,11 +44,17 @@ class MapState:
     revision: int = 0
     stamp: str = ""
     collection: int = 0
+    looks: int = 0
     recent: bool = True
+
+    @property
+    def searched(self) -> int:
+        """How many frames are searched: the places and their looks."""
+        return self.places + self.looks
 
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
-_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "collection")
+_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "collection", "looks")
 _STATE = (
     MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS),
     (MAPS.c.touched > seconds_now() - RECENT_SECONDS).label("recent"),

@@ -40,6 +40,7 @@ MAPS = Table(
     _column("listed", integer(), server_default="1"),  # 0: it is being built
     _column("touched", real(), server_default="0"),  # the moment of the last write, seconds since 1970
     _column("places", integer(), server_default="0"),  # how many there are
+    _column("looks", integer(), server_default="0"),  # how many they have besides their first ones
     _column("numbers", integer(), server_default="1"),  # the number of the next place
     _column("rows", integer(), server_default="0"),  # the number of the next row
     _column("codes", integer(), server_default="0"),  # the code of the next sequence or lost track
@@ -59,6 +60,11 @@ SEQUENCES = _table(
 # Track and station are the sequence and the ordinal at which another traverse shows what this place shows
 # (:class:`core.places.Whereabouts`); NULL: those of the place itself.  That sequence may be gone, whose code is never
 # used again.  pose_of is the id of the place whose pose the place got with its station; NULL: the pose is its own.
+#
+# A look is a row of its own with what its place has, so that whatever searches, reads and checks rows need not know of
+# looks: look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame, camera
+# and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run that it
+# was learnt from.
 PLACES = _table(
     "places", ("number",),
     _column("number", integer()),  # grows in the order of enrolment
@@ -77,6 +83,10 @@ PLACES = _table(
     _column("station", integer(), optional=True),
     _column("pose_of", text(), optional=True),
     _column("metadata", text()),
+    _column("look_of", integer(), optional=True),
+    _column("looks", integer()),
+    _column("seen", text(), optional=True),
+    _column("run", text(), optional=True),
     _column("created_at", text()),
     _column("updated_at", text()),
     _column("key", integer(), optional=True),  # of its entity in Milvus
@@ -90,6 +100,10 @@ Index("places_of_sequence", PLACES.c.map, PLACES.c.sequence, PLACES.c.number)
 # With the number, and made after the index above by its name: a PostgreSQL without statistics takes the later of two
 # indexes that seem as good to it, and the other one would have it walk through a whole sequence.
 Index("places_on_position", PLACES.c.map, PLACES.c.sequence, PLACES.c.ordinal, PLACES.c.number)
+Index(
+    "looks_of_places", PLACES.c.map, PLACES.c.look_of,
+    sqlite_where=PLACES.c.look_of.is_not(None), postgresql_where=PLACES.c.look_of.is_not(None),
+)  # fmt: skip
 Index("places_by_revision", PLACES.c.map, PLACES.c.revision).ddl_if(dialect="postgresql")
 Index("places_by_key", PLACES.c.key, unique=True, sqlite_where=PLACES.c.key.is_not(None))
 

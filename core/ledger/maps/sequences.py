@@ -14,7 +14,8 @@ from core.places import NO_SEQUENCE
 
 _S, _P = SEQUENCES.c, PLACES.c
 _OF_MAP = _S.map == bindparam("map")
-_OF_SEQUENCE = and_(_P.map == bindparam("map"), _P.sequence == bindparam("code"))
+# Looks are where their places are, and do not count among the frames of a sequence.
+_OF_SEQUENCE = and_(_P.map == bindparam("map"), _P.sequence == bindparam("code"), _P.look_of.is_(None))
 _AT = and_(_OF_SEQUENCE, _P.ordinal == bindparam("ordinal"))
 
 _CODES = Statement(select(_S.name, _S.code).where(_OF_MAP, among(_S.name, "names")))
@@ -46,7 +47,7 @@ _DROP = Statement(
 _ENDS = Statement(select(_S.name, _S.next_ordinal).where(_OF_MAP).order_by(_S.name.is_not(None), _S.name))
 _SUMMARIES = Statement(
     select(_S.name, func.count(), func.min(_P.timestamp), func.max(_P.timestamp))
-    .join(PLACES, and_(_P.map == _S.map, _P.sequence == _S.code))
+    .join(PLACES, and_(_P.map == _S.map, _P.sequence == _S.code, _P.look_of.is_(None)))
     .where(_OF_MAP, _S.name > bindparam("after"))
     .group_by(_S.name)
     .order_by(_S.name)

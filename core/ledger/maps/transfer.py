@@ -30,9 +30,9 @@ class Transfer:
     ) -> None:
         self._reading, self._writing, self.paused_writes = reading, writing, paused_writes
 
-    def outline(self) -> list[Outline]:
+    def outline(self, looks: bool = False) -> list[Outline]:
         with self._reading() as connection:
-            return places.outlines(connection)
+            return places.outlines(connection, looks)
 
     def count_without_image(self) -> int:
         with self._reading() as connection:
@@ -45,7 +45,7 @@ class Transfer:
     def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
         with self._reading() as connection:
             found = places.of_ids(connection, place_ids)
-        return {place_id: (stored.place, stored.row) for place_id, stored in found.items()}
+        return {place_id: (stored.of_frame(), stored.row) for place_id, stored in found.items()}
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
         if items:
@@ -60,6 +60,7 @@ class Transfer:
         with self._writing() as write:
             found = places.of_ids(write.connection, list(frames))
             going = [stored for place_id, stored in found.items() if stored.digest == frames[place_id]]
+            going.sort(key=lambda stored: stored.look_of is None)  # a place takes its looks along
             for stored in going:
                 write.forget(stored)
         return len(going)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.errors import RepeatedLook, TooManyLooks, UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.ledger.maps import frames, places, record, sequences
 from core.ledger.maps.connection import MapConnection
@@ -19,10 +21,10 @@ from core.ledger.maps.frames import StoredPicture
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.maps.enrolling import picture_of
-from core.maps.records import Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
+from core.maps.records import MOST_LOOKS, Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import moment_text, same_fields
-from core.maps.views import MOST_HIDDEN, LatestViews, Look, latest_views, leaves_view, reach_of
-from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
+from core.maps.views import MOST_HIDDEN, LatestViews, ViewedFrame, latest_views, leaves_view, reach_of
+from core.places import NO_SEQUENCE, Place, PlaceFields, Pose, place_and_look
 
 Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
 """The descriptor, float32 [D], and the local descriptors, int8 [C, L], of one frame."""
@@ -129,36 +131,87 @@ class Write(ABC):
         return self._found[place_id]
 
     def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
-        """Create a place, replace its frame, or change its fields if the frame is the same.
+        """Create a place, replace its frame, or change its fields if the frame is the same; or add a look to a place.
+
+        A place whose frame is replaced loses the looks that were learnt, for it may be another place now.
 
         Args:
             keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
-        stored = self._find(item.id)
+        of, name = place_and_look(item.id)
+        stored, place = self._find(item.id), None if name is None else self._find(of)
         if stored is not None and stored.digest == item.digest:
             if item.keypoints is not None and not frames.has_keypoints(self.connection, stored.row):
                 self._put_keypoints(stored, item.keypoints)
-            return self.set_fields(stored, item.fields)
+            return self.set_fields(stored, item.fields) if name is None else (stored.shown(), "unchanged")
+        if name is not None:
+            place = self._expect_room_for_look(of, item.digest)
         row, (kind, picture) = self.state.rows, picture_of(item, self.record.keep if keep is None else keep)
         checksum = self._add_descriptors(row, item)
         self.state = replace(self.state, rows=row + 1)
         frame: dict[str, Any] = {"row": row, "checksum": checksum, "digest": item.digest}
-        look = Look(item.descriptor, item.local, item.fields.pose)
-        if stored is None:
-            made = self._create(item, {**frame, "regions": item.regions, "picture": kind}, look, ordinal)
+        shape: dict[str, Any] = {**frame, "regions": item.regions, "picture": kind}
+        look = ViewedFrame(item.descriptor, item.local, item.fields.pose)
+        if place is not None:
+            made = self._create_look(place, item, shape)
+        elif stored is None:
+            made = self._create(item, shape, look, ordinal)
         else:
             shown = places.with_place(stored, regions=item.regions, picture=kind, pose_of=None)
             shown = replace(shown, track=None, station=None, **frame)
             made = self._put(self._with_fields(shown, item.fields, look, stored), stored)
             self._leave(stored)
+            made = self._without_learnt_looks(made)
         if picture is not None:
             self.put_picture(row, picture)
         if item.keypoints is not None:
             self._put_keypoints(made, item.keypoints)
-        return made.place, "created" if stored is None else "replaced"
+        return made.shown(), "created" if stored is None else "replaced"
 
-    def _create(self, item: Enrolment, values: dict[str, Any], look: Look, ordinal: int | None) -> StoredPlace:
+    def _expect_room_for_look(self, place_id: str, digest: bytes) -> StoredPlace:
+        """The place that a new look is of.
+
+        Raises:
+            UnknownPlace: there is none.
+            RepeatedLook: the frame is the one with which the place was enrolled.
+            TooManyLooks: the place has as many as it may have.
+        """
+        place = self._find(place_id)
+        if place is None:
+            raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
+        if place.digest == digest:
+            raise RepeatedLook(f"The frame is the one with which place {place_id!r} was enrolled.")
+        if place.place.looks >= MOST_LOOKS:
+            raise TooManyLooks(f"Place {place_id!r} has {MOST_LOOKS} looks already; remove one first.")
+        return place
+
+    def _create_look(self, place: StoredPlace, item: Enrolment, values: dict[str, Any]) -> StoredPlace:
+        """Store a new look of a place, whose fields it has; camera and time are those of its own frame."""
+        fields, now = place.place.fields().model_copy(update={"camera": item.fields.camera}), moment_text(self._now)
+        seen = item.fields.timestamp
+        look = places.placed(
+            item.id, fields, place.sequence, place.ordinal, number=self.state.numbers, revision=self._revision,
+            created_at=now, updated_at=now, track=place.track, station=place.station, pose_of=place.place.pose_of,
+            look_of=place.number, seen=None if seen is None else moment_text(seen), run=item.run, **values,
+        )  # fmt: skip
+        return self.insert_look(place, look)
+
+    def insert_look(self, place: StoredPlace, look: StoredPlace) -> StoredPlace:
+        """Store a new look of a place, whose row counts already."""
+        made = self.insert(look)
+        now = self._find(place.place.id) or place
+        self._put(places.with_place(now, looks=now.place.looks + 1), now, searched=False)
+        return made
+
+    def _without_learnt_looks(self, stored: StoredPlace) -> StoredPlace:
+        """A place after the looks that were learnt from runs are deleted."""
+        for look in places.looks_of(self.connection, stored):
+            if look.run is not None:
+                self.forget(look)
+        return self._find(stored.place.id) or stored
+
+    def _create(self, item: Enrolment, values: dict[str, Any], look: ViewedFrame, ordinal: int | None) -> StoredPlace:
         code, at = self._code_of(item.fields.sequence), ordinal
         if at is None:
             at = self._position(item.fields.sequence, look)
@@ -179,9 +232,17 @@ class Write(ABC):
         made = self._prepared(stored, None, True)
         self._places.append(made)
         self._found[made.place.id] = made
-        self.state = replace(self.state, numbers=made.number + 1, places=self.state.places + 1)
+        self.state = replace(self.state, numbers=made.number + 1)
+        self._count(made, 1)
         self._note(made)
         return made
+
+    def _count(self, stored: StoredPlace, more: int) -> None:
+        """Count a place or a look that comes or, with -1, goes."""
+        if stored.look_of is None:
+            self.state = replace(self.state, places=self.state.places + more)
+        else:
+            self.state = replace(self.state, looks=self.state.looks + more)
 
     def _put(self, stored: StoredPlace, before: StoredPlace, searched: bool = True) -> StoredPlace:
         made = self._prepared(replace(stored, revision=self._revision), before, searched)
@@ -191,7 +252,21 @@ class Write(ABC):
             self._drop_if_empty(before.sequence)
         self.changed = True
         self._note(made)
+        if made.look_of is None and _shared(made) != _shared(before):
+            self._move_looks(made, searched)
         return made
+
+    def _move_looks(self, stored: StoredPlace, searched: bool) -> None:
+        """Give the looks of a place what they share with it."""
+        place = stored.place
+        shared = {"pose": place.pose, "pose_of": place.pose_of, "timestamp": place.timestamp}
+        shared |= {"sequence": place.sequence, "metadata": place.metadata, "looks": place.looks}
+        for look in places.looks_of(self.connection, stored):
+            moved = replace(
+                places.with_place(look, **shared), sequence=stored.sequence, ordinal=stored.ordinal,
+                track=stored.track, station=stored.station,
+            )  # fmt: skip
+            self._put(moved, look, searched)
 
     def _code_of(self, sequence: str | None) -> int:
         """The code of a sequence, which is made if there is none."""
@@ -222,7 +297,7 @@ class Write(ABC):
         self.changed = True
         self._let_go(stored)
 
-    def _position(self, sequence: str | None, look: Look) -> int | None:
+    def _position(self, sequence: str | None, look: ViewedFrame) -> int | None:
         """The position at the end of a sequence of a frame that shows a view which is there already, else None."""
         if sequence is None:
             return None
@@ -232,11 +307,11 @@ class Write(ABC):
             self._latest[sequence] = latest_views(last, first, positions, self._reach, self._looks)
         return self._latest[sequence].position_of(look)
 
-    def _looks(self, rows: list[int]) -> list[Look]:
+    def _looks(self, rows: list[int]) -> list[ViewedFrame]:
         """The content of the frames in some rows, those of this write included."""
         poses = {row: stored.place.pose for row, stored in places.at_rows(self.connection, rows).items()}
         return [
-            Look(descriptor, local, poses[row])
+            ViewedFrame(descriptor, local, poses[row])
             for row, (descriptor, local) in zip(rows, self._descriptors_at(rows), strict=True)
         ]
 
@@ -245,7 +320,7 @@ class Write(ABC):
         return reach_of(self.record.same_place_radius)
 
     def _with_fields(
-        self, stored: StoredPlace, fields: PlaceFields, look: Look | None = None, shown: StoredPlace | None = None
+        self, stored: StoredPlace, fields: PlaceFields, look: ViewedFrame | None = None, shown: StoredPlace | None = None
     ) -> StoredPlace:
         """A place with other fields; its position in its sequence changes only with the sequence, or if it leaves it.
 
@@ -265,7 +340,7 @@ class Write(ABC):
         self._latest.clear()
         return changed
 
-    def _leaves(self, stored: StoredPlace, fields: PlaceFields, look: Look | None) -> bool:
+    def _leaves(self, stored: StoredPlace, fields: PlaceFields, look: ViewedFrame | None) -> bool:
         """Whether a place whose sequence stays does not belong to its position any more, because of a change."""
         if fields.sequence is None or (look is None and fields.pose == stored.place.pose):
             return False
@@ -310,12 +385,16 @@ class Write(ABC):
         return self._put(self._with_fields(stored, fields), stored).place, "updated"
 
     def adopt(self, item: Enrolment, history: History) -> None:
-        """Store a place of another map with its history."""
-        self.enrol(item, history.picture, history.ordinal)
+        """Store a place of another map, or a look of a place, with its history."""
+        with suppress(RepeatedLook, TooManyLooks):  # the place has other looks here
+            self.enrol(item, history.picture, history.ordinal)
         self._latest.clear()
-        stored = self._find(item.id)
-        assert stored is not None
+        if (stored := self._find(item.id)) is None:
+            return
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
+        if stored.look_of is not None:
+            self._put(places.with_place(stored, **moments), stored, searched=False)
+            return
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
         changed = replace(places.with_place(stored, **moments), ordinal=ordinal)
         self._put(changed, stored, searched=ordinal != stored.ordinal)
@@ -334,12 +413,20 @@ class Write(ABC):
         self._put(changed, stored, searched=moved)
 
     def forget(self, stored: StoredPlace) -> None:
-        """Delete a place."""
+        """Delete a place with its looks, or one look of a place."""
+        for look in places.looks_of(self.connection, stored):
+            self._remove(look)
+        self._remove(stored)
+        if stored.look_of is None:
+            self._drop_if_empty(stored.sequence)
+            self._latest.clear()
+        elif (place := self._find(place_and_look(stored.place.id)[0])) is not None:
+            self._put(places.with_place(place, looks=place.place.looks - 1), place, searched=False)
+
+    def _remove(self, stored: StoredPlace) -> None:
         places.remove(self.connection, stored)
         self._found[stored.place.id] = None
-        self._drop_if_empty(stored.sequence)
-        self._latest.clear()
-        self.state = replace(self.state, places=self.state.places - 1)
+        self._count(stored, -1)
         self._leave(stored)
 
     def edit(self, changed: MapRecord) -> None:
@@ -360,3 +447,10 @@ class Write(ABC):
         self._finish()
         if self.state != self._before:
             record.put_counters(self._connection, self.state)
+
+
+def _shared(stored: StoredPlace) -> tuple[Any, ...]:
+    """The values of a place that its looks have as well."""
+    place = stored.place
+    at = stored.sequence, stored.ordinal, stored.track, stored.station
+    return (*at, place.pose, place.pose_of, place.timestamp, place.sequence, place.metadata, place.looks)

@@ -13,7 +13,8 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import MOST_STORED
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
-from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
+from core.names import LONGEST, TEXT
+from core.places import LOOK, PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to accept more."""
@@ -59,16 +60,19 @@ class Picture(_Line):
 
 
 class PlaceLine(_Line):
-    """A place.
+    """A place, or a look of a place in a line before.
+
+    id: of a look its address (:func:`core.places.look_address`).
 
     track, station: the sequence and the ordinal at which another traverse shows the same; None: its own.  A sequence
         that is gone has no name any more, but a number, which distinguishes the places on its track from others.
     pose_of: the place whose pose it got from an alignment.
     digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
     keypoints: the number of those of its frame; their record is the next one in its group.  None: none are stored.
+    seen, run: when the frame of a look was taken, and the run from which it was learnt.
     """
 
-    id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
+    id: Annotated[str, Field(pattern=f"^{PLACE_ID}(/{LOOK})?$")]
     pose: Pose | None
     pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None
     timestamp: Timestamp | None
@@ -84,6 +88,8 @@ class PlaceLine(_Line):
     keypoints: Annotated[int, Field(ge=0, le=MOST_STORED, strict=True)] | None
     created_at: Timestamp
     updated_at: Timestamp
+    seen: Timestamp | None = None
+    run: Annotated[str, Field(max_length=LONGEST, pattern=f"^{TEXT}$")] | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:

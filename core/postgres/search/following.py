@@ -118,14 +118,15 @@ class FollowedMap:
 
     def _tier(self, state: MapState, held: Followed | None) -> Tier:
         present: Tier = "exact" if held is None else tier_of(held.snapshot)
-        return tier_for(state.record.index, state.places, present)
+        return tier_for(state.record.index, state.searched, present)
 
     # Reading all
 
     def _read(self, connection: MapConnection, state: MapState, source: PostgresRows) -> Snapshot:
         columns, total = read_columns(connection, state.rows), state.rows
-        if len(columns.rows) != state.places:
-            raise StorageFailure(f"The map has {len(columns.rows)} places, but its record counts {state.places}.")
+        if len(columns.rows) != state.searched:
+            counted = f"its record counts {state.searched}"
+            raise StorageFailure(f"The map has {len(columns.rows)} places and looks, but {counted}.")
         whereabouts = columns.by_row(total)
         alive = np.zeros(total, np.bool_)
         alive[columns.rows] = True
@@ -201,8 +202,8 @@ class FollowedMap:
             after = after.moved(moved)
         if dead := [row for row in rows.dead_since(connection, held.revision) if row < last.rows]:
             after = after.without(dead)
-        if len(after) != state.places:
-            raise StorageFailure(f"The map has {state.places} places, but {len(after)} were found.")
+        if len(after) != state.searched:
+            raise StorageFailure(f"The map has {state.searched} places and looks, but {len(after)} were found.")
         return after
 
     def _appended(

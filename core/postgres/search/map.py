@@ -91,9 +91,9 @@ class CodedMap(PostgresMap):
     def index_status(self) -> IndexStatus:
         """How the map is searched; a map of few places is read for that."""
         held = self._followed.held
-        if held is None and self._state.places >= COMPACT_FROM:
-            return unopened(self.record.index, self._state.places)
-        snapshot = self.snapshot() if held is None or self._state.places < COMPACT_FROM else held.snapshot
+        if held is None and self._state.searched >= COMPACT_FROM:
+            return unopened(self.record.index, self._state.searched)
+        snapshot = self.snapshot() if held is None or self._state.searched < COMPACT_FROM else held.snapshot
         return IndexStatus(
             setting=self.record.index,
             tier=tier_of(snapshot),

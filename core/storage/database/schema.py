@@ -27,6 +27,7 @@ _STATISTICS = {
     ("places", "sqlite_autoindex_places_3"): "1000000 1000000 1",  # by row
     ("places", "places_of_sequence"): "1000000 1000000 5000 1",
     ("places", "places_on_position"): "1000000 1000000 5000 2 1",
+    ("places", "looks_of_places"): "1000000 1000000 3",
     ("sequences", "sequences"): "200 200 1",
     ("sequences", "sqlite_autoindex_sequences_2"): "200 200 1",  # by name
     ("tokens", "tokens"): "2000000 2000000 1000 1",
@@ -39,7 +40,7 @@ _MORE = [
         for (table, index), numbers in _STATISTICS.items()
     ),
 ]
-TABLES = Tables("map", 11, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
+TABLES = Tables("map", 12, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
 SCHEMA = Schema(APPLICATION_ID, TABLES.version, TABLES.create("sqlite"))
 
 

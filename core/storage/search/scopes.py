@@ -57,9 +57,8 @@ class Chooser:
             allowed[rows] = among[rows]
         if selection.excluded is not None:
             with self._reading() as connection:
-                row = places.rows_of(connection, [selection.excluded]).get(selection.excluded)
-            if row is not None and row < len(allowed):
-                allowed[row] = False
+                rows = np.array(places.all_rows_of(connection, selection.excluded), np.int64)
+            allowed[rows[rows < len(allowed)]] = False
         return allowed
 
     def _not_recent(self, selection: Selection) -> NotLately | None:

@@ -6,7 +6,7 @@ A suite of one store derives a class from :class:`StoreContract` that says how t
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -25,11 +25,12 @@ from core.judgement.priors import Disc, Period
 from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, SameFrame, Selection, Store
 from core.maps.archives.reading import Archive, check
 from core.maps.selection import Conditions, RecentFrames
-from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, microseconds
+from core.maps.records import Outline
+from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, look_address, microseconds
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
 from tests.durability.contents import sha
 from tests.durability.model import GONE, MapModel, PlaceModel, Refused, changed, differences
-from tests.durability.storage.operations import DEFAULTS, enrolment, shown
+from tests.durability.storage.operations import DEFAULTS, enrolment, look_enrolment, shown
 
 MAP = "lab"
 NAMES = ("monday", "tuesday")
@@ -162,6 +163,28 @@ class StoreContract(RuleBasedStateMachine):
         self.agree(
             lambda model: (model.patch(place_id, changes), None)[1], lambda lab: (lab.patch(place_id, changes), None)[1]
         )
+
+    @rule(
+        place_id=ids, picture=pictures, seen=st.none() | times, run=st.none() | st.sampled_from(["night", "snow"]),
+        camera=st.none() | st.just("front"), keypoints=st.booleans(),
+    )  # fmt: skip
+    def add_look(self, place_id: str, picture: str, seen: Any, run: Any, camera: Any, keypoints: bool) -> None:
+        of = shown(picture)
+        self.agree(
+            lambda model: model.add_look(place_id, of, seen, camera, run, of.keypoints if keypoints else None),
+            lambda lab: lab.enrol([look_enrolment(place_id, picture, seen, camera, run, keypoints)])[0][1],
+        )
+
+    @rule(place_id=ids, picture=pictures)
+    def forget_look(self, place_id: str, picture: str) -> None:
+        name = shown(picture).digest[:16]
+        self.agree(
+            lambda model: model.forget_look(place_id, name), lambda lab: lab.forget_look(place_id, name)
+        )
+
+    @rule(run=st.sampled_from(["night", "snow"]))
+    def forget_learnt(self, run: str) -> None:
+        self.agree(lambda model: model.forget_learnt(run), lambda lab: lab.forget_learnt(run))
 
     @rule(place_id=ids)
     def forget(self, place_id: str) -> None:
@@ -333,7 +356,8 @@ class StoreContract(RuleBasedStateMachine):
         ((rows, products),) = scope.search(asked[np.newaxis])
         found = [place and place.id for place in self.map.places_at(rows.tolist())]
         allowed = self._allowed(selection)
-        assert sorted(str(name) for name in found) == sorted(allowed)
+        looks = {name: 1 + len(self.model.places[name].looks) for name in allowed}
+        assert sorted(str(name) for name in found) == sorted(name for name in allowed for _ in range(looks[name]))
         exact = scope.snapshot.descriptors_at(rows) @ asked
         assert np.allclose(products, exact, atol=1e-5) and (np.diff(products) <= 0).all()
         assert scope.weights_at(rows) is None
@@ -350,7 +374,8 @@ class StoreContract(RuleBasedStateMachine):
         scope = self.map.scope(Selection(prior=Conditions(sequences=(sequence,)), trust=trust))
         ((rows, _),) = scope.search(descriptor_of("picture 0")[np.newaxis])
         weights, places = scope.weights_at(rows), self.map.places_at(rows.tolist())
-        assert weights is not None and len(rows) == len(self.model.places)
+        looks = sum(len(place.looks) for place in self.model.places.values())
+        assert weights is not None and len(rows) == len(self.model.places) + looks
         expected = [0.0 if place and place.sequence == sequence else np.log(1 - trust) for place in places]
         assert np.allclose(weights, expected)
 
@@ -375,7 +400,7 @@ class StoreContract(RuleBasedStateMachine):
         assert [record.id for record in self.store.records(None, 10)[0]] == [MAP]
         assert lab.record.revision == expected["revision"] and lab.count_places() == len(expected["places"])
         found = _places(lab)
-        wanted = [{name: place[name] for name in found[0]} for place in expected["places"]] if found else []
+        wanted = [_without(place, "found_first") for place in expected["places"]]
         assert len(found) == len(expected["places"])
         assert not (wrong := differences(wanted, found)), "\n".join(wrong)
         self.model.told(found)
@@ -405,6 +430,15 @@ class StoreContract(RuleBasedStateMachine):
             and _has(place, filters.metadata)
             and all(_holds(one, place) for one in filters.geometry)
         ]
+
+
+def _without(content: Any, name: str) -> Any:
+    """A place as the model has it, without a value that is not compared, also of its looks."""
+    if isinstance(content, list):
+        return [_without(one, name) for one in content]
+    if isinstance(content, dict):
+        return {key: _without(value, name) for key, value in content.items() if key != name}
+    return content
 
 
 def _has(place: PlaceModel, where: Any) -> bool:
@@ -439,14 +473,18 @@ def _track(where: Whereabouts, at: int, names: Mapping[int, str | None]) -> list
 
 def _places(lab: Map) -> list[dict[str, Any]]:
     """All places of a map, as the model has them."""
-    outline, snapshot = lab.transfer.outline(), lab.snapshot()
-    assert len(snapshot) == len(outline)
+    every, snapshot = lab.transfer.outline(looks=True), lab.snapshot()
+    assert len(snapshot) == len(every)
+    outline = lab.transfer.outline()
+    assert outline == [one for one in every if not one.is_look]
+    looks = _other_looks(lab, every)
     rows = np.array([place.row for place in outline], np.int64)
     listed, cursor = lab.places(None, 1000)
     assert cursor is None and [place.id for place in listed] == [place.id for place in outline]
     assert lab.places_at(rows.tolist()) == listed == [lab.place(place.id) for place in outline]
     assert lab.rows_of([place.id for place in outline]) == rows.tolist()
-    assert np.flatnonzero(snapshot.alive).tolist() == sorted(rows.tolist()) and snapshot.rows > max(rows, default=-1)
+    living = sorted(one.row for one in every)
+    assert np.flatnonzero(snapshot.alive).tolist() == living and snapshot.rows > max(living, default=-1)
     descriptors, local, where = snapshot.descriptors_at(rows), snapshot.locals_at(rows), snapshot.whereabouts_at(rows)
     keypoints = lab.keypoints_at(rows.tolist())
     names = {int(where.sequence[at]): place.sequence for at, place in enumerate(outline)}
@@ -466,6 +504,33 @@ def _places(lab: Map) -> list[dict[str, Any]]:
             "keypoints": None if (of_frame := keypoints[at]) is None else sha(of_frame.record()),
             "descriptor": sha(descriptors[at].tobytes()),
             "local": sha(local[at].tobytes()),
+            "other_looks": looks[place.id],
         }
         for at, place in enumerate(listed)
     ]
+
+
+def _other_looks(lab: Map, every: Sequence[Outline]) -> dict[str, list[dict[str, Any]]]:
+    """The looks of all places besides their first, as the model has them; they are where their places are."""
+    rows, snapshot = {one.id: one.row for one in every}, lab.snapshot()
+    found: dict[str, list[dict[str, Any]]] = {one.id: [] for one in every if not one.is_look}
+    for place_id, looks in found.items():
+        for look in lab.looks(place_id):
+            address = look_address(place_id, look.name)
+            row = np.array([rows[address]])
+            where = snapshot.whereabouts_at(np.array([rows[address], rows[place_id]]))
+            assert all((column[0] == column[1]).all() or (column != column).all() for column in vars(where).values())
+            (shown_by,), (keypoints,) = lab.places_at(row.tolist()), lab.keypoints_at(row.tolist())
+            changes = {"look": look.name, **{name: getattr(look, name) for name in ("camera", "regions", "picture")}}
+            moments = {name: getattr(shown_by, name) for name in ("created_at", "updated_at")}
+            assert shown_by == lab.place(place_id).model_copy(update=changes | moments)
+            picture = lab.picture(address)
+            looks.append({
+                **look.model_dump(mode="json"),
+                "kept": None if picture is None else sha(picture),
+                "keypoints": None if keypoints is None else sha(keypoints.record()),
+                "descriptor": sha(snapshot.descriptors_at(row)[0].tobytes()),
+                "local": sha(snapshot.locals_at(row)[0].tobytes()),
+            })  # fmt: skip
+    assert sum(map(len, found.values())) == sum(one.is_look for one in every)
+    return found

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.maps.views import ABOUT, SAME, LatestViews, Look, latest_views, likeness, shows_same
+from core.maps.views import ABOUT, SAME, LatestViews, ViewedFrame, latest_views, likeness, shows_same
 from core.places import Pose
 
 CELLS, VALUES = 40, 24
@@ -19,9 +19,9 @@ def cells(seed: int) -> NDArray[np.float64]:
     return np.random.default_rng(seed).normal(0, 30, (CELLS, VALUES))
 
 
-def look(seen: NDArray[np.float64], noise: float = 0.0, seed: int = 0) -> Look:
+def look(seen: NDArray[np.float64], noise: float = 0.0, seed: int = 0) -> ViewedFrame:
     noisy = seen + np.random.default_rng(seed).normal(0, noise, seen.shape) if noise else seen
-    return Look(np.ones(4, np.float32), np.clip(np.rint(noisy), -127, 127).astype(np.int8))
+    return ViewedFrame(np.ones(4, np.float32), np.clip(np.rint(noisy), -127, 127).astype(np.int8))
 
 
 def between(one: int, other: int, share: float) -> NDArray[np.float64]:
@@ -29,7 +29,7 @@ def between(one: int, other: int, share: float) -> NDArray[np.float64]:
     return np.sqrt(1 - share) * cells(one) + np.sqrt(share) * cells(other)
 
 
-def positions(looks: list[Look], hidden: int = 3) -> list[int]:
+def positions(looks: list[ViewedFrame], hidden: int = 3) -> list[int]:
     """The positions that the frames of a traverse get."""
     views, found, end = LatestViews(None, {}, hidden), [], 0
     for one in looks:
@@ -59,7 +59,7 @@ def test_hidden_cells_do_not_count() -> None:
 
 
 def test_without_cells_descriptors_tell() -> None:
-    one, near, far = (Look(np.array(values, np.float32), NO_CELLS) for values in ([1, 0], [1, 0.2], [0.3, 1]))
+    one, near, far = (ViewedFrame(np.array(values, np.float32), NO_CELLS) for values in ([1, 0], [1, 0.2], [0.3, 1]))
     assert shows_same(one, near)
     assert not shows_same(one, far, about=True)
 
@@ -118,7 +118,7 @@ def test_the_end_of_a_sequence_is_read_by_row() -> None:
 
 
 def test_poses_decide_before_looks_do() -> None:
-    def at(x: float | None) -> Look:
+    def at(x: float | None) -> ViewedFrame:
         return dataclasses.replace(look(cells(1)), pose=None if x is None else Pose(x=x, y=0.0))
 
     views = LatestViews((4, at(0.0)), {3: at(100.0), 4: at(0.0)}, 3, 15.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from core.errors import RevisionMismatch
 from core.maps import PlaceFilter, Store
-from core.maps.views import Look, shows_same
+from core.maps.views import ViewedFrame, shows_same
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 
 BATCHES = 8
@@ -36,9 +36,9 @@ def check_writers_lose_nothing(store: Store, others: Sequence[Store]) -> None:
     listed, _ = lab.places(None, 100, PlaceFilter(sequence="shared"))
     assert {place.id for place in listed} == {f"w{which}-{number}" for which in writers for number in range(BATCHES)}
     outline = lab.transfer.outline()
-    first: dict[int, Look] = {}  # what the first frame at each position shows; other frames there show it, too
+    first: dict[int, ViewedFrame] = {}  # what the first frame at each position shows; other frames there show it, too
     for place in sorted((place for place in outline if place.sequence == "shared"), key=lambda place: place.ordinal):
-        look = Look(descriptor_of(place.id), local_of(place.id))
+        look = ViewedFrame(descriptor_of(place.id), local_of(place.id))
         assert place.ordinal == len(first) or shows_same(look, first[place.ordinal], about=True)
         first.setdefault(place.ordinal, look)
     written = BATCHES * len(others)

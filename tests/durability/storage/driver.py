@@ -133,6 +133,17 @@ class Storage:
         digests = {place_id: map_.digest(place_id) or b"" for place_id in operation["ids"]}
         return {"answer": map_.transfer.forget(digests)}
 
+    def _looks(self, operation: Operation) -> Answer:
+        items = [look_enrolment(**item) for item in operation["items"]]
+        done = self._atlas.get(operation["map"]).enrol(items)
+        return {"answer": [change for _, change in done]}
+
+    def _forget_look(self, operation: Operation) -> None:
+        self._atlas.get(operation["map"]).forget_look(operation["id"], operation["look"])
+
+    def _forget_learnt(self, operation: Operation) -> Answer:
+        return {"answer": self._atlas.get(operation["map"]).forget_learnt(operation["run"])}
+
     def _edit(self, operation: Operation) -> Answer:
         return {"answer": self._atlas.get(operation["map"]).edit(operation["changes"]).revision}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from random import Random
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from core.maps import Enrolment, MapSettings
 from core.maps.records import Precision
-from core.places import PlaceFields
+from core.places import PlaceFields, look_address
 from core.storage.files.row_formats import pack_descriptors, pack_local, unpack_descriptors, unpack_local
 from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, keypoints_of, local_of
 from tests.durability.contents import sha
@@ -57,6 +58,12 @@ def shown(picture: str) -> Shown:
         local={name: sha(found[0].tobytes()) for name, found in local.items()},
         keypoints=sha(keypoints_of(picture).record()),
     )
+
+
+def look_enrolment(place: str, picture: str, seen: Any, camera: str | None, run: str | None, keypoints: bool) -> Enrolment:
+    """A picture as it is added to the looks of a place."""
+    item = enrolment(place, picture, {"timestamp": seen, "camera": camera}, keypoints)
+    return replace(item, id=look_address(place, item.digest.hex()[:16]), run=run)
 
 
 def enrolment(id: str, picture: str, fields: dict[str, Any], keypoints: bool) -> Enrolment:
@@ -118,6 +125,15 @@ def _enrol(world: World, operation: Operation) -> list[str]:
     ]
 
 
+def _looks(world: World, operation: Operation) -> list[str]:
+    map_ = _map(world, operation["map"])
+    return [
+        map_.add_look(item["place"], of := shown(item["picture"]), item["seen"], item["camera"], item["run"],
+                      of.keypoints if item["keypoints"] else None)
+        for item in operation["items"]
+    ]  # fmt: skip
+
+
 def _adopt(world: World, operation: Operation) -> None:
     source, target = _map(world, operation["from"]), world[operation["map"]]
     for place_id, ordinal in operation["places"]:
@@ -173,6 +189,9 @@ _APPLIED: dict[str, Callable[[World, Operation], Any]] = {
     "forget": lambda world, o: _map(world, o["map"]).forget(o["id"]),
     "forget-sequence": lambda world, o: _map(world, o["map"]).forget_sequence(o["name"]),
     "forget-many": _forget_many,
+    "looks": _looks,
+    "forget-look": lambda world, o: _map(world, o["map"]).forget_look(o["id"], o["look"]),
+    "forget-learnt": lambda world, o: _map(world, o["map"]).forget_learnt(o["run"]),
     "edit": lambda world, o: _map(world, o["map"]).edit(o["changes"]),
     "keypoints": lambda world, o: _map(world, o["map"]).fill_in(o["limit"]),
     "counterparts": _counterparts,
@@ -207,8 +226,8 @@ def chosen(random: Random, world: World, prefix: str) -> Operation:
     if len(map_.places) > LARGEST_MAP and random.random() < 0.5:
         return {"do": "delete", "map": name}
     kinds = ("enrol", "enrol", "enrol", "batch", "batch", "fields", "patch", "forget", "sequence", "many", "edit",
-             "keypoints", "counterparts", "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
-    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 2, 3, 2, 3, 0.7, 4, 0.5)
+             "looks", "unlook", "keypoints", "counterparts", "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
+    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 8, 2, 2, 3, 2, 3, 0.7, 4, 0.5)
     kind = random.choices(kinds, weights)[0]
     return _CHOSEN[kind](random, world, name, listed) or _batch(random, world, name, listed)
 
@@ -302,6 +321,29 @@ def _many(random: Random, world: World, name: str, listed: list[str]) -> Operati
     return {"do": "forget-many", "map": name, "ids": random.sample(known, min(len(known), random.randrange(1, 6)))}
 
 
+def _added_looks(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    items = [
+        {
+            "place": _any_id(random, world[name]),
+            "picture": f"picture {random.randrange(PICTURES)}",
+            "seen": random.choice([None, "2026-12-01T22:00:00Z"]),
+            "camera": random.choice([None, None, "front"]),
+            "run": random.choice([None, "monday night", "tuesday night"]),
+            "keypoints": random.random() < 0.7,
+        }
+        for _ in range(random.randrange(1, 4))
+    ]
+    return {"do": "looks", "map": name, "items": items}
+
+
+def _removed_looks(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    there = [(place_id, look) for place_id, place in world[name].places.items() for look in place.looks]
+    if not there or random.random() < 0.3:
+        return {"do": "forget-learnt", "map": name, "run": random.choice(["monday night", "tuesday night", "never"])}
+    place_id, look = random.choice(there)
+    return {"do": "forget-look", "map": name, "id": place_id, "look": look}
+
+
 def _edited(random: Random, world: World, name: str, listed: list[str]) -> Operation:
     changes: dict[str, Any] = random.choice([
         {"description": f"number {random.randrange(1000)}"},
@@ -358,6 +400,8 @@ _CHOSEN: dict[str, _Chosen] = {
     "forget": _forgotten,
     "sequence": _sequence,
     "many": _many,
+    "looks": _added_looks,
+    "unlook": _removed_looks,
     "edit": _edited,
     "keypoints": _filled_in,
     "counterparts": _counterpart,

@@ -90,7 +90,7 @@ def test_a_changed_value_of_a_place_is_noticed(full: MemoryMap) -> None:
             assert len(found) == 1 and (found == [f"p{row}"] or column == "id"), column
             if column != "sequence":  # else there is no such sequence, which is noticed in another way
                 with pytest.raises(DamagedRow, match="does not match its checksum"):
-                    places.listed(connection, -1, 10)
+                    places.listed_with_looks(connection, -1, 10)
     with full._reading() as connection:
         assert places.unsound(connection) == [] and len(places.listed(connection, -1, 10)) == 2
 
