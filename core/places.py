@@ -79,8 +79,19 @@ def check_address(text: str) -> str:
     """
     place_id, slash, look = text.partition("/")
     check_place_id(place_id)
-    if slash and not re.fullmatch(LOOK, look):
-        raise InvalidIdentifier(f"{look[:140]!a} cannot name a look: a name has 16 hexadecimal digits in small letters.")
+    if slash:
+        check_look(look)
+    return text
+
+
+def check_look(text: str) -> str:
+    """Return ``text`` if it can be the name of a look.
+
+    Raises:
+        InvalidIdentifier: it cannot.
+    """
+    if not re.fullmatch(LOOK, text):
+        raise InvalidIdentifier(f"{text[:140]!a} cannot name a look: a name has 16 hexadecimal digits in lower case.")
     return text
 
 

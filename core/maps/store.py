@@ -339,8 +339,9 @@ class Map(Protocol):
     def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
         """Store frames as places, or as looks of places, in the order given, all of them or, if this raises, none.
 
-        A place whose frame is replaced loses the looks that were learnt from runs.  An id that exists keeps its place and creation time: if the frame's digest is the same, only its fields are
-        stored (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
+        An id that exists keeps its place and creation time: if the frame's digest is the same, only its fields are
+        stored (``unchanged``, ``updated``), otherwise its frame is ``replaced``, and the looks that the place learnt
+        from runs are gone.  An id may occur twice.
 
         Returns:
             The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame.
@@ -388,6 +389,18 @@ class Map(Protocol):
 
         Raises:
             UnknownPlace: there is no such place.
+        """
+
+    def all_looks(
+        self, cursor: str | None, limit: int, run: str | None = None
+    ) -> tuple[list[tuple[str, Look]], str | None]:
+        """A page of the looks of all places, each with the id of its place, in the order in which they were added.
+
+        Args:
+            run: only those that were learnt from it; None: all.
+
+        Raises:
+            InvalidCursor.
         """
 
     def forget_look(self, place_id: str, look: str) -> None:

@@ -121,7 +121,11 @@ class LatestViews:
     """
 
     def __init__(
-        self, last: tuple[int, ViewedFrame] | None, first: Mapping[int, ViewedFrame], positions: int, reach: float = math.inf
+        self,
+        last: tuple[int, ViewedFrame] | None,
+        first: Mapping[int, ViewedFrame],
+        positions: int,
+        reach: float = math.inf,
     ) -> None:
         self._last, self._first, self._positions, self._reach = last, dict(first), positions, reach
 
@@ -167,7 +171,9 @@ def latest_views(
     return LatestViews((last[0], shown[0]), dict(zip(first, shown[1:], strict=True)), positions, reach)
 
 
-def leaves_view(pose: Pose | None, look: ViewedFrame | None, first: ViewedFrame, beside: Sequence[ViewedFrame], reach: float) -> bool:
+def leaves_view(
+    pose: Pose | None, look: ViewedFrame | None, first: ViewedFrame, beside: Sequence[ViewedFrame], reach: float
+) -> bool:
     """Whether a frame that was changed does not belong to its position in its sequence any more.
 
     It keeps its position, even if it shows something else now, so that a stop whose frames are enrolled again one after

@@ -33,7 +33,15 @@ from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
 from core.recognition.question import Query, Question
-from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, no_candidates, rank_places
+from core.recognition.stages import (
+    Candidates,
+    Positions,
+    calibration_of,
+    likeness,
+    neighborhood_of,
+    no_candidates,
+    rank_places,
+)
 from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, sightings, third_stage
 
 ATTEMPTS = 3
@@ -62,7 +70,7 @@ class Answer:
     """The answer to one query.
 
     judgement: the verdict, with the values that it rests on.
-    matches: score and place of the best matches, best first; at most k.
+    matches: score and place of the best matches, best first, each place once; at most k.
     weights: the prior weight of each match, in (0, 1]; None if the query had no prior.
     calibration: the calibration by which the query was judged.
     search: milliseconds spent on the first two stages of the search, the judgement and the look-up of the places; for
@@ -71,7 +79,7 @@ class Answer:
         where they were verified; None if they have none.
     note: why the camera's intrinsics were not used for the pose; None if they were, or if there are none.
     encoding: the encoded query.
-    candidates: the best places of the ranking; the matches are the first of them.
+    candidates: the best places of the ranking; the matches are the first of them, less further looks of these places.
     third_stage: whether the candidates were verified geometrically.
     rivals: the groups of places that make an answer ambiguous, the places of each group best first.
     """
@@ -264,7 +272,7 @@ def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -
     k, judged = query.question.k, partial(judgement_of, map_, encoder)
     ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
     attempt = 1
-    while None in (places := _places(map_, ranked, k)) and attempt < ATTEMPTS:
+    while None in (places := places_of(map_, ranked.rows, k)) and attempt < ATTEMPTS:
         (candidates,) = rank_places(map_, encoder, [query.encoding], query.question.selection)
         ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
         attempt += 1
@@ -277,8 +285,31 @@ def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -
     return _put_together(map_, encoder, query, ranked, found, judgement, stage)
 
 
-def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
-    return map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
+def places_of(map_: Map, rows: Positions, k: int) -> list[Place | None]:
+    """The places of the first of some rows, int64 [n], until they are ``k`` different ones; None for one that is gone.
+
+    Of a place that has looks further rows may be among them.
+    """
+    found: list[Place | None] = []
+    while len(found) < len(rows) and _different(found) < k:
+        found += map_.places_at(rows[len(found) : len(found) + k].tolist())
+    while found and _different(found[:-1]) >= k:
+        found.pop()
+    return found
+
+
+def _different(places: Sequence[Place | None]) -> int:
+    """How many places there are if looks of one count once."""
+    return len({place.id for place in places if place is not None}) + sum(place is None for place in places)
+
+
+def first_looks(places: Sequence[Place | None]) -> list[int]:
+    """The positions at which a place is for the first time."""
+    first: dict[str, int] = {}
+    for position, place in enumerate(places):
+        if place is not None:
+            first.setdefault(place.id, position)
+    return list(first.values())
 
 
 def _put_together(
@@ -292,7 +323,8 @@ def _put_together(
 ) -> Answer:
     """The answer by the judged candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
-    matches = [(float(score), place) for score, place in zip(candidates.final_scores, places, strict=False)]
+    listed = first_looks(places)
+    matches = [(float(candidates.final_scores[position]), places[position]) for position in listed]
     if matches:
         judgement = replace(judgement, score=matches[0][0])
     log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
@@ -303,8 +335,10 @@ def _put_together(
         views, note = relative_views(map_, candidates, stage, query.verifier)
         shared = sightings(map_, candidates, stage, query.verifier)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views, sightings=shared)
-    weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     rivals = rival_places(map_, candidates, judgement)
+    if len(listed) < len(places):
+        candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))
+    weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
 
 
@@ -313,7 +347,7 @@ def rival_places(map_: Map, candidates: Candidates, judgement: Judgement) -> tup
     groups = []
     for group in judgement.rivals:
         places = map_.places_at(candidates.rows[list(group.positions)].tolist())
-        ids = tuple(place.id for place in places if place is not None)
+        ids = tuple(dict.fromkeys(place.id for place in places if place is not None))
         if ids:
             groups.append(RivalPlaces(ids, float(candidates.final_scores[group.positions[0]]), group.same_place))
     return tuple(groups)

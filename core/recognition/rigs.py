@@ -16,7 +16,7 @@ from core.judgement.priors import decision_slope
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.question import Query
-from core.recognition.recognition import ATTEMPTS, Answer, judgement_of, locate, rival_places
+from core.recognition.recognition import ATTEMPTS, Answer, first_looks, judgement_of, locate, places_of, rival_places
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
 from core.recognition.verification import ThirdStage, VerificationState, third_stage
 
@@ -56,11 +56,11 @@ def locate_rig(
             for one in finals
         ]
         fused = fuse(views, calibration, neighborhood)
-        places = map_.places_at(fused.rows[: question.k].tolist())
+        places = places_of(map_, fused.rows, question.k)
         if None not in places:
             break
     # A place that is deleted all the same is not listed; the verdict holds unless it was the best one.
-    retained = [position for position, place in enumerate(places) if place is not None]
+    retained = first_looks(places)
     judgement = (
         fused.judgement if retained[:1] == [0] else replace(fused.judgement, verdict="unknown", probability=None)
     )
@@ -71,6 +71,8 @@ def locate_rig(
     weights = None if ranked[0].weights is None else np.exp(fused.weights[retained]).tolist()
     pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
     rivals = rival_places(map_, candidates, judgement)
+    if len(retained) < len(places):
+        candidates = candidates.take(np.append(retained, np.arange(len(places), len(candidates.rows))))
     milliseconds = 1e3 * (time.perf_counter() - began) - stage.milliseconds
     return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates, stage, rivals)
 

@@ -38,7 +38,7 @@ from service.jobs import routes as jobs
 from service.maps import calibration, calibration_preview, camera_routes, event_routes, transfer_routes
 from service.maps import routes as maps
 from service.maps.schemas import CalibrationOrder
-from service.places import plan_routes
+from service.places import looks, plan_routes
 from service.places import routes as places
 from service.places.parameters import BatchItem
 from service.queries import answer_routes, loop_closure, multi_map_routes
@@ -101,6 +101,7 @@ ROUTERS = (
     maps.router,
     places.router,
     places.traverses,
+    looks.router,
     plan_routes.router,
     camera_routes.router,
     event_routes.router,

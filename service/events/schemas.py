@@ -90,7 +90,10 @@ class EnrolmentEvent(Event):
     kind: ClassVar[EventKind] = "enrolment"
 
     operation: str | None = Field(description="The operation that was called, such as enrol_place.")
-    changes: dict[str, int] = Field(description="How many places were created, updated, replaced, unchanged, deleted.")
+    changes: dict[str, int] = Field(
+        description="How many places were created, updated, replaced, unchanged, deleted; `look-added` and "
+        "`look-removed` count looks."
+    )
     places: list[ChangedPlace] = Field(default_factory=list, description="The first of those that changed.")
     sequence: str | None = Field(default=None, description="The traverse that was deleted as a whole.")
     total: int = Field(description="How many places the map has now.")

@@ -19,14 +19,18 @@ def tell_enrolment(engine: Engine, map_: Map, stored: Sequence[tuple[Place, Chan
     """Tell the listeners of a map, if it has any, which places of one commit were created or changed."""
     if not engine.events.heard(map_.record.id):
         return
-    changed = [(place, change) for place, change in stored if change != "unchanged"]
+    changed = [
+        (place, change if place.look is None else "look-added") for place, change in stored if change != "unchanged"
+    ]
     if not changed:
         return
     listed = [
         ChangedPlace(id=place.id, change=change, sequence=place.sequence, pose=place.pose, camera=place.camera)
         for place, change in changed[:MOST_LISTED]
     ]
-    _tell(engine, map_, dict(Counter(change for _, change in stored)), listed)
+    unchanged = len(stored) - len(changed)
+    counts = Counter(change for _, change in changed) + Counter({"unchanged": unchanged})
+    _tell(engine, map_, dict(counts), listed)
 
 
 def tell_change(engine: Engine, map_: Map, change: str, count: int, sequence: str | None = None) -> None:

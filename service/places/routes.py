@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
@@ -102,6 +102,11 @@ BATCH_BODY = form_body(
     },
     ["places"],
 )
+
+
+THUMBNAIL: dict[int | str, dict[str, Any]] = {
+    200: {"description": "A small JPEG.", "content": {"image/jpeg": {"schema": {"type": "string"}}}}
+}
 
 
 @router.put(
@@ -313,10 +318,7 @@ def delete_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
 @router.get(
     "/{place}/thumbnail",
     response_class=Response,
-    responses={
-        200: {"description": "A small JPEG.", "content": {"image/jpeg": {"schema": {"type": "string"}}}},
-        **problem_documentation(errors.UnknownPlace, errors.NoThumbnail),
-    },
+    responses={**THUMBNAIL, **problem_documentation(errors.UnknownPlace, errors.NoThumbnail)},
 )
 def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Response:
     """The thumbnail of a place, or a thumbnail of the image that the map keeps."""

@@ -30,7 +30,7 @@ ShownPose = Annotated[Pose, PlainSerializer(lambda pose: pose.model_dump(exclude
 
 
 class PlaceView(BaseModel):
-    """One enrolled reference frame."""
+    """One enrolled place."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [PLACE_EXAMPLE]})
 
@@ -43,6 +43,15 @@ class PlaceView(BaseModel):
     metadata: dict[str, Any]
     regions: int = Field(description="Regions of interest found in the frame.")
     picture: Keep = Field(description="The picture that is stored of the frame.")
+    look: str | None = Field(
+        default=None,
+        exclude_if=lambda name: name is None,
+        description="In a match: the look whose frame it is, with its camera, regions and picture; left out for the "
+        "frame with which the place was enrolled.",
+    )
+    looks: int = Field(
+        default=0, exclude_if=lambda count: count == 0, description="How many looks it has besides its first."
+    )
     created_at: Timestamp
     updated_at: Timestamp
 

@@ -17,7 +17,7 @@ from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
-from core.places import Place
+from core.places import Place, look_address
 from core.recognition.recognition import Answer
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
@@ -62,8 +62,9 @@ async def explain_match(
         QueueFull, EncoderNotInstalled: the picture cannot be encoded.
         Others: see ``EncoderQueue.encode``.
     """
-    place_id = answer.matches[0][1].id
-    found = await in_thread(_stored_place, map_, place_id)
+    match_place = answer.matches[0][1]
+    place_id, look = match_place.id, match_place.look
+    found = await in_thread(_stored_place, map_, place_id if look is None else look_address(place_id, look))
     if found is None:
         return None
     inliers = _inliers(answer)
@@ -100,7 +101,11 @@ def _inliers(answer: Answer) -> list[KeypointPair]:
 
 
 def _stored_place(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | None:
-    """The descriptors, the fields and the picture (or None) that a map stores of a place; None if the place is gone."""
+    """The descriptors, the fields and the picture (or None) that a map stores of a place or a look; None: it is gone.
+
+    Args:
+        place_id: its id; of a look its address.
+    """
     snapshot = map_.snapshot()
     (row,) = map_.rows_of([place_id])
     if row is None or row >= snapshot.rows:

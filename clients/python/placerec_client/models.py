@@ -11,6 +11,22 @@ from pydantic import Field
 from placerec_client.model import Known, Model
 
 
+class AddedLook(Model):
+    """A look after a POST."""
+
+    name: str
+    timestamp: datetime | None = None
+    camera: str | None = None
+    run: str | None = None
+    regions: int
+    picture: Known[Literal["none", "thumbnail", "image"]]
+    created_at: datetime
+    place: str
+    change: Known[Literal["created", "unchanged", "updated", "replaced"]]
+    encoder: str
+    milliseconds: dict[str, float]
+
+
 class AgreementDefinition(Model):
     """The second stage of an encoder. ``layers`` share one grid; ``values`` of each are retained, and its cosine
     counts by its ``weights``. ``reach`` is how far a cell may have moved, in rows and columns. ``candidates`` are
@@ -167,7 +183,7 @@ class Pose(Model):
 
 
 class PlaceView(Model):
-    """One enrolled reference frame."""
+    """One enrolled place."""
 
     id: str
     pose: Pose | None = None
@@ -178,6 +194,8 @@ class PlaceView(Model):
     metadata: dict[str, Any]
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
+    look: str | None = None
+    looks: int = 0
     created_at: datetime
     updated_at: datetime
 
@@ -721,6 +739,8 @@ class EnrolledPlace(Model):
     metadata: dict[str, Any]
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
+    look: str | None = None
+    looks: int = 0
     created_at: datetime
     updated_at: datetime
     change: Known[Literal["created", "unchanged", "updated", "replaced"]]
@@ -928,6 +948,26 @@ class Layer(Model):
     name: str
     rows: int
     columns: int
+
+
+class LookView(Model):
+    """A look of a place beside its first."""
+
+    name: str
+    timestamp: datetime | None = None
+    camera: str | None = None
+    run: str | None = None
+    regions: int
+    picture: Known[Literal["none", "thumbnail", "image"]]
+    created_at: datetime
+    place: str
+
+
+class LookPage(Model):
+    """Looks in the order in which they were added."""
+
+    items: list[LookView]
+    next_cursor: str | None = None
 
 
 class MapAnswer(Model):
@@ -1250,6 +1290,13 @@ class RegionsView(Model):
     found: int
     regions: list[Region]
     milliseconds: dict[str, float]
+
+
+class RemovedLooks(Model):
+    """Looks that were removed together."""
+
+    run: str
+    looks: int
 
 
 class RequestsState(Model):

@@ -280,6 +280,33 @@ class ListSequences(TypedDict, total=False):
     """Most items on a page."""
 
 
+class AddLook(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places/{place}/looks``."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class ListAllLooks(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/looks``."""
+
+    limit: int
+    """Most items on a page."""
+
+    run: str | None
+    """Only those that were learnt from this run."""
+
+
+class DeleteLearntLooks(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/looks``."""
+
+
 class ReadPlan(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/plan``."""
 

@@ -44,7 +44,7 @@ from core.maps.records import (
     patched_fields,
     patched_record,
 )
-from core.places import Look, Place, PlaceFields, look_address
+from core.places import Look, Place, PlaceFields, look_address, place_and_look
 
 
 class LedgerMap(ABC):
@@ -285,6 +285,24 @@ class LedgerMap(ABC):
         """
         with self._reading() as connection:
             return [one.look() for one in places.looks_of(connection, places.expect(connection, place_id))]
+
+    def all_looks(
+        self, cursor: str | None, limit: int, run: str | None = None
+    ) -> tuple[list[tuple[str, Look]], str | None]:
+        """A page of the looks of all places, each with the id of its place, in the order in which they were added.
+
+        Args:
+            run: only those that were learnt from it.
+
+        Raises:
+            InvalidCursor.
+        """
+        listing: Listing = ["looks", self.record.id, run]
+        after = decode_number(listing, cursor)
+        with self._reading() as connection:
+            found = places.looks_after(connection, after, one_more(limit), run)
+        page, more = page_of(listing, found, limit, lambda stored: stored.number)
+        return [(place_and_look(stored.place.id)[0], stored.look()) for stored in page], more
 
     def forget_look(self, place_id: str, look: str) -> None:
         """Delete a look of a place.

@@ -34,7 +34,6 @@ from core.places import (
     PlaceFields,
     Pose,
     Whereabouts,
-    look_address,
     microseconds,
     place_and_look,
 )
@@ -59,9 +58,11 @@ _BY_ID = Statement(_STORED.where(_P.id == bindparam("id")))
 _BY_IDS = Statement(_STORED.where(among(_P.id, "ids")))
 _BY_ROWS = Statement(_STORED.where(among(_P.row, "rows")))
 _LOOKS_OF = Statement(_STORED.where(_P.look_of == bindparam("place")).order_by(_P.number))
-_LEARNT_FROM = Statement(
-    _STORED.where(_P.look_of.is_not(None), _P.run == bindparam("run")).order_by(_P.number)
+_SOME_LOOKS = (
+    _STORED.where(_P.look_of.is_not(None), _P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most"))
 )
+_LOOKS = Statement(_SOME_LOOKS)
+_LEARNT_FROM = Statement(_SOME_LOOKS.where(_P.run == bindparam("run")))
 _BY_KEYS = Statement(_WHOLE.where(among(_P.key, "keys")))  # keys are those of one map
 _ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
 _NUMBERS_OF = Statement(select(_P.id, _P.number).where(_P.map == bindparam("map"), among(_P.id, "ids")))
@@ -95,9 +96,7 @@ _ROWS_WITH = Statement(select(joined(_T.row)).where(_T.map == bindparam("map"), 
 _ROWS_WITH_AMONG = Statement(
     select(joined(_T.row)).where(_T.map == bindparam("map"), _T.token == bindparam("token"), among(_T.row, "rows"))
 )
-_WITH_LOOKS = Statement(
-    _STORED.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most"))
-)
+_WITH_LOOKS = Statement(_STORED.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 _OUTLINES = Statement(
     select(_P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at, _P.run)
     .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
@@ -109,13 +108,13 @@ _STATIONS = Statement(
     .where(_P.map == bindparam("map"), _IS_PLACE)
     .order_by(_P.number)
 )
-_HANDED_OVER = Statement(select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _IS_PLACE, _P.pose_of.is_not(None)))
+_HANDED_OVER = Statement(
+    select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _IS_PLACE, _P.pose_of.is_not(None))
+)
 _WITHOUT_IMAGE = Statement(
     select(func.count()).select_from(PLACES).where(_P.map == bindparam("map"), _P.picture != "image")
 )
-_COUNT = Statement(
-    select(func.count(), func.count(_P.look_of)).select_from(PLACES).where(_P.map == bindparam("map"))
-)
+_COUNT = Statement(select(func.count(), func.count(_P.look_of)).select_from(PLACES).where(_P.map == bindparam("map")))
 _CHECKSUMS = Statement(select(_P.row, _P.id, _P.checksum).where(_P.map == bindparam("map")))
 _PICTURED = Statement(
     select(_P.id, _P.row, _P.picture, _P.digest, _P.camera).where(_P.map == bindparam("map")).order_by(_P.number)
@@ -194,7 +193,9 @@ class StoredPlace:
 
     def of_frame(self) -> Place:
         """The place as its frame was enrolled: the time of a look is that of its own frame."""
-        return self.place if self.look_of is None else self.place.model_copy(update={"timestamp": self.look().timestamp})
+        if self.look_of is None:
+            return self.place
+        return self.place.model_copy(update={"timestamp": self.look().timestamp})
 
 
 def _stored(values: Sequence[Any]) -> StoredPlace:
@@ -287,7 +288,16 @@ def looks_of(connection: MapConnection, stored: StoredPlace) -> list[StoredPlace
 
 def learnt_from(connection: MapConnection, run: str) -> list[StoredPlace]:
     """The looks that were learnt from a run."""
-    return [_stored(values) for values in connection.execute(_LEARNT_FROM, run=run)]
+    return looks_after(connection, -1, 1 << 62, run)
+
+
+def looks_after(connection: MapConnection, after: int, limit: int, run: str | None) -> list[StoredPlace]:
+    """Up to ``limit`` looks behind number ``after``, of any run or of one, in the order in which they were added."""
+    if run is None:
+        found = connection.execute(_LOOKS, after=after, most=limit)
+    else:
+        found = connection.execute(_LEARNT_FROM, after=after, most=limit, run=run)
+    return [_stored(values) for values in found]
 
 
 def numbers_of(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, int]:
@@ -436,6 +446,15 @@ def with_fields(stored: StoredPlace, fields: PlaceFields, now: datetime) -> Stor
     if fields.pose != stored.place.pose:
         columns["pose_of"] = None
     return _from_columns(columns, fields.sequence)
+
+
+def as_look(stored: StoredPlace, place: StoredPlace) -> StoredPlace:
+    """A look with all that it shares with its place."""
+    of, shared = place.place, ("pose", "pose_of", "timestamp", "sequence", "metadata", "looks")
+    return replace(
+        with_place(stored, **{name: getattr(of, name) for name in shared}),
+        sequence=place.sequence, ordinal=place.ordinal, track=place.track, station=place.station, look_of=place.number,
+    )  # fmt: skip
 
 
 def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:

@@ -61,10 +61,10 @@ SEQUENCES = _table(
 # (:class:`core.places.Whereabouts`); NULL: those of the place itself.  That sequence may be gone, whose code is never
 # used again.  pose_of is the id of the place whose pose the place got with its station; NULL: the pose is its own.
 #
-# A look is a row of its own with what its place has, so that whatever searches, reads and checks rows need not know of
-# looks: look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame, camera
-# and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run that it
-# was learnt from.
+# A look is a row of its own that has what its place has, so that whatever searches, reads and checks rows need not know
+# of looks.  look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame,
+# camera and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run
+# from which it was learnt.
 PLACES = _table(
     "places", ("number",),
     _column("number", integer()),  # grows in the order of enrolment

@@ -125,7 +125,8 @@ class Write(ABC):
         found = places.of_ids(self.connection, place_ids)
         self._found.update({place_id: found.get(place_id) for place_id in place_ids})
 
-    def _find(self, place_id: str) -> StoredPlace | None:
+    def find(self, place_id: str) -> StoredPlace | None:
+        """The place of an id, or the look of an address, with the changes so far; None if there is none."""
         if place_id not in self._found:
             self._found[place_id] = places.find(self.connection, place_id)
         return self._found[place_id]
@@ -140,7 +141,7 @@ class Write(ABC):
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
         """
         of, name = place_and_look(item.id)
-        stored, place = self._find(item.id), None if name is None else self._find(of)
+        stored, place = self.find(item.id), None if name is None else self.find(of)
         if stored is not None and stored.digest == item.digest:
             if item.keypoints is not None and not frames.has_keypoints(self.connection, stored.row):
                 self._put_keypoints(stored, item.keypoints)
@@ -177,7 +178,7 @@ class Write(ABC):
             RepeatedLook: the frame is the one with which the place was enrolled.
             TooManyLooks: the place has as many as it may have.
         """
-        place = self._find(place_id)
+        place = self.find(place_id)
         if place is None:
             raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
         if place.digest == digest:
@@ -200,7 +201,7 @@ class Write(ABC):
     def insert_look(self, place: StoredPlace, look: StoredPlace) -> StoredPlace:
         """Store a new look of a place, whose row counts already."""
         made = self.insert(look)
-        now = self._find(place.place.id) or place
+        now = self.find(place.place.id) or place
         self._put(places.with_place(now, looks=now.place.looks + 1), now, searched=False)
         return made
 
@@ -209,7 +210,7 @@ class Write(ABC):
         for look in places.looks_of(self.connection, stored):
             if look.run is not None:
                 self.forget(look)
-        return self._find(stored.place.id) or stored
+        return self.find(stored.place.id) or stored
 
     def _create(self, item: Enrolment, values: dict[str, Any], look: ViewedFrame, ordinal: int | None) -> StoredPlace:
         code, at = self._code_of(item.fields.sequence), ordinal
@@ -252,21 +253,10 @@ class Write(ABC):
             self._drop_if_empty(before.sequence)
         self.changed = True
         self._note(made)
-        if made.look_of is None and _shared(made) != _shared(before):
-            self._move_looks(made, searched)
+        for look in places.looks_of(self.connection, made):
+            if (moved := places.as_look(look, made)) != look:
+                self._put(moved, look, searched)
         return made
-
-    def _move_looks(self, stored: StoredPlace, searched: bool) -> None:
-        """Give the looks of a place what they share with it."""
-        place = stored.place
-        shared = {"pose": place.pose, "pose_of": place.pose_of, "timestamp": place.timestamp}
-        shared |= {"sequence": place.sequence, "metadata": place.metadata, "looks": place.looks}
-        for look in places.looks_of(self.connection, stored):
-            moved = replace(
-                places.with_place(look, **shared), sequence=stored.sequence, ordinal=stored.ordinal,
-                track=stored.track, station=stored.station,
-            )  # fmt: skip
-            self._put(moved, look, searched)
 
     def _code_of(self, sequence: str | None) -> int:
         """The code of a sequence, which is made if there is none."""
@@ -320,7 +310,11 @@ class Write(ABC):
         return reach_of(self.record.same_place_radius)
 
     def _with_fields(
-        self, stored: StoredPlace, fields: PlaceFields, look: ViewedFrame | None = None, shown: StoredPlace | None = None
+        self,
+        stored: StoredPlace,
+        fields: PlaceFields,
+        look: ViewedFrame | None = None,
+        shown: StoredPlace | None = None,
     ) -> StoredPlace:
         """A place with other fields; its position in its sequence changes only with the sequence, or if it leaves it.
 
@@ -367,16 +361,21 @@ class Write(ABC):
 
     def add_keypoints(self, frame: PicturedPlace, found: Keypoints) -> bool:
         """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
-        stored = self._find(frame.id)
+        stored = self.find(frame.id)
         if stored is None or stored.digest != frame.digest or frames.has_keypoints(self.connection, stored.row):
             return False
         self._put_keypoints(stored, found)
         return self.record.verification
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
-        """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
-        stored = self._find(item.id)
-        return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
+        """Change the fields of a place that shows this frame; None if it shows another frame or is gone.
+
+        A look that shows it stays as it is.
+        """
+        stored = self.find(item.id)
+        if stored is None or stored.digest != item.digest:
+            return None
+        return self.set_fields(stored, item.fields) if stored.look_of is None else (stored.shown(), "unchanged")
 
     def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
         """Change the fields of a place; its frame stays."""
@@ -389,7 +388,7 @@ class Write(ABC):
         with suppress(RepeatedLook, TooManyLooks):  # the place has other looks here
             self.enrol(item, history.picture, history.ordinal)
         self._latest.clear()
-        if (stored := self._find(item.id)) is None:
+        if (stored := self.find(item.id)) is None:
             return
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
         if stored.look_of is not None:
@@ -420,7 +419,7 @@ class Write(ABC):
         if stored.look_of is None:
             self._drop_if_empty(stored.sequence)
             self._latest.clear()
-        elif (place := self._find(place_and_look(stored.place.id)[0])) is not None:
+        elif (place := self.find(place_and_look(stored.place.id)[0])) is not None:
             self._put(places.with_place(place, looks=place.place.looks - 1), place, searched=False)
 
     def _remove(self, stored: StoredPlace) -> None:
@@ -447,10 +446,3 @@ class Write(ABC):
         self._finish()
         if self.state != self._before:
             record.put_counters(self._connection, self.state)
-
-
-def _shared(stored: StoredPlace) -> tuple[Any, ...]:
-    """The values of a place that its looks have as well."""
-    place = stored.place
-    at = stored.sequence, stored.ordinal, stored.track, stored.station
-    return (*at, place.pose, place.pose_of, place.timestamp, place.sequence, place.metadata, place.looks)

@@ -20,7 +20,8 @@ from core.maps.archives.reading import Archive
 from core.maps.cameras import CameraRecord
 from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.stored_fields import moment_text
-from core.places import NO_SEQUENCE
+from core.maps.records import MOST_LOOKS
+from core.places import NO_SEQUENCE, place_and_look
 from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking
 from core.storage.files.segment_files import Layout
 
@@ -36,7 +37,9 @@ class ImportWrite(Protocol):
 
     def expect(self, count: int) -> None: ...
     def add_stored(self, frame: NDArray[np.void]) -> int: ...
+    def find(self, place_id: str) -> StoredPlace | None: ...
     def insert(self, stored: StoredPlace) -> StoredPlace: ...
+    def insert_look(self, place: StoredPlace, look: StoredPlace) -> StoredPlace: ...
     def put_picture(self, row: int, picture: bytes) -> None: ...
     def put_keypoints(self, stored: StoredPlace, record: bytes) -> None: ...
 
@@ -102,12 +105,27 @@ class Importing(Unpacking):
             for at, (line, content) in enumerate(zip(lines, contents, strict=True)):
                 if line.id in known:
                     raise InvalidArchive(f"The place {line.id!r} is listed twice.")
+                place = self._place_of_look(write, line)
                 known[line.id] = row = write.state.rows
-                made = write.insert(self._place(write, line, row, write.add_stored(stored[at : at + 1])))
+                read = self._place(write, line, row, write.add_stored(stored[at : at + 1]))
+                made = write.insert(read) if place is None else write.insert_look(place, places.as_look(read, place))
                 if content.picture is not None:
                     write.put_picture(row, content.picture[0])
                 if content.keypoints is not None:
                     write.put_keypoints(made, content.keypoints)
+
+    def _place_of_look(self, write: ImportWrite, line: PlaceLine) -> StoredPlace | None:
+        """The place that a look is of; None for the line of a place."""
+        place_id, look = place_and_look(line.id)
+        if look is None:
+            return None
+        if (place := write.find(place_id)) is None:
+            raise InvalidArchive(f"The look {line.id!r} is of a place that the file does not list before it.")
+        if not line.digest.startswith(look):
+            raise InvalidArchive(f"The look {line.id!r} is not named by the digest of its frame.")
+        if place.place.looks >= MOST_LOOKS:
+            raise InvalidArchive(f"The place {place_id!r} has more than {MOST_LOOKS} looks.")
+        return place
 
     def _place(self, write: ImportWrite, line: PlaceLine, row: int, checksum: int) -> StoredPlace:
         code = NO_SEQUENCE if line.sequence is None else self._code(line.sequence, line)
@@ -117,6 +135,7 @@ class Importing(Unpacking):
                 digest=bytes.fromhex(line.digest), regions=line.regions,
                 picture="none" if line.picture is None else line.picture.kind, track=self._track(write, line),
                 station=line.station, pose_of=line.pose_of, revision=write.state.revision + 1,
+                seen=None if line.seen is None else moment_text(line.seen), run=line.run,
                 created_at=moment_text(line.created_at), updated_at=moment_text(line.updated_at),
             )  # fmt: skip
         except InvalidField as error:

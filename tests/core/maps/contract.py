@@ -24,8 +24,8 @@ from core.frames.masks import Mask
 from core.judgement.priors import Disc, Period
 from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, SameFrame, Selection, Store
 from core.maps.archives.reading import Archive, check
-from core.maps.selection import Conditions, RecentFrames
 from core.maps.records import Outline
+from core.maps.selection import Conditions, RecentFrames
 from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, look_address, microseconds
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
 from tests.durability.contents import sha
@@ -178,9 +178,7 @@ class StoreContract(RuleBasedStateMachine):
     @rule(place_id=ids, picture=pictures)
     def forget_look(self, place_id: str, picture: str) -> None:
         name = shown(picture).digest[:16]
-        self.agree(
-            lambda model: model.forget_look(place_id, name), lambda lab: lab.forget_look(place_id, name)
-        )
+        self.agree(lambda model: model.forget_look(place_id, name), lambda lab: lab.forget_look(place_id, name))
 
     @rule(run=st.sampled_from(["night", "snow"]))
     def forget_learnt(self, run: str) -> None:

@@ -32,7 +32,7 @@ from core.storage.files.row_formats import inner_products, pack_descriptors
 from core.storage.search import index_files, recall
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, keypoints_of
 from tests.durability.contents import contents, map_contents
-from tests.durability.storage.operations import Operation, enrolment, pictures
+from tests.durability.storage.operations import Operation, enrolment, look_enrolment, pictures
 
 ROWS_PER_SEGMENT = 4
 GROUP_ROWS = 8

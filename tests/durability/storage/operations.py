@@ -60,7 +60,9 @@ def shown(picture: str) -> Shown:
     )
 
 
-def look_enrolment(place: str, picture: str, seen: Any, camera: str | None, run: str | None, keypoints: bool) -> Enrolment:
+def look_enrolment(
+    place: str, picture: str, seen: Any, camera: str | None, run: str | None, keypoints: bool
+) -> Enrolment:
     """A picture as it is added to the looks of a place."""
     item = enrolment(place, picture, {"timestamp": seen, "camera": camera}, keypoints)
     return replace(item, id=look_address(place, item.digest.hex()[:16]), run=run)
