@@ -69,6 +69,10 @@ class UnknownKey(Problem):
     """404 ``unknown-key``: The key does not exist."""
 
 
+class UnknownLook(Problem):
+    """404 ``unknown-look``: The place has no such look."""
+
+
 class UnknownMap(Problem):
     """404 ``unknown-map``: The map does not exist."""
 
@@ -149,12 +153,20 @@ class PlaceTaken(Problem):
     """409 ``place-taken``: The place has another frame."""
 
 
+class RepeatedLook(Problem):
+    """409 ``repeated-look``: The look is the place's own frame."""
+
+
 class StreamTaken(Problem):
     """409 ``stream-taken``: Another connection streams into the session."""
 
 
 class TooManyKeys(Problem):
     """409 ``too-many-keys``: No more keys can be created."""
+
+
+class TooManyLooks(Problem):
+    """409 ``too-many-looks``: The place has as many looks as it may have."""
 
 
 class TooManyMaps(Problem):
@@ -469,6 +481,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "unknown-frame": UnknownFrame,
     "unknown-job": UnknownJob,
     "unknown-key": UnknownKey,
+    "unknown-look": UnknownLook,
     "unknown-map": UnknownMap,
     "unknown-path": UnknownPath,
     "unknown-place": UnknownPlace,
@@ -489,8 +502,10 @@ BY_SLUG: dict[str, type[Problem]] = {
     "map-exists": MapExists,
     "merge-conflict": MergeConflict,
     "place-taken": PlaceTaken,
+    "repeated-look": RepeatedLook,
     "stream-taken": StreamTaken,
     "too-many-keys": TooManyKeys,
+    "too-many-looks": TooManyLooks,
     "too-many-maps": TooManyMaps,
     "too-many-places": TooManyPlaces,
     "wrong-encoder": WrongEncoder,

@@ -19,8 +19,8 @@ from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
 from core.maps.archives.reading import Archive
 from core.maps.cameras import CameraRecord
 from core.maps.enrolling import CheckDescriptors, any_descriptors
-from core.maps.stored_fields import moment_text
 from core.maps.records import MOST_LOOKS
+from core.maps.stored_fields import moment_text
 from core.places import NO_SEQUENCE, place_and_look
 from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking
 from core.storage.files.segment_files import Layout
