@@ -53,6 +53,7 @@ PARTS = {
         "data sets",
     ),
     "maps": Part("benchmarks.maps.map_sizes", "--datasets {data} --repeats 3", "data sets"),
+    "looks": Part("benchmarks.maps.looks", "--datasets {data}", "data sets"),
     "runs": Part("benchmarks.maps.sequences", "--data {data}/eval", "data sets"),
     "sessions": Part("benchmarks.maps.sessions", "--datasets {data}", "data sets"),
     "day": Part("benchmarks.day", "--datasets {data} --short --json {results}/day.json", "data sets"),
