@@ -229,6 +229,9 @@ class Look(BaseModel):
     timestamp: Timestamp | None = Field(description="When its frame was taken.")
     camera: Camera | None = Field(description="Whose mask was applied to its frame.")
     run: str | None = Field(description="The run from which it was learnt; null: an operator added it.")
+    least_score: float | None = Field(
+        description="The score of two stages from which a match with it is believed; null: from any."
+    )
     regions: int = Field(ge=0, description="Regions of interest found in its frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="The stored form of its frame.")
     created_at: Timestamp
@@ -248,7 +251,7 @@ class Neighborhood:
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where and when the frames of n places were taken, one row for each place.
+    """Where and when the frames of n places were taken, and from which score on they are believed; a row for each.
 
     kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
     position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
@@ -261,8 +264,11 @@ class Whereabouts:
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
     track, station: int32 [n] and int64 [n], the sequence and the ordinal at which another traverse shows the same, as
         alignment found; the place's own where nothing is known.
+    least: float32 [n], the score of two stages from which a match with the frame is believed; -inf for all but frames
+        that a map learnt from runs.
 
-    Heading and timestamp may be left out if none is known, track and station if all are the places' own.
+    Heading and timestamp may be left out if none is known, track and station if all are the places' own, least if any
+    score will do.
     """
 
     kind: NDArray[np.int8]
@@ -273,12 +279,15 @@ class Whereabouts:
     timestamp: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     track: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     station: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    least: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
 
     def __post_init__(self) -> None:
         if len(self.heading) < len(self.kind):
             object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
         if len(self.timestamp) < len(self.kind):
             object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
+        if len(self.least) < len(self.kind):
+            object.__setattr__(self, "least", np.full(len(self.kind), -np.inf, np.float32))
         if len(self.track) < len(self.kind):
             object.__setattr__(self, "track", self.sequence.copy())
             object.__setattr__(self, "station", self.ordinal.copy())

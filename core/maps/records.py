@@ -166,6 +166,7 @@ class Enrolment:
     thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
     keypoints: of the frame; stored if the map's setting ``verification`` says so.  None: they were not looked for.
     run: the run from which a look was learnt; None: it was not.
+    least: the score of two stages from which a match with the look is believed; None: from any.
     """
 
     id: str
@@ -178,6 +179,7 @@ class Enrolment:
     image: bytes | None = None
     keypoints: Keypoints | None = None
     run: str | None = None
+    least: float | None = None
 
 
 @dataclass(frozen=True)
@@ -234,6 +236,7 @@ class Outline:
     picture: the kind of its stored picture.
     ordinal: its position in its sequence.
     run: the run from which a look was learnt.
+    least: the score of two stages from which a match with a look is believed; None: from any.
     """
 
     number: int
@@ -246,6 +249,7 @@ class Outline:
     ordinal: int
     updated_at: str
     run: str | None = None
+    least: float | None = None
 
     @property
     def is_look(self) -> bool:

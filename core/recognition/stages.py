@@ -100,6 +100,11 @@ class Candidates:
         raised[positions], examined[positions] = gains, True
         return replace(self, scores=self.scores + raised, ordered=self.ordered + raised, examined=examined)
 
+    def believable(self) -> Candidates:
+        """The candidates without frames that score less than it takes to believe them (``Whereabouts.least``)."""
+        enough = self.scores >= self.whereabouts.least
+        return self if enough.all() else self.take(np.flatnonzero(enough))
+
     def with_geometry(self, geometry: Geometry, verifications: tuple[Verification | None, ...]) -> Candidates:
         """The candidates, which are in the order of three stages, with the results of their verification."""
         return replace(self, geometry=geometry, verifications=verifications)
@@ -220,7 +225,7 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
             None if weights is None else weights[order],
             found.scores,
             len(snapshot),
-        )
+        ).believable()
         if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates):
             break
     return candidates

@@ -6,7 +6,7 @@ import logging
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
-from math import nan
+from math import inf, nan
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,7 @@ def _location(stored: StoredPlace) -> Location:
         NO_TIME if moment is None else microseconds(moment),
         stored.track,
         stored.station,
+        -inf if stored.least is None else stored.least,
     )
 
 

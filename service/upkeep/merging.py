@@ -323,6 +323,7 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             image=picture if stored.picture == "image" else None,
             keypoints=of_frame,
             run=place.run,
+            least=place.least,
         )
         if place.is_look:
             items.append((item, History(stored.picture, None, stored.created_at, stored.updated_at)))

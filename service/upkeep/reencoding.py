@@ -199,6 +199,7 @@ class _Reencoding:
         item = Enrolment(
             place.id, stored.fields(), descriptor, regions, place.digest, local, image=image, keypoints=keypoints,
             run=place.run,
+            least=place.least,
         )  # fmt: skip
         return item, History("image", place.ordinal, stored.created_at, stored.updated_at)
 

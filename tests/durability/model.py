@@ -71,6 +71,7 @@ class LookModel:
     seen: Any
     camera: str | None
     run: str | None
+    least: float | None
     kept: str
     number: int
     descriptor: Any
@@ -197,7 +198,14 @@ class MapModel:
         return "created" if known is None else "replaced"
 
     def add_look(
-        self, place_id: str, shown: Shown, seen: Any, camera: str | None, run: str | None, keypoints: Any
+        self,
+        place_id: str,
+        shown: Shown,
+        seen: Any,
+        camera: str | None,
+        run: str | None,
+        least: float | None,
+        keypoints: Any,
     ) -> str:
         """Add a look to a place; created, or unchanged if the place has it."""
         place, name = self.place(place_id), shown.digest[:16]
@@ -209,7 +217,9 @@ class MapModel:
             raise Refused("RepeatedLook")
         self.numbers += 1
         stored = shown.descriptor.get(self.precision, ANY)
-        place.looks[name] = LookModel(shown, seen, camera, run, self.settings["keep"], self.numbers, stored, keypoints)
+        place.looks[name] = LookModel(
+            shown, seen, camera, run, least, self.settings["keep"], self.numbers, stored, keypoints
+        )  # fmt: skip
         return "created"
 
     def forget_look(self, place_id: str, name: str) -> None:
@@ -411,6 +421,7 @@ class MapModel:
             "timestamp": canonical({"timestamp": look.seen})["timestamp"],
             "camera": look.camera,
             "run": look.run,
+            "least_score": look.least,
             "regions": shown.regions,
             "picture": look.kept,
             "created_at": look.created,

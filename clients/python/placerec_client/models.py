@@ -18,6 +18,7 @@ class AddedLook(Model):
     timestamp: datetime | None = None
     camera: str | None = None
     run: str | None = None
+    least_score: float | None = None
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
     created_at: datetime
@@ -957,6 +958,7 @@ class LookView(Model):
     timestamp: datetime | None = None
     camera: str | None = None
     run: str | None = None
+    least_score: float | None = None
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
     created_at: datetime

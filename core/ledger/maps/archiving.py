@@ -138,6 +138,7 @@ def _archived(
             "updated_at": moment_text(place.updated_at),
             "seen": stored.seen,
             "run": stored.run,
+            "least": stored.least,
         }
     )
     size = 0 if picture is None else picture[0]

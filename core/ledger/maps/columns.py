@@ -17,11 +17,12 @@ from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, 
 
 _P = PLACES.c
 _AT_ONCE = 65_536
-_NUMBERS = 12
+_NUMBERS = 13
 _COLUMNS = (
     select(
         _P.row, _P.checksum, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
-        func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), func.substr(_P.timestamp, 1, 26),
+        func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), _P.least,
+        func.substr(_P.timestamp, 1, 26),
     ).where(_P.map == bindparam("map"))
 )  # fmt: skip
 _ALL = Statement(_COLUMNS)
@@ -89,6 +90,7 @@ def read_columns(connection: MapConnection, rows: int, after: int | None = None)
         np.concatenate(moments).astype(np.int64),
         found[:, 10].astype(np.int32),
         found[:, 11].astype(np.int64),
+        np.where(np.isnan(found[:, 12]), -np.inf, found[:, 12]).astype(np.float32),
     )
     return Columns(row, found[:, 1].astype(np.uint32), whereabouts)
 

@@ -49,7 +49,7 @@ _WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
 _STORED = _WHOLE.where(_P.map == bindparam("map"))
 _NUMBERS = (
     "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision", "look_of",
-    "seen", "run",
+    "seen", "run", "least",
 )  # fmt: skip
 
 _IS_PLACE = _P.look_of.is_(None)
@@ -98,7 +98,9 @@ _ROWS_WITH_AMONG = Statement(
 )
 _WITH_LOOKS = Statement(_STORED.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 _OUTLINES = Statement(
-    select(_P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at, _P.run)
+    select(
+        _P.number, _P.id, _P.row, _P.digest, _P.picture, _P.camera, _S.name, _P.ordinal, _P.updated_at, _P.run, _P.least
+    )
     .join(SEQUENCES, and_(_S.map == _P.map, _S.code == _P.sequence))
     .where(_P.map == bindparam("map"))
     .order_by(_P.number)
@@ -146,6 +148,7 @@ class StoredPlace:
     revision: of the map's write that changed it last.
     look_of: the number of the place whose look it is; None: it is a place.
     seen: when a look's frame was taken, as text; run: the run from which it was learnt.
+    least: the score of two stages from which a match with a look is believed; None: from any.
     """
 
     number: int
@@ -162,6 +165,7 @@ class StoredPlace:
     look_of: int | None = None
     seen: str | None = None
     run: str | None = None
+    least: float | None = None
 
     def shown(self) -> Place:
         """The place as an answer has it: that of a look's row has the place's id, and the name of the look."""
@@ -178,6 +182,7 @@ class StoredPlace:
             timestamp=None if self.seen is None else datetime.fromisoformat(self.seen),
             camera=self.place.camera,
             run=self.run,
+            least_score=self.least,
             regions=self.place.regions,
             picture=self.place.picture,
             created_at=self.place.created_at,
@@ -188,7 +193,7 @@ class StoredPlace:
         place = self.place
         return Outline(
             self.number, place.id, self.row, self.digest, place.picture, place.camera, place.sequence, self.ordinal,
-            moment_text(place.updated_at), self.run,
+            moment_text(place.updated_at), self.run, self.least,
         )  # fmt: skip
 
     def of_frame(self) -> Place:
@@ -435,7 +440,8 @@ def placed(item_id: str, fields: PlaceFields, sequence: int, ordinal: int, **val
     """
     columns = {
         "id": item_id, "sequence": sequence, "ordinal": ordinal, "track": None, "station": None, "pose_of": None,
-        "key": None, "look_of": None, "looks": 0, "seen": None, "run": None, **values, **field_columns(fields),
+        "key": None, "look_of": None, "looks": 0, "seen": None, "run": None, "least": None,
+        **values, **field_columns(fields),
     }  # fmt: skip
     return _from_columns(columns, fields.sequence)
 
@@ -501,6 +507,7 @@ def whereabouts_of(stored: Sequence[StoredPlace]) -> Whereabouts:
         np.array([NO_TIME if moment is None else microseconds(moment) for moment in moments], np.int64),
         np.array([one.sequence if one.track is None else one.track for one in stored], np.int32),
         np.array([one.ordinal if one.station is None else one.station for one in stored], np.int64),
+        np.array([-np.inf if one.least is None else one.least for one in stored], np.float32),
     )
 
 

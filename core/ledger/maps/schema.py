@@ -64,7 +64,7 @@ SEQUENCES = _table(
 # A look is a row of its own that has what its place has, so that whatever searches, reads and checks rows need not know
 # of looks.  look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame,
 # camera and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run
-# from which it was learnt.
+# from which it was learnt; least is the score of two stages from which a match with it is believed, NULL: from any.
 PLACES = _table(
     "places", ("number",),
     _column("number", integer()),  # grows in the order of enrolment
@@ -87,6 +87,7 @@ PLACES = _table(
     _column("looks", integer()),
     _column("seen", text(), optional=True),
     _column("run", text(), optional=True),
+    _column("least", real(), optional=True),
     _column("created_at", text()),
     _column("updated_at", text()),
     _column("key", integer(), optional=True),  # of its entity in Milvus

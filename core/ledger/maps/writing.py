@@ -194,7 +194,9 @@ class Write(ABC):
         look = places.placed(
             item.id, fields, place.sequence, place.ordinal, number=self.state.numbers, revision=self._revision,
             created_at=now, updated_at=now, track=place.track, station=place.station, pose_of=place.place.pose_of,
-            look_of=place.number, seen=None if seen is None else moment_text(seen), run=item.run, **values,
+            look_of=place.number, seen=None if seen is None else moment_text(seen), run=item.run,
+            least=None if item.least is None else item.least + 0.0,
+            **values,
         )  # fmt: skip
         return self.insert_look(place, look)
 

@@ -69,7 +69,8 @@ class PlaceLine(_Line):
     pose_of: the place whose pose it got from an alignment.
     digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
     keypoints: the number of those of its frame; their record is the next one in its group.  None: none are stored.
-    seen, run: when the frame of a look was taken, and the run from which it was learnt.
+    seen, run, least: when the frame of a look was taken, the run from which it was learnt, and the score of two stages
+        from which a match with it is believed.
     """
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}(/{LOOK})?$")]
@@ -90,6 +91,7 @@ class PlaceLine(_Line):
     updated_at: Timestamp
     seen: Timestamp | None = None
     run: Annotated[str, Field(max_length=LONGEST, pattern=f"^{TEXT}$")] | None = None
+    least: Annotated[float, Field(allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:

@@ -275,9 +275,9 @@ def _both(
 def _locations(where: Whereabouts) -> Iterator[Location]:
     columns = (
         where.kind, where.position, where.sequence, where.ordinal, where.heading, where.timestamp, where.track,
-        where.station,
+        where.station, where.least,
     )  # fmt: skip
-    for kind, position, sequence, ordinal, heading, timestamp, track, station in zip(
+    for kind, position, sequence, ordinal, heading, timestamp, track, station, least in zip(
         *(column.tolist() for column in columns), strict=True
     ):
-        yield Location(kind, tuple(position), sequence, ordinal, heading, timestamp, track, station)
+        yield Location(kind, tuple(position), sequence, ordinal, heading, timestamp, track, station, least)

@@ -136,6 +136,7 @@ class Importing(Unpacking):
                 picture="none" if line.picture is None else line.picture.kind, track=self._track(write, line),
                 station=line.station, pose_of=line.pose_of, revision=write.state.revision + 1,
                 seen=None if line.seen is None else moment_text(line.seen), run=line.run,
+                least=line.least,
                 created_at=moment_text(line.created_at), updated_at=moment_text(line.updated_at),
             )  # fmt: skip
         except InvalidField as error:

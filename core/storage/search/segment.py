@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import nan
+from math import inf, nan
 
 import faiss
 import numpy as np
@@ -30,6 +30,7 @@ class Location:
     timestamp: int = NO_TIME
     track: int | None = None
     station: int | None = None
+    least: float = -inf
 
 
 def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
@@ -43,6 +44,7 @@ def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
         np.array([location.timestamp for location in locations], dtype=np.int64),
         np.array([one.sequence if one.track is None else one.track for one in locations], dtype=np.int32),
         np.array([one.ordinal if one.station is None else one.station for one in locations], dtype=np.int64),
+        np.array([location.least for location in locations], dtype=np.float32),
     )
 
 

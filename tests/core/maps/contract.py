@@ -166,13 +166,15 @@ class StoreContract(RuleBasedStateMachine):
 
     @rule(
         place_id=ids, picture=pictures, seen=st.none() | times, run=st.none() | st.sampled_from(["night", "snow"]),
-        camera=st.none() | st.just("front"), keypoints=st.booleans(),
+        least=st.none() | st.sampled_from([0.0, 0.3]), camera=st.none() | st.just("front"), keypoints=st.booleans(),
     )  # fmt: skip
-    def add_look(self, place_id: str, picture: str, seen: Any, run: Any, camera: Any, keypoints: bool) -> None:
+    def add_look(
+        self, place_id: str, picture: str, seen: Any, run: Any, least: Any, camera: Any, keypoints: bool
+    ) -> None:
         of = shown(picture)
         self.agree(
-            lambda model: model.add_look(place_id, of, seen, camera, run, of.keypoints if keypoints else None),
-            lambda lab: lab.enrol([look_enrolment(place_id, picture, seen, camera, run, keypoints)])[0][1],
+            lambda model: model.add_look(place_id, of, seen, camera, run, least, of.keypoints if keypoints else None),
+            lambda lab: lab.enrol([look_enrolment(place_id, picture, seen, camera, run, least, keypoints)])[0][1],
         )
 
     @rule(place_id=ids, picture=pictures)
@@ -517,7 +519,11 @@ def _other_looks(lab: Map, every: Sequence[Outline]) -> dict[str, list[dict[str,
             address = look_address(place_id, look.name)
             row = np.array([rows[address]])
             where = snapshot.whereabouts_at(np.array([rows[address], rows[place_id]]))
-            assert all((column[0] == column[1]).all() or (column != column).all() for column in vars(where).values())
+            columns = dict(vars(where))
+            assert columns.pop("least").tolist() == [
+                -np.inf if look.least_score is None else np.float32(look.least_score), -np.inf
+            ]  # fmt: skip
+            assert all((column[0] == column[1]).all() or (column != column).all() for column in columns.values())
             (shown_by,), (keypoints,) = lab.places_at(row.tolist()), lab.keypoints_at(row.tolist())
             changes = {"look": look.name, **{name: getattr(look, name) for name in ("camera", "regions", "picture")}}
             moments = {name: getattr(shown_by, name) for name in ("created_at", "updated_at")}

@@ -61,11 +61,11 @@ def shown(picture: str) -> Shown:
 
 
 def look_enrolment(
-    place: str, picture: str, seen: Any, camera: str | None, run: str | None, keypoints: bool
+    place: str, picture: str, seen: Any, camera: str | None, run: str | None, least: float | None, keypoints: bool
 ) -> Enrolment:
     """A picture as it is added to the looks of a place."""
     item = enrolment(place, picture, {"timestamp": seen, "camera": camera}, keypoints)
-    return replace(item, id=look_address(place, item.digest.hex()[:16]), run=run)
+    return replace(item, id=look_address(place, item.digest.hex()[:16]), run=run, least=least)
 
 
 def enrolment(id: str, picture: str, fields: dict[str, Any], keypoints: bool) -> Enrolment:
@@ -131,7 +131,7 @@ def _looks(world: World, operation: Operation) -> list[str]:
     map_ = _map(world, operation["map"])
     return [
         map_.add_look(item["place"], of := shown(item["picture"]), item["seen"], item["camera"], item["run"],
-                      of.keypoints if item["keypoints"] else None)
+                      item["least"], of.keypoints if item["keypoints"] else None)
         for item in operation["items"]
     ]  # fmt: skip
 
@@ -331,6 +331,7 @@ def _added_looks(random: Random, world: World, name: str, listed: list[str]) -> 
             "seen": random.choice([None, "2026-12-01T22:00:00Z"]),
             "camera": random.choice([None, None, "front"]),
             "run": random.choice([None, "monday night", "tuesday night"]),
+            "least": random.choice([None, 0.0, 0.1, random.random()]),
             "keypoints": random.random() < 0.7,
         }
         for _ in range(random.randrange(1, 4))
