@@ -88,31 +88,33 @@ def queries_from_labels(
     snapshot: Snapshot,
     encodings: Sequence[Encoding],
     places: Sequence[str | None],
-    enrolled: Sequence[bool] | None = None,
+    own: Sequence[str | None] | None = None,
 ) -> LabelledQueries:
     """The queries of a calibration from labelled frames.
 
     Args:
         encodings: the frames, encoded by the map's encoder.
         places: for each frame the id of the place that it shows; None if the map lacks the place.
-        enrolled: for each frame whether it is itself the frame of that place, which is then left out; None: none is.
+        own: for each frame the place, or the address of the look, whose frame it is itself, which is then left out;
+            None: none is.
 
     Raises:
         UnknownPlace: the map has no place of one of the ids.
     """
     rows = _rows_of(map_, snapshot, [place for place in places if place is not None])
+    own_rows = [None if one is None else map_.rows_of([one])[0] for one in own or [None] * len(places)]
     near = _SamePlace(snapshot, neighborhood_of(map_))
     nothing = np.zeros(snapshot.rows, np.bool_)
 
     def made() -> Iterator[LabelledQuery]:
-        for encoding, place, own in zip(encodings, places, enrolled or [False] * len(places), strict=True):
+        for encoding, place, own_row in zip(encodings, places, own_rows, strict=True):
             if place is None:
                 yield LabelledQuery(encoding.descriptor, encoding.local, nothing, nothing, nothing)
                 continue
             row, absent = rows[place], nothing
-            if own:
+            if own_row is not None and own_row < snapshot.rows:
                 absent = nothing.copy()
-                absent[row] = True
+                absent[own_row] = True
             same, around = near(row) & ~absent, near(row, GUARD_FACTOR)
             yield LabelledQuery(encoding.descriptor, encoding.local, same, absent, around)
 
@@ -138,8 +140,7 @@ def queries_from_traverse(
     if strangers := sorted(set(queried) - set(members)):
         raise UnknownPlace(f"The sequence {sequence[:128]!r} has no place {strangers[0][:128]!r}.")
     rows = _rows_of(map_, snapshot, members + [place for place in (pairs or {}).values() if place is not None])
-    own = np.zeros(snapshot.rows, np.bool_)
-    own[[rows[place] for place in members]] = True
+    own = snapshot.whereabouts.of_views(np.array([rows[place] for place in members], np.int64))  # with their looks
     near = _SamePlace(snapshot, neighborhood_of(map_))
     if pairs is None:
         others = snapshot.alive & ~own

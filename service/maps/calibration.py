@@ -297,7 +297,7 @@ def _queries(
         if not known:
             raise errors.CalibrationImpossible("No frame of the map's review is labelled with a place that it has.")
         places = [frame.place for frame in known]
-        return queries_from_labels(map_, snapshot, encodings, places, [frame.enrolled for frame in known])
+        return queries_from_labels(map_, snapshot, encodings, places, [frame.own for frame in known])
     if order.method == "frames":
         assert order.labels is not None
         return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])

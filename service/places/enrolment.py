@@ -6,14 +6,14 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from core.frames.masks import Mask
 from core.maps import Change, Enrolment, Map, SameFrame
-from core.places import Place, PlaceFields
+from core.places import Place, PlaceFields, look_address
 from core.recognition.recognition import describe, frame_digest
 from service.engine.encoders import Encoded
-from service.engine.engine import Engine
+from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import BatchTurn, Stage
@@ -49,6 +49,20 @@ class Enrolled:
     place: Place
     change: Change
     milliseconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EnrolledLook:
+    """A stored look.
+
+    name: of the look.
+    change: whether it was created, or is unchanged.
+    milliseconds: as of :class:`Enrolled`.
+    """
+
+    name: str
+    change: Change
+    milliseconds: Mapping[str, float]
 
 
 def digest_of(frame: FrameToEnrol) -> bytes:
@@ -145,6 +159,25 @@ async def enrol(
         # Places that were deleted, or got another frame, since their digest was read: their frames have to be encoded.
         open_, known = known - set(done), set()
     return stored
+
+
+async def enrol_look(
+    engine: Engine, map_: Map, place_id: str, data: bytes, fields: PlaceFields, deadline: RequestDeadline
+) -> EnrolledLook:
+    """Add a frame to the looks of a place.
+
+    Args:
+        fields: time and camera of the frame.
+
+    Raises:
+        UnknownPlace, RepeatedLook, TooManyLooks: the place cannot have it.
+        UnknownCamera, and what ``enrol`` raises.
+    """
+    frame = FrameToEnrol(place_id, fields, data, await camera_mask(map_, fields.camera))
+    await in_thread(map_.place, place_id)  # an unknown place is refused before its frame is encoded
+    name = (await in_thread(digest_of, frame)).hex()[:16]
+    stored = (await enrol(engine, map_, [replace(frame, id=look_address(place_id, name))], deadline))[0]
+    return EnrolledLook(name, stored.change, stored.milliseconds)
 
 
 def _prepare_all(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request
@@ -13,7 +12,6 @@ from core import errors
 from core.maps import Change
 from core.names import texts
 from core.places import Look, PlaceFields, Timestamp, check_look, look_address
-from service.engine.engine import camera_mask
 from service.errors.problems import problem_documentation
 from service.http.openapi import frame_body
 from service.http.routing import (
@@ -38,7 +36,7 @@ from service.http.schemas import (
     PageParameters,
     Parameters,
 )
-from service.places.enrolment import FrameToEnrol, digest_of, enrol
+from service.places.enrolment import enrol_look
 from service.places.place_events import tell_change
 from service.places.routes import ENROLMENT_PROBLEMS, THUMBNAIL
 from service.worker_threads import in_thread
@@ -127,13 +125,10 @@ async def add_look(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = PlaceFields(timestamp=options.timestamp, camera=options.camera)
-    frame = FrameToEnrol(place_id, fields, data, await camera_mask(map_, fields.camera))
-    await in_thread(map_.place, place_id)  # an unknown place is refused before its frame is encoded
-    name = (await in_thread(digest_of, frame)).hex()[:16]
-    stored = (await enrol(engine, map_, [replace(frame, id=look_address(place_id, name))], deadline))[0]
-    (look,) = [one for one in await in_thread(map_.looks, place_id) if one.name == name]
+    stored = await enrol_look(engine, map_, place_id, data, fields, deadline)
+    (look,) = [one for one in await in_thread(map_.looks, place_id) if one.name == stored.name]
     response.status_code = 201 if stored.change == "created" else 200
-    request.state.noted = {"map": map_id, "place": place_id, "look": name, "change": stored.change}
+    request.state.noted = {"map": map_id, "place": place_id, "look": stored.name, "change": stored.change}
     return AddedLook(
         **look.__dict__,
         place=place_id,

@@ -10,6 +10,7 @@ from core.errors import PlacerecError, StorageFailure, UnknownCamera
 from core.frames.masks import Mask
 from core.maps import Map
 from core.method.encoder import Encoding
+from core.places import look_address
 from service.engine.encoders import Encoded
 
 TOGETHER = 32
@@ -23,13 +24,13 @@ class KnownFrame:
     number: of the frame.
     camera: the camera that took it, as the query named it.
     place: the id of the place that it shows; None if the map has none.
-    enrolled: whether the frame was enrolled as this place.
+    own: the place as which it was enrolled, or the address of the look; None: it is in no map.
     """
 
     number: int
     camera: str | None
     place: str | None
-    enrolled: bool
+    own: str | None
 
 
 def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
@@ -42,7 +43,10 @@ def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
     for frame in map_.review.labelled():
         label = (frame.label or {})["label"]
         camera, place = frame.answer.get("camera"), label.get("place") or label.get("new")
-        found.append(KnownFrame(frame.number, camera, place, "new" in label))
+        own = label.get("new")
+        if place is not None and (look := label.get("look")) is not None:
+            own = look_address(place, look)
+        found.append(KnownFrame(frame.number, camera, place, own))
     found = found[-most:]
     named = [frame.place for frame in found if frame.place is not None]
     there = {place for place, row in zip(named, map_.rows_of(named), strict=True) if row is not None}

@@ -13,7 +13,7 @@ from core import errors
 from core.frames.containers import read_header
 from core.maps import Map
 from core.maps.pagination import Listing, decode_number, page_of
-from core.places import check_place_id
+from core.places import PlaceFields, check_place_id
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -23,7 +23,7 @@ from service.http.openapi import BINARY
 from service.http.routing import DeadlineDep, EngineDep, MapId, StrictRoute, json_body, single_values
 from service.http.schemas import PageParameters
 from service.http.uploads import FORMATS
-from service.places.enrolment import FrameToEnrol, digest_of, enrol
+from service.places.enrolment import FrameToEnrol, digest_of, enrol, enrol_look
 from service.places.schemas import PlaceView
 from service.review.schemas import ExportedLabel, Labelled, LabelList, LabelOrder, NewPlace, ReviewFrameView, ReviewPage
 from service.worker_threads import in_thread
@@ -105,6 +105,8 @@ def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) ->
         errors.UnknownCamera,
         errors.InvalidField,
         errors.NoRegions,
+        errors.RepeatedLook,
+        errors.TooManyLooks,
         errors.StorageFull,
         PlaceTaken,
         TooManyPlaces,
@@ -118,8 +120,9 @@ async def label_frame(
 ) -> Labelled:
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
-    Or throw it away. A label that is given again replaces the one before; enrolled places stay. Labels serve to
-    calibrate the map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
+    With `"look": true` it is also added to the looks of the place. Or throw it away. A label that is given again
+    replaces the one before; enrolled places and looks stay. Labels serve to calibrate the map, with the method
+    `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)
     async with engine.review_keeper.turn(map_, number):
@@ -139,6 +142,10 @@ async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, dead
         check_place_id(order.place)
         await in_thread(map_.place, order.place)
         label = {"place": order.place}
+        if order.look:
+            with map_.review.held(number):
+                label["look"] = await _add_look(engine, map_, number, order.place, deadline)
+                return await _store(map_, number, label)
     return await _store(map_, number, label)
 
 
@@ -147,6 +154,18 @@ async def _store(map_: Map, number: int, label: dict[str, Any], enrolled: PlaceV
     said = {"label": label, "at": datetime.now(UTC).isoformat(), "by": asker.principal if asker.key else None}
     frame = await in_thread(map_.review.label, number, said)
     return Labelled(id=number, discarded=False, frame=ReviewFrameView.of(frame), enrolled=enrolled)
+
+
+async def _add_look(engine: Engine, map_: Map, number: int, place_id: str, deadline: RequestDeadline) -> str:
+    """Add a stored frame to the looks of a place, with the time and the camera of its query; returns the look's name.
+
+    Raises:
+        UnknownFrame, and what ``enrol_look`` raises.
+    """
+    stored = await in_thread(map_.review.find, number)
+    data = await in_thread(map_.review.picture, number)
+    fields = PlaceFields(timestamp=stored.at, camera=stored.answer.get("camera"))
+    return (await enrol_look(engine, map_, place_id, data, fields, deadline)).name
 
 
 async def _enrol(engine: Engine, map_: Map, number: int, new: NewPlace, deadline: RequestDeadline) -> PlaceView:

@@ -15,9 +15,14 @@ from service.places.schemas import PlaceView
 
 
 class ReviewLabel(BaseModel):
-    """People's label of a frame; one of the three is set."""
+    """People's label of a frame; one of place, new and stranger is set."""
 
     place: str | None = Field(default=None, description="The place that it shows.")
+    look: str | None = Field(
+        default=None,
+        exclude_if=lambda name: name is None,
+        description="The look of this place as which it was added; left out if it was not.",
+    )
     new: str | None = Field(default=None, description="The place as which it was enrolled.")
     stranger: bool = Field(default=False, description="It shows no place of the map.")
 
@@ -77,10 +82,13 @@ class LabelOrder(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid",
-        json_schema_extra={"examples": [{"place": "p7"}, {"stranger": True}]},
+        json_schema_extra={"examples": [{"place": "p7"}, {"place": "p7", "look": True}, {"stranger": True}]},
     )
 
     place: str | None = Field(default=None, max_length=128, description="It shows this place of the map.")
+    look: bool = Field(
+        default=False, strict=True, description="With place: it is also added to the looks of the place."
+    )
     new: NewPlace | None = Field(default=None, description="It shows a new place, as which it is enrolled.")
     stranger: bool = Field(default=False, strict=True, description="It shows no place of this map.")
     discard: bool = Field(default=False, strict=True, description="It is thrown away.")
@@ -89,6 +97,8 @@ class LabelOrder(BaseModel):
     def _says_one_thing(self) -> LabelOrder:
         if [self.place is not None, self.new is not None, self.stranger, self.discard].count(True) != 1:
             raise ValueError("give exactly one of place, new, stranger and discard")
+        if self.look and self.place is None:
+            raise ValueError("a look needs the place that it is of")
         return self
 
 

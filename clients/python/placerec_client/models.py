@@ -914,9 +914,10 @@ class LabelList(Model):
 
 
 class ReviewLabel(Model):
-    """People's label of a frame; one of the three is set."""
+    """People's label of a frame; one of place, new and stranger is set."""
 
     place: str | None = None
+    look: str | None = None
     new: str | None = None
     stranger: bool = False
 

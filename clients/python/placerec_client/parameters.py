@@ -994,6 +994,9 @@ class LabelOrder(TypedDict, total=False):
     place: str | None
     """It shows this place of the map."""
 
+    look: bool
+    """With place: it is also added to the looks of the place."""
+
     new: NewPlace | None
     """It shows a new place, as which it is enrolled."""
 

@@ -323,3 +323,20 @@ def test_ten_labels_move_the_encoders_curve(server: Server) -> None:
     before, after = report["previous"], report["calibration"]
     assert after["margin"] == before["margin"] and after["curve"] != before["curve"]
     assert server.client.get("/v1/maps/moved").json()["calibration"]["source"] == "labels"
+
+
+def test_a_frame_becomes_a_look_of_the_place_that_it_shows(reviewed: Server, lab: str) -> None:
+    night = encoded(stranger(3))
+    reviewed.query(lab, night)
+    (frame,) = kept(reviewed, lab, 1)
+    told = label(reviewed, lab, frame["id"], place="p2", look=True)
+    (look,) = reviewed.client.get(f"/v1/maps/{lab}/places/p2/looks").json()["items"]
+    assert told["frame"]["label"]["place"] == "p2" and told["frame"]["label"]["look"] == look["name"]
+    assert look["timestamp"] == frame["at"] and look["run"] is None
+    assert reviewed.query(lab, night)["matches"][0]["place"]["id"] == "p2"
+    again = label(reviewed, lab, frame["id"], place="p2", look=True)
+    assert again["frame"]["label"]["look"] == look["name"], "the same frame gave the place a second look"
+    (exported,) = reviewed.client.get(f"/v1/maps/{lab}/review/labels").json()["items"]
+    assert (exported["place"], exported["enrolled"]) == ("p2", False)
+    path = f"/v1/maps/{lab}/review/{frame['id']}"
+    assert_problem(reviewed.client.post(path, json={"stranger": True, "look": True}), 422, "invalid-request")
