@@ -21,7 +21,9 @@ from core.learning import (
     RunFrame,
     Trail,
     corroborated,
+    elsewhere,
     kept,
+    least_score,
     lesson_of,
     services,
 )
@@ -75,6 +77,7 @@ class _Waiting:
     pending: PendingProposal
     frame: EncodedPicture
     believable: float
+    least: float
     place: int
     right: bool
     attacker: bool
@@ -115,7 +118,7 @@ class Learner:
             lesson = lesson_of(frames, graph)
             tally.contradiction, tally.refused = lesson.contradiction, dict(lesson.refused)
             self._observe(lesson, frames, graph, tally)
-            self._propose(lesson, run, answers, tally)
+            self._propose(lesson, run, answers, Trail.of(frames), graph, tally)
             self._take(graph, tally)
             self._rehearse(lesson, run, tally)
         self.runs += 1
@@ -156,17 +159,30 @@ class Learner:
             del self.learnt[row]
             tally.withdrawn += 1
 
-    def _propose(self, lesson: Lesson, run: EncodedRun, answers: Sequence[Recognized], tally: Tally) -> None:
+    def _propose(
+        self,
+        lesson: Lesson,
+        run: EncodedRun,
+        answers: Sequence[Recognized],
+        trail: Trail,
+        graph: PlaceGraph,
+        tally: Tally,
+    ) -> None:
         for proposal in lesson.proposals:
             moment, place = run.moments[proposal.frame], self.map.place[proposal.row]
             right, name = self._shows(moment, place), str(run.plan.number)
             source = f"{run.plan.robot} {run.plan.number}"  # every run is of another day
             believable = answers[proposal.frame].believable
+            frame = run.frames[proposal.frame]
+            others = [run.frames[one] for one in elsewhere(trail, proposal.frame, graph).tolist()]
+            least = least_score(self.map.scores_between(frame, others), self.map.encoder.calibration)
+            if least is None:
+                continue
             tally.proposed += 1
             tally.proposed_wrong += not right
             pending = PendingProposal(proposal, name, source)
-            frame = run.frames[proposal.frame]
-            self.waiting.append(_Waiting(pending, frame, believable, place, right, run.plan.robot == "stranger"))
+            stranger = run.plan.robot == "stranger"
+            self.waiting.append(_Waiting(pending, frame, believable, least, place, right, stranger))
 
     def _take(self, graph: PlaceGraph, tally: Tally) -> None:
         """Take the proposals that this mode takes; the others wait for a while."""
@@ -198,7 +214,7 @@ class Learner:
                 self.map.withdraw_look(row)
                 del self.learnt[row]
         if len(looks) - 1 in staying:
-            row = self.map.add_look(one.place, one.frame)
+            row = self.map.add_look(one.place, one.frame, one.least)
             self.learnt[row] = _Learnt(one.frame, one.place, one.right, one.attacker, one.believable)
             tally.taken += 1
             tally.taken_wrong += not one.right

@@ -73,6 +73,7 @@ class LivingMap:
         self.place: list[int] = []
         self.alive: list[bool] = []
         self.keypoints: list[Keypoints | None] = []
+        self.least: list[float] = []
         size = 4 * len(frames)
         one = frames[0]
         self._rows = _Rows(
@@ -86,8 +87,8 @@ class LivingMap:
     def __len__(self) -> int:
         return sum(self.alive)
 
-    def add_look(self, place: int, frame: EncodedPicture) -> int:
-        """Add a look of a place; its row."""
+    def add_look(self, place: int, frame: EncodedPicture, least: float = -np.inf) -> int:
+        """Add a look of a place, which is believed from a score of ``least`` on; its row."""
         row, rows = len(self.place), self._rows
         if row == len(rows.descriptors):
             for name, column in vars(rows).items():
@@ -96,6 +97,7 @@ class LivingMap:
         if frame.keypoints is not None:
             rows.glances[row] = glance_at(frame.keypoints)
         self.place.append(place)
+        self.least.append(least)
         self.alive.append(True)
         self.keypoints.append(frame.keypoints)
         return row
@@ -143,7 +145,7 @@ class LivingMap:
         candidates = Candidates(
             ranked, found.scores, scores[order][found.order], listed.take(found.order), found.examined, None,
             found.scores, len(living),
-        )
+        ).take(np.flatnonzero(found.scores >= np.array(self.least)[ranked]))
         calibration = self.encoder.calibration
 
         def judged(candidates: Candidates) -> Judgement:

@@ -2,9 +2,11 @@
 
 ``frames`` is a run with its odometry, ``smoothing`` the place of each frame by all others, ``anchors`` the frames beyond
 doubt and the way between them, ``proposals`` what a run teaches, ``corroboration`` which of it may be taken without a
-person, ``looks`` which of them a place keeps, and ``statistics`` how they serve and when one is withdrawn.
+person, ``cohort`` from which score on a look is believed, ``looks`` which of them a place keeps, and ``statistics`` how
+they serve and when one is withdrawn.
 """
 
+from core.learning.cohort import elsewhere, least_score
 from core.learning.corroboration import PendingProposal, corroborated
 from core.learning.frames import RunFrame, Trail
 from core.learning.looks import MOST_LOOKS, kept
@@ -24,7 +26,9 @@ __all__ = [
     "LookStatistics",
     "Trail",
     "corroborated",
+    "elsewhere",
     "kept",
+    "least_score",
     "lesson_of",
     "services",
     "smoothed",

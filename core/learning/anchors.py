@@ -21,7 +21,7 @@ from core.belief.motion import HEADING_SPREAD
 from core.learning.frames import RunFrame, Trail
 from core.learning.smoothing import Posterior
 
-SURE = 0.8
+SURE = 0.5
 """A recognized frame is an anchor from this probability of its own on."""
 
 AGREEING = 0.5

@@ -30,6 +30,12 @@ LOSING = 0.02
 """Probability, at each look, that a robot that does not see the map is not at any of its places any more.  Robots on
 detours give it a say: in maps without poses, motion alone does not tell that a robot has left the way."""
 
+WEIGHT = 1.5
+"""Weight of a frame's evidence, relative to that in a belief: there, less than half of what a frame says is counted, as
+every mistake is believed at once; here, the frames after it contradict it.  With 1.5, in a year of runs on corridor,
+lip6, nordland and fixed cameras (``python -m benchmarks.learning``), 5 338 of 7 423 frames are placed with a certainty of
+0.95 by the others, all of them right within two places; with 1, 5 140; with 2, 5 524, of which 4 are wrong."""
+
 STORED = 512
 """At most this many places of each frame are stored with probabilities of their own."""
 
@@ -190,7 +196,7 @@ def smoothed(looks: Sequence[WeighedFrame], graph: PlaceGraph, stored: int = STO
 
 
 def _tempered(look: WeighedFrame) -> Evidence:
-    return look.seen.tempered(look.share)
+    return look.seen.tempered(WEIGHT * look.share)
 
 
 def _start(n: int) -> _States:
