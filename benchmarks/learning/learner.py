@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.learning.living_map import EncodedPicture, LivingMap, Recognized
 from benchmarks.learning.worlds import RobotWorld
@@ -20,8 +21,8 @@ from core.learning import (
     PendingProposal,
     RunFrame,
     Trail,
+    cohort_of,
     corroborated,
-    elsewhere,
     kept,
     least_score,
     lesson_of,
@@ -82,6 +83,11 @@ class _Waiting:
     right: bool
     attacker: bool
 
+    @property
+    def key(self) -> tuple[str, int]:
+        """The run and the number of the frame in it."""
+        return self.pending.run, self.pending.proposal.frame
+
 
 @dataclass
 class _Learnt:
@@ -104,6 +110,7 @@ class Learner:
         self.waiting: list[_Waiting] = []
         self.learnt: dict[int, _Learnt] = {}
         self.runs = 0
+        self._between: dict[tuple[tuple[str, int], tuple[str, int]], float] = {}
 
     def live(self, run: EncodedRun) -> Tally:
         """Answer a run, then learn from it."""
@@ -174,8 +181,12 @@ class Learner:
             source = f"{run.plan.robot} {run.plan.number}"  # every run is of another day
             believable = answers[proposal.frame].believable
             frame = run.frames[proposal.frame]
-            others = [run.frames[one] for one in elsewhere(trail, proposal.frame, graph).tolist()]
-            least = least_score(self.map.scores_between(frame, others), self.map.encoder.calibration)
+            cohort = cohort_of(trail, proposal.frame, graph)
+            beside, far = (
+                self.map.scores_between(frame, [run.frames[one] for one in part.tolist()])
+                for part in (cohort.beside, cohort.far)
+            )
+            least = least_score(beside, far, self.map.encoder.calibration)
             if least is None:
                 continue
             tally.proposed += 1
@@ -191,8 +202,13 @@ class Learner:
             left: list[_Waiting] = []
         else:
 
-            def scores(number: int, others: Sequence[int]) -> np.ndarray:
-                return self.map.scores_between(self.waiting[number].frame, [self.waiting[one].frame for one in others])
+            def scores(number: int, others: Sequence[int]) -> NDArray[np.float32]:
+                one = self.waiting[number]
+                new = [at for at in others if (one.key, self.waiting[at].key) not in self._between]
+                found = self.map.scores_between(one.frame, [self.waiting[at].frame for at in new])
+                for at, score in zip(new, found.tolist(), strict=True):
+                    self._between[one.key, self.waiting[at].key] = score
+                return np.array([self._between[one.key, self.waiting[at].key] for at in others], np.float32)
 
             pending = [one.pending for one in self.waiting]
             chosen = set(corroborated(pending, graph, self.map.encoder.calibration, scores))

@@ -187,6 +187,8 @@ class LivingMap:
 
     def scores_between(self, one: EncodedPicture, others: Sequence[EncodedPicture]) -> NDArray[np.float32]:
         """The scores of both stages of a frame against others, float32 [k]."""
+        if not others:
+            return np.zeros(0, np.float32)
         descriptors = np.stack([one.descriptor, *(other.descriptor for other in others)])
         return likeness_of_first(self.encoder, descriptors, np.stack([one.local, *(other.local for other in others)]))
 

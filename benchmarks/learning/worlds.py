@@ -26,7 +26,7 @@ from core.frames.preprocessing import Pixels
 from lab.training.photographs import MIXED_CAMERAS, find_photographs, read
 from lab.training.validation import DAYLIGHT
 
-CUTS, WINDOW = 8, 0.55
+CUTS, WINDOW = 8, 0.4
 """Places that are cut from each fixed camera, and the share of its picture's width and height that each shows."""
 
 

@@ -6,7 +6,7 @@ person, ``cohort`` from which score on a look is believed, ``looks`` which of th
 they serve and when one is withdrawn.
 """
 
-from core.learning.cohort import elsewhere, least_score
+from core.learning.cohort import Cohort, cohort_of, least_score
 from core.learning.corroboration import PendingProposal, corroborated
 from core.learning.frames import RunFrame, Trail
 from core.learning.looks import MOST_LOOKS, kept
@@ -16,6 +16,7 @@ from core.learning.statistics import LookStatistics, services
 
 __all__ = [
     "MOST_LOOKS",
+    "Cohort",
     "Lesson",
     "WeighedFrame",
     "LessonOptions",
@@ -25,8 +26,8 @@ __all__ = [
     "RunFrame",
     "LookStatistics",
     "Trail",
+    "cohort_of",
     "corroborated",
-    "elsewhere",
     "kept",
     "least_score",
     "lesson_of",

@@ -9,6 +9,8 @@ scores of a cohort of impostors (Rosenberg et al., The use of cohort normalized 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +23,28 @@ from core.learning.frames import Trail
 LEAST_COHORT = 20
 """A look with fewer frames of its run elsewhere is not learnt: nobody knows what else looks like it."""
 
+CLEAR = 1.2
+"""Frames up to so many same-place radii away may show the same place, as odometry is not exact.  Those beyond show
+another."""
 
-def elsewhere(trail: Trail, number: int, graph: PlaceGraph, pace: float | None = None) -> NDArray[np.int64]:
-    """The frames of a run that cannot show what one of them shows, by odometry, int64 [k].
+STRICTER = 1.3
+"""A look is believed from this many times the score on at which its cohort would be left behind."""
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """The frames of a run that show other places than one of them, int64 [k] and [m].
+
+    beside: those that may overlap with it.
+    far: those that cannot.
+    """
+
+    beside: NDArray[np.int64]
+    far: NDArray[np.int64]
+
+
+def cohort_of(trail: Trail, number: int, graph: PlaceGraph, pace: float | None = None) -> Cohort:
+    """The frames of a run that show other places than one of them, by odometry.
 
     Covered and constant ones are left out, and those before or after a motion that is not known.
 
@@ -31,22 +52,22 @@ def elsewhere(trail: Trail, number: int, graph: PlaceGraph, pace: float | None =
         pace: frames of the map in a metre, for maps without poses; None: not known.
     """
     same = graph.neighborhood
-    reach = GUARD_FACTOR * same.radius
-    if not graph.posed.any() and pace:
-        reach = GUARD_FACTOR * max(same.frames, 1) / pace
-    apart = np.abs(trail.points - trail.points[number]) > reach
-    counts = np.array([one.sight is None for one in trail.frames], np.bool_)
-    return np.flatnonzero(apart & counts & (trail.piece == trail.piece[number]))
+    radius = same.radius if graph.posed.any() or not pace else max(same.frames, 1) / pace
+    apart = np.abs(trail.points - trail.points[number])
+    counts = np.array([one.sight is None for one in trail.frames], np.bool_) & (trail.piece == trail.piece[number])
+    far = apart > GUARD_FACTOR * radius
+    return Cohort(np.flatnonzero(counts & ~far & (apart > CLEAR * radius)), np.flatnonzero(counts & far))
 
 
-def least_score(scores: NDArray[np.floating], calibration: Calibration) -> float | None:
+def least_score(beside: NDArray[np.floating], far: NDArray[np.floating], calibration: Calibration) -> float | None:
     """The score from which on a match with a look is believed among its cohort; None if that is too small.
 
     Args:
-        scores: float [k], of both stages, of the look against the frames of its run that are elsewhere.
+        beside, far: float [k] and [m], the scores of both stages of the look against the frames of its :class:`Cohort`.
         calibration: by which the map's queries are judged.
     """
-    if len(scores) < LEAST_COHORT:
+    if len(far) < LEAST_COHORT:
         return None
-    rest = np.sort(np.asarray(scores, np.float64))[::-1]
-    return believable_score(rest, len(rest), calibration)[1]
+    rest = np.sort(np.asarray(far, np.float64))[::-1]
+    believable = believable_score(rest, len(rest), calibration)[1]
+    return max(STRICTER * believable, float(beside.max(initial=-np.inf)))
