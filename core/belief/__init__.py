@@ -10,9 +10,9 @@ from core.belief.estimate import Candidate, Estimate
 from core.belief.evidence import NOTHING, Evidence, Sighting, evidence, evidence_of, sighted
 from core.belief.graph import PlaceGraph, place_graph
 from core.belief.motion import Odometry, Step, Stride
-from core.belief.odometry import OdometryPose
+from core.belief.odometry import OdometryPose, motion_between
 from core.belief.record import DamagedRecord, from_bytes, to_bytes
-from core.belief.run import Run, RunOptions, RunState, Sight
+from core.belief.run import Run, RunOptions, RunState, Sight, freshness
 from core.belief.view import View, view_of
 
 __all__ = [
@@ -34,7 +34,9 @@ __all__ = [
     "View",
     "evidence",
     "evidence_of",
+    "freshness",
     "from_bytes",
+    "motion_between",
     "place_graph",
     "sighted",
     "to_bytes",

@@ -110,6 +110,18 @@ def _apart(speed: ArrayLike) -> NDArray[np.float64]:
     return np.clip(np.sqrt(speed), 1.0, FIRST)
 
 
+def freshness(motion: Odometry | None, spacing: float) -> float:
+    """The weight of a frame, from SAME_SPOT to 1: less than 1 if odometry says that the robot has hardly moved.
+
+    Args:
+        motion: since the last frame; None: it is not known.
+        spacing: metres between places of the map; 0: they have no poses.
+    """
+    if motion is None or not spacing:
+        return 1.0
+    return float(min(1.0, max(SAME_SPOT, motion.distance / (0.5 * spacing), abs(motion.turn) / TURN_NOTED)))
+
+
 class Run:
     """The belief of one run; two threads must not use it at the same time.
 
@@ -270,12 +282,7 @@ class Run:
         return step if step.reach is None else replace(step, reach=step.reach + self._pending_reach)
 
     def _freshness(self, step: Step) -> float:
-        """The weight of a frame: less than 1 if odometry says that the robot has hardly moved since the last one."""
-        if step.odometry is None or not self.frames or not self.graph.spacing:
-            return 1.0
-        moved = step.odometry.distance / (0.5 * self.graph.spacing)
-        turned = abs(step.odometry.turn) / TURN_NOTED
-        return float(min(1.0, max(SAME_SPOT, moved, turned)))
+        return freshness(step.odometry, self.graph.spacing) if self.frames else 1.0
 
     def estimate(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
         """Where the robot is; this counts unrecognized frames, so call it once for each frame.

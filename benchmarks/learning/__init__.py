@@ -1,0 +1,1 @@
+"""A year in which maps learn from their robots."""

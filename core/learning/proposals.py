@@ -1,0 +1,262 @@
+"""What a run teaches: frames whose place the whole run knows beyond doubt, although alone they were not recognized.
+
+Each becomes a proposal, a further look of its place, unless something speaks against it: the view was covered, or shows
+what the frame before it showed; the rest of the run leaves doubt; there is no anchor shortly before or after it, or
+their way by odometry leads to another place or turns another way; or keypoints of the frame do not fit those of an
+anchor of the same run that was taken where the views overlap.
+
+A run teaches nothing at all if too few of its frames are recognized, or if the run contradicts too many of those that
+are: then the robot is in another building, or its odometry is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.belief import PlaceGraph
+from core.geometry.verification import LEAST_MATCHES, verify
+from core.learning.anchors import Fit, Way, anchors_of, pace_of, place_of
+from core.learning.frames import RunFrame, Trail
+from core.learning.smoothing import Posterior, smoothed
+
+LEAST_PROBABILITY = 0.95
+"""Certainty from which a frame's place counts as known."""
+
+LEAST_ANCHORS = 6
+"""A run with fewer anchors teaches nothing."""
+
+LEAST_AGREEING = 0.7
+"""A run teaches nothing if it contradicts more than the rest of the frames that are sure of themselves."""
+
+TURNED = math.radians(30)
+"""A robot that looks farther than this from where the map looked sees something else."""
+
+OVERLAPPING = 1.0
+"""Anchors up to this many same-place radii of way from a frame show part of what it shows."""
+
+FITTING, STRANGE = 60.0, 8.0
+"""Evidence (``core.geometry.verification``) from which keypoints prove that two frames overlap, and under which they
+deny it."""
+
+DESCRIBED = 40
+"""Keypoints that both frames must have for the lack of evidence to mean anything."""
+
+Refusal = Literal["recognized", "covered", "constant", "uncertain", "no anchors", "odometry", "turned", "geometry"]
+"""Why a frame is no proposal: it was recognized at its place; its view; or what speaks against it."""
+
+Contradiction = Literal["no places", "too few recognized", "contradicted"]
+"""Why a run teaches nothing."""
+
+
+@dataclass(frozen=True)
+class LessonOptions:
+    """How sure proposals must be.
+
+    least_probability: the probability of the place by the rest of the run.
+    least_anchors: of a run.
+    """
+
+    least_probability: float = LEAST_PROBABILITY
+    least_anchors: int = LEAST_ANCHORS
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A frame of a run as a further look of a place.
+
+    frame: its number in the run.
+    row: of the map, a frame of the place.
+    certainty: the probability of the place and those that are the same place, by the rest of the run.
+    anchors: numbers of the nearest recognized frames before and after it that agree with it.
+    distance: metres, or frames of the sequence without poses, between the place and where odometry puts the frame.
+    misfit: the same between the anchors and the way of odometry, root mean square.
+    geometry: the best evidence that its keypoints overlap with those of a recognized frame beside it; None: there is no
+        such frame with keypoints.
+    why: a sentence for a person.
+    """
+
+    frame: int
+    row: int
+    certainty: float
+    anchors: tuple[int, int]
+    distance: float
+    misfit: float
+    geometry: float | None
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What a run teaches.
+
+    proposals: in the order of the frames.
+    contradiction: why the run teaches nothing; None if it may.
+    anchors: int64 [a], the frames that are beyond doubt.
+    contradicted: int64 [c], those that were sure of themselves at a place that the run denies.
+    rows: int64 [n], the place of each frame that the rest of the run is certain of, as a row of the map; -1: none.
+    refused: why frames are no proposals, and how many.
+    """
+
+    proposals: tuple[Proposal, ...]
+    contradiction: Contradiction | None
+    anchors: NDArray[np.int64]
+    contradicted: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    refused: Mapping[Refusal, int] = field(default_factory=dict)
+
+
+def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOptions | None = None) -> Lesson:
+    """What a whole run teaches a map.
+
+    Args:
+        frames: of one robot, in the order in which they were taken.
+        graph: of the places that the frames were judged against.
+        options: None: the usual.
+    """
+    options = options or LessonOptions()
+    none = np.empty(0, np.int64)
+    if not len(graph) or not len(frames):
+        return Lesson((), "no places", none, none, np.full(len(frames), -1, np.int64))
+    trail = Trail.of(frames)
+    pace = None if graph.posed.all() else pace_of(trail, graph)
+    posteriors = smoothed(trail.looks(graph, pace), graph)
+    anchors, contradicted = anchors_of(frames, posteriors, graph)
+    contradiction = _contradiction(len(anchors), len(contradicted), options)
+    if contradiction is not None:
+        return Lesson((), contradiction, anchors, contradicted, np.full(len(frames), -1, np.int64))
+    judge = _Judge(frames, graph, posteriors, Way(trail, anchors, graph, pace), options)
+    found: list[Proposal] = []
+    refused: Counter[Refusal] = Counter()
+    rows = np.full(len(frames), -1, np.int64)
+    for number in range(len(frames)):
+        place = judge.place(number)
+        if place is not None and judge.fits(number, place):
+            rows[number] = graph.rows[place]
+        outcome = judge.outcome(number, place)
+        if isinstance(outcome, Proposal):
+            found.append(outcome)
+        else:
+            refused[outcome] += 1
+    return Lesson(tuple(found), None, anchors, contradicted, rows, refused)
+
+
+def _contradiction(anchors: int, contradicted: int, options: LessonOptions) -> Contradiction | None:
+    if anchors < options.least_anchors:
+        return "too few recognized"
+    return "contradicted" if anchors < LEAST_AGREEING * (anchors + contradicted) else None
+
+
+class _Judge:
+    """Judges the frames of one run."""
+
+    def __init__(
+        self,
+        frames: Sequence[RunFrame],
+        graph: PlaceGraph,
+        posteriors: Sequence[Posterior],
+        way: Way,
+        options: LessonOptions,
+    ) -> None:
+        self.frames, self.graph, self.posteriors, self.way, self.options = frames, graph, posteriors, way, options
+        self._fits: dict[int, Fit | None] = {}
+
+    def fit(self, number: int) -> Fit | None:
+        """As of :meth:`core.learning.anchors.Way.fit`."""
+        if number not in self._fits:
+            self._fits[number] = self.way.fit(number)
+        return self._fits[number]
+
+    def place(self, number: int) -> int | None:
+        """The place of a frame that the rest of the run is certain of: of the same places the likeliest one.
+
+        Among places that are the same, the frame may have a say itself.
+        """
+        posterior = self.posteriors[number]
+        best = posterior.best
+        if best is None:
+            return None
+        same = self.graph.same_place(best)
+        if posterior.at(same) < self.options.least_probability:
+            return None
+        places, gains = self.graph.evidence_at(self.frames[number].seen)
+        own = dict(zip(places.tolist(), gains.tolist(), strict=True))
+        there = dict(zip(posterior.places.tolist(), posterior.probabilities.tolist(), strict=True))
+        chosen = max(same.tolist(), key=lambda one: there.get(one, 0.0) * math.exp(own.get(one, 0.0)))
+        return int(chosen)
+
+    def fits(self, number: int, place: int) -> bool:
+        """Whether odometry leads a frame from its anchors to a place, looking the same way."""
+        fit = self.fit(number)
+        return fit is not None and self._near(fit, place) and self.way.turned(fit, place) <= TURNED
+
+    def _near(self, fit: Fit, place: int) -> bool:
+        same = self.graph.neighborhood
+        return self.way.distance(fit, place) <= (0.5 * same.radius if fit.point is not None else 0.5 * same.frames + 0.5)
+
+    def outcome(self, number: int, place: int | None) -> Proposal | Refusal:
+        """The proposal that a frame is, or why it is none."""
+        frame = self.frames[number]
+        if frame.sight is not None:
+            return frame.sight
+        if place is None:
+            return "uncertain"
+        same = self.graph.same_place(place)
+        if frame.verdict == "recognized" and frame.row is not None and place_of(self.graph, frame.row) in same:
+            return "recognized"
+        fit = self.fit(number)
+        if fit is None:
+            return "no anchors"
+        if not self._near(fit, place):
+            return "odometry"
+        if self.way.turned(fit, place) > TURNED:
+            return "turned"
+        geometry, denied = self._geometry(number)
+        if denied:
+            return "geometry"
+        certainty = self.posteriors[number].at(same)
+        distance = self.way.distance(fit, place)
+        return Proposal(
+            number,
+            int(self.graph.rows[place]),
+            certainty,
+            (fit.before, fit.after),
+            distance,
+            fit.misfit,
+            geometry,
+            _reason(frame, certainty, fit, distance, geometry),
+        )
+
+    def _geometry(self, number: int) -> tuple[float | None, bool]:
+        """The best evidence that a frame overlaps with an anchor beside it, and whether that is denied."""
+        query = self.frames[number].keypoints
+        travelled, piece = self.way.trail.travelled, self.way.trail.piece
+        reach = self.way.reach()
+        if query is None or len(query) < LEAST_MATCHES or reach is None:
+            return None, False
+        anchors = self.way.anchors[piece[self.way.anchors] == piece[number]]
+        apart = np.abs(travelled[anchors] - travelled[number])
+        near = anchors[apart <= OVERLAPPING * self.graph.neighborhood.radius]
+        near = near[np.argsort(np.abs(near - number), kind="stable")][:4]
+        beside = [one for at in near.tolist() if at != number and (one := self.frames[at].keypoints) is not None]
+        if not beside:
+            return None, False
+        best = max(one.evidence for one in verify(query, beside))
+        described = len(query) >= DESCRIBED and max(map(len, beside)) >= DESCRIBED
+        return best, described and best < STRANGE
+
+
+def _reason(frame: RunFrame, certainty: float, fit: Fit, distance: float, geometry: float | None) -> str:
+    alone = {"recognized": "at another place", "ambiguous": "ambiguous", "unknown": "unknown"}[frame.verdict]
+    unit = "m" if fit.point is not None else "frames"
+    text = (
+        f"Alone the frame was {alone}; the rest of the run puts it here with {certainty:.3f}. Odometry from the recognized "
+        f"frames {fit.before} and {fit.after} leads within {distance:.1f} {unit}."
+    )
+    return text if geometry is None else f"{text} Its keypoints fit a recognized frame beside it with {geometry:.0f}."
