@@ -48,6 +48,27 @@ class ReviewSetting(BaseModel):
         return count <= self.most_frames and size <= self.most_bytes
 
 
+LearningMode = Literal["off", "propose"]
+"""What a map learns from runs: nothing; or looks are stored for review, and a person accepts them."""
+
+
+class LearningSetting(BaseModel):
+    """What a map learns from the runs of its robots."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: LearningMode = Field(
+        default="off", description="propose: looks are stored for review, and a person accepts them; off: nothing."
+    )
+    least_probability: float = Field(
+        strict=True,
+        default=0.95,
+        ge=0.5,
+        lt=1,
+        description="How sure the rest of a run must be of a frame's place for the frame to be proposed.",
+    )
+
+
 class MapSettings(BaseModel):
     """The settings of a map that its owner may choose, when it is made and later."""
 
@@ -81,6 +102,9 @@ class MapSettings(BaseModel):
     )
     review: ReviewSetting | None = Field(
         default=None, description="Which frames are stored to be reviewed by people; null: none."
+    )
+    learning: LearningSetting = Field(
+        default=LearningSetting(), description="What the map learns from the runs of its robots."
     )
 
 

@@ -48,8 +48,13 @@ class Review(Protocol):
     """The frames of one map stored for review.  Any thread may use it; every method may raise StorageFull
     and StorageFailure."""
 
-    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
+    def keep(
+        self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False
+    ) -> bool:
         """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
+
+        Args:
+            renew: if the same file is stored already, and has no label, it gets this answer in place of its former one.
 
         Returns:
             Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.

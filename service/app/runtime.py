@@ -19,6 +19,8 @@ from service.app.probe import Probe
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
+from service.learning import lessons
+from service.learning.run_notes import RunNotes
 from service.maps import calibration, storage_jobs
 from service.maps.exports import Exports
 from service.maps.imports import Imports
@@ -30,6 +32,7 @@ from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
 from service.ray_serve import encoders_for
+from service.sessions.session import Session
 from service.sessions.sessions import Sessions
 from service.sessions.table import session_file
 from service.settings import Settings, unknown_variables
@@ -98,6 +101,12 @@ class Runtime:
         silent = "The object store does not answer."
         self._pictures = Probe(maps.check_pictures, PICTURES_CHECK_SECONDS, silent)
         self._register_jobs()
+        self.sessions.on_run = self._learn
+
+    def _learn(self, session: Session, notes: RunNotes) -> None:
+        """Have a map learn from a run that is over."""
+        camera = session.options.camera
+        lessons.submit(self.engine, self.jobs, session.map_id, session.map_created_at, camera, notes)
 
     def _register_jobs(self) -> None:
         """Register the kinds of jobs that continue after a restart; ``Imports`` registers its own."""

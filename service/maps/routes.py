@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from core import errors
 from core.judgement.verdict import Calibration
-from core.maps import Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
+from core.maps import LearningSetting, Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
 from core.maps.pagination import Listing, decode_name, page_of
 from core.places import check_map_id
 from service.engine.engine import Engine
@@ -38,6 +38,7 @@ from service.maps.limits import check_map_count
 from service.maps.map_events import tell_end, tell_map
 from service.maps.schemas import (
     CalibrationChanges,
+    LearningChanges,
     MapChanges,
     MapPage,
     MapView,
@@ -58,6 +59,8 @@ router = APIRouter(
     responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
 )
 log = logging.getLogger("placerec.maps")
+
+Setting = TypeVar("Setting", ReviewSetting, LearningSetting)
 
 ALL_MAPS = "(all)"
 """The lock held while a map is created, so that two requests cannot both create the last map that is allowed; no map
@@ -209,23 +212,24 @@ def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[st
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     calibration, review = given.pop("calibration", None), given.pop("review", None)
+    learning = given.pop("learning", None)
     values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
     if "calibration" in changes.model_fields_set:
         values["calibration"] = _own_calibration(engine, map_, calibration)
     if "review" in changes.model_fields_set:
-        values["review"] = _own_review(map_, review)
+        kept = map_.record.review or ReviewSetting()
+        values["review"] = None if review is None else _changed(kept, ReviewSetting(), review)
+    if "learning" in changes.model_fields_set:
+        off = LearningSetting()
+        values["learning"] = off if learning is None else _changed(map_.record.learning, off, learning)
     return values
 
 
-def _own_review(map_: Map, changes: ReviewChanges | None) -> ReviewSetting | None:
-    if changes is None:
-        return None
-    defaults = ReviewSetting()
-    values = (map_.record.review or defaults).model_dump()
-    for name in changes.model_fields_set:
-        given = getattr(changes, name)
-        values[name] = getattr(defaults, name) if given is None else given
-    return ReviewSetting(**values)
+def _changed(now: Setting, default: Setting, changes: ReviewChanges | LearningChanges) -> Setting:
+    """A setting of several values after a merge patch; null stands for the default of a value."""
+    given = {name: getattr(changes, name) for name in changes.model_fields_set}
+    changed = {name: getattr(default, name) if value is None else value for name, value in given.items()}
+    return type(now)(**now.model_dump() | changed)
 
 
 def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:

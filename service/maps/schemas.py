@@ -10,8 +10,17 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
-from core.maps import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, StorageStatus, TierSetting
-from core.maps.records import COMPACT_FROM
+from core.maps import (
+    IndexStatus,
+    Keep,
+    LearningSetting,
+    MapSettings,
+    Precision,
+    ReviewSetting,
+    StorageStatus,
+    TierSetting,
+)
+from core.maps.records import COMPACT_FROM, LearningMode
 from core.places import Timestamp
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 from service.queries.counts import VerdictCounts
@@ -26,6 +35,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "same_place_frames": 3,
     "verification": True,
     "review": None,
+    "learning": {"mode": "off", "least_probability": 0.95},
     "calibration": {
         "source": "encoder-default",
         "threshold": 0.09,
@@ -78,6 +88,7 @@ class MapView(BaseModel):
     )
     verification: bool = Field(description="Whether keypoints of each frame are stored, by which answers are verified.")
     review: ReviewSetting | None = Field(description="Which frames are stored to be reviewed by people; null: none.")
+    learning: LearningSetting = Field(description="What the map learns from the runs of its robots.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
@@ -147,6 +158,15 @@ class ReviewChanges(BaseModel):
     most_bytes: int | None = Field(strict=True, default=None, ge=1 << 16, le=1 << 36)
 
 
+class LearningChanges(BaseModel):
+    """What to learn from runs; null restores a default."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mode: LearningMode | None = None
+    least_probability: float | None = Field(strict=True, default=None, ge=0.5, lt=1)
+
+
 class MapChanges(BaseModel):
     """A merge patch (RFC 7396) of a map: null restores the default, and what is left out stays as it is."""
 
@@ -165,6 +185,7 @@ class MapChanges(BaseModel):
         description=f"auto, exact or compact (auto from {COMPACT_FROM} places on).",
     )
     review: ReviewChanges | None = Field(default=None, description="null: no frames are stored from now on.")
+    learning: LearningChanges | None = Field(default=None, description="null: nothing is learnt from now on.")
     calibration: CalibrationChanges | None = None
 
 

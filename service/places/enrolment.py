@@ -22,6 +22,18 @@ from service.worker_threads import in_thread
 
 
 @dataclass(frozen=True)
+class LookOrigin:
+    """Where a look comes from.
+
+    run: the run from which it was learnt; None: a person added it.
+    least: the score of two stages from which a match with it is believed; None: from any.
+    """
+
+    run: str | None = None
+    least: float | None = None
+
+
+@dataclass(frozen=True)
 class FrameToEnrol:
     """One frame that a caller wants to store as the place ``id``.
 
@@ -29,6 +41,7 @@ class FrameToEnrol:
     data: the bytes of the file; None if the place already holds the frame and only its fields are set.
     mask: the part of the frame that is ignored.
     sha256: the digest of the frame that the place holds, 32 bytes; None if there are ``data``.
+    origin: of a look.
     """
 
     id: str
@@ -36,6 +49,7 @@ class FrameToEnrol:
     data: bytes | None
     mask: Mask | None = None
     sha256: bytes | None = None
+    origin: LookOrigin = LookOrigin()
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,7 @@ def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes
     Raises:
         NoRegions: the frame is blank, or nearly so.
     """
-    return describe(
+    described = describe(
         map_,
         frame.id,
         frame.fields,
@@ -88,6 +102,7 @@ def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes
         engine.settings.thumbnail_side,
         encoded.keypoints,
     )
+    return replace(described, run=frame.origin.run, least=frame.origin.least)
 
 
 def _raise(_index: int, error: Exception) -> None:
@@ -162,7 +177,13 @@ async def enrol(
 
 
 async def enrol_look(
-    engine: Engine, map_: Map, place_id: str, data: bytes, fields: PlaceFields, deadline: RequestDeadline
+    engine: Engine,
+    map_: Map,
+    place_id: str,
+    data: bytes,
+    fields: PlaceFields,
+    deadline: RequestDeadline,
+    origin: LookOrigin = LookOrigin(),
 ) -> EnrolledLook:
     """Add a frame to the looks of a place.
 
@@ -173,7 +194,7 @@ async def enrol_look(
         UnknownPlace, RepeatedLook, TooManyLooks: the place cannot have it.
         UnknownCamera, and what ``enrol`` raises.
     """
-    frame = FrameToEnrol(place_id, fields, data, await camera_mask(map_, fields.camera))
+    frame = FrameToEnrol(place_id, fields, data, await camera_mask(map_, fields.camera), origin=origin)
     await in_thread(map_.place, place_id)  # an unknown place is refused before its frame is encoded
     name = (await in_thread(digest_of, frame)).hex()[:16]
     stored = (await enrol(engine, map_, [replace(frame, id=look_address(place_id, name))], deadline))[0]

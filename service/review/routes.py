@@ -23,7 +23,7 @@ from service.http.openapi import BINARY
 from service.http.routing import DeadlineDep, EngineDep, MapId, StrictRoute, json_body, single_values
 from service.http.schemas import PageParameters
 from service.http.uploads import FORMATS
-from service.places.enrolment import FrameToEnrol, digest_of, enrol, enrol_look
+from service.places.enrolment import FrameToEnrol, LookOrigin, digest_of, enrol, enrol_look
 from service.places.schemas import PlaceView
 from service.review.schemas import ExportedLabel, Labelled, LabelList, LabelOrder, NewPlace, ReviewFrameView, ReviewPage
 from service.worker_threads import in_thread
@@ -159,13 +159,20 @@ async def _store(map_: Map, number: int, label: dict[str, Any], enrolled: PlaceV
 async def _add_look(engine: Engine, map_: Map, number: int, place_id: str, deadline: RequestDeadline) -> str:
     """Add a stored frame to the looks of a place, with the time and the camera of its query; returns the look's name.
 
+    A proposal for this place that a map has learnt becomes a learnt look.
+
     Raises:
         UnknownFrame, and what ``enrol_look`` raises.
     """
     stored = await in_thread(map_.review.find, number)
     data = await in_thread(map_.review.picture, number)
-    fields = PlaceFields(timestamp=stored.at, camera=stored.answer.get("camera"))
-    return (await enrol_look(engine, map_, place_id, data, fields, deadline)).name
+    proposal, taken, origin = stored.answer.get("proposal"), stored.at, LookOrigin()
+    if proposal is not None:
+        taken = None if proposal["taken"] is None else datetime.fromisoformat(proposal["taken"])
+        if proposal["place"] == place_id:
+            origin = LookOrigin(proposal["run"], proposal["least_score"])
+    fields = PlaceFields(timestamp=taken, camera=stored.answer.get("camera"))
+    return (await enrol_look(engine, map_, place_id, data, fields, deadline, origin)).name
 
 
 async def _enrol(engine: Engine, map_: Map, number: int, new: NewPlace, deadline: RequestDeadline) -> PlaceView:

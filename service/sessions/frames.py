@@ -6,20 +6,23 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-from core.belief import NOTHING, Candidate, Estimate, Run, Step, View, evidence_of, view_of
+from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence_of, view_of
+from core.learning import RunFrame
 from core.maps import Map
 from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
+from service.access.audit import ASKER
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.events.schemas import SessionEvent
 from service.http.routing import rounded
+from service.learning.run_notes import NotedFrame
 from service.places.schemas import PlaceView
 from service.queries.answers import answer_of
 from service.queries.following import follow_answer
-from service.queries.given_answers import QueriedFrame
+from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -79,7 +82,7 @@ async def process_frame(
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
             while True:
                 try:
-                    answer = await in_thread(
+                    answer, seen = await in_thread(
                         _advance, sessions, map_, session, run, answered.answer, view, single, options, request_id,
                         began,
                     )  # fmt: skip
@@ -91,6 +94,8 @@ async def process_frame(
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
+        if session.notes is not None:
+            _note(sessions, session, run, map_, data, options, answered.answer, seen, GivenAnswer.of(single, queried))
     total = {"total": answer.milliseconds["total"]}
     follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total)
     tell_belief(engine, map_, session, answer)
@@ -161,8 +166,8 @@ def _advance(
     options: FrameParameters,
     request_id: str | None,
     began: float,
-) -> SessionAnswer:
-    """Update the belief, save the session, and answer."""
+) -> tuple[SessionAnswer, Evidence]:
+    """Update the belief, save the session, and answer; also with what the frame alone said."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
     seen = NOTHING if answered.blank else evidence_of(answered, neighborhood_of(map_))
@@ -205,7 +210,35 @@ def _advance(
         session.moment = options.timestamp.timestamp()
     answer.saved = sessions.save(session)
     answer.milliseconds |= rounded({"save": 1e3 * (time.perf_counter() - started) - believed})
-    return answer
+    return answer, seen
+
+
+def _note(
+    sessions: Sessions,
+    session: Session,
+    run: Run,
+    map_: Map,
+    data: bytes,
+    options: FrameParameters,
+    answered: Answer,
+    seen: Evidence,
+    given: GivenAnswer,
+) -> None:
+    """Note a frame for what the map learns from the run; a run to which another key sends frames teaches nothing."""
+    notes = session.notes
+    if notes is None or notes.key != ASKER.get().key:
+        session.notes = None
+        return
+    rows = answered.candidates.rows
+    judgement = answered.judgement
+    frame = RunFrame(
+        seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None, options.odometry_pose(),
+        run.sight,
+    )  # fmt: skip
+    notes.add(NotedFrame(frame, data, options.timestamp, given.for_review(given.event(map_.record.id))))
+    if notes.full:
+        session.notes = notes.continued()
+        sessions.on_run(session, notes)
 
 
 def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, Motion]:

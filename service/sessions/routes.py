@@ -26,6 +26,7 @@ from service.http.routing import (
     FromState,
     MapId,
     Page,
+    PrincipalDep,
     StrictRoute,
     frame_for_map,
     json_body,
@@ -34,6 +35,7 @@ from service.http.routing import (
     single_values,
     started,
 )
+from service.learning.run_notes import new_notes
 from service.queries.answers import StatisticsDep
 from service.sessions.frames import process_frame, session_report, session_view
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView
@@ -63,13 +65,19 @@ GONE = problem_documentation(UnknownSession, SessionExpired)
     ),
 )
 def create_session(
-    map_id: MapId, new: NewSession, engine: EngineDep, sessions: SessionsDep, response: Response
+    map_id: MapId,
+    new: NewSession,
+    engine: EngineDep,
+    sessions: SessionsDep,
+    principal: PrincipalDep,
+    response: Response,
 ) -> SessionView:
     """Begin a session. It ends when it is deleted, or when no frame has come for `expires_after` seconds."""
     map_ = engine.maps.get(map_id)
     if new.camera is not None:
         map_.cameras.mask(new.camera)
     session = sessions.create(map_, new)
+    session.notes = new_notes(map_, session.id, principal)
     response.headers["Location"] = f"{engine.settings.root_path}/v1/maps/{map_id}/sessions/{session.id}"
     return session_view(session)
 

@@ -12,6 +12,7 @@ from core.belief import Run, to_bytes
 from core.maps import Map
 from core.maps.selection import Conditions, Selection
 from service.errors.faults import QueueFull
+from service.learning.run_notes import RunNotes
 from service.sessions.schemas import NewSession
 from service.sessions.table import SessionRecord
 
@@ -39,6 +40,7 @@ class Session:
     recorded: the revision of the record, as it was last seen.
     restored: whether the session was restored after a restart.
     streaming: whether a WebSocket streams into the session.
+    notes: what the map learns from, of the frames that this service has processed; None: it learns nothing.
     waiting: how many frames are being processed or wait for that.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
@@ -62,6 +64,7 @@ class Session:
     recorded: int = 0
     restored: bool = False
     streaming: bool = False
+    notes: RunNotes | None = None
     waiting: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)

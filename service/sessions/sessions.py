@@ -16,6 +16,7 @@ import json
 import logging
 import secrets
 import threading
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -30,6 +31,7 @@ from service.access.audit import ASKER
 from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NO_ASKER, SessionEvent
+from service.learning.run_notes import RunNotes
 from service.peers.peers import Peers
 from service.sessions.graphs import SessionGraphs
 from service.sessions.schemas import NewSession
@@ -61,9 +63,12 @@ class Sessions:
         events: receives the begin and the end of sessions.
         ledger: has the sessions.
         peers: the services that share it.
+
+    on_run: called with the notes of a run, or of a part of it, and its session, once they are complete.
     """
 
     def __init__(self, settings: Settings, events: Events, ledger: Ledger, peers: Peers) -> None:
+        self.on_run: Callable[[Session, RunNotes], None] = lambda _session, _notes: None
         self._settings, self._events, self._alone = settings, events, peers.alone
         self._ledger, self._table, self._graphs = ledger, SessionTable(ledger), SessionGraphs()
         self._lock = threading.RLock()
@@ -147,9 +152,11 @@ class Sessions:
     def _let_go(self, session_id: str) -> bool:
         """Hold a session no longer; whether it was held."""
         with self._lock:
-            held = self._held.pop(session_id, None) is not None
+            held = self._held.pop(session_id, None)
             self._graphs.drop_unused(self._held.values())
-            return held
+        if held is not None and held.notes is not None:
+            self.on_run(held, held.notes)
+        return held is not None
 
     def _begun_before(self, map_: Map, session: Session, begun_by: str | None) -> Session | None:
         """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""

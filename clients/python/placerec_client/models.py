@@ -952,6 +952,13 @@ class Layer(Model):
     columns: int
 
 
+class LearningSetting(Model):
+    """What a map learns from the runs of its robots."""
+
+    mode: Known[Literal["off", "propose"]] = "off"
+    least_probability: float = 0.95
+
+
 class LookView(Model):
     """A look of a place beside its first."""
 
@@ -1084,6 +1091,7 @@ class MapView(Model):
     same_place_frames: int
     verification: bool
     review: ReviewSetting | None = None
+    learning: LearningSetting
     calibration: Calibration | None = None
     index: IndexStatus
     storage: StorageStatus

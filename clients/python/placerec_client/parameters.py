@@ -775,6 +775,9 @@ class NewMap(TypedDict, total=False):
     review: ReviewSetting | None
     """Which frames are stored to be reviewed by people; null: none."""
 
+    learning: LearningSetting
+    """What the map learns from the runs of its robots."""
+
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
 
@@ -800,6 +803,9 @@ class MapChanges(TypedDict, total=False):
 
     review: ReviewChanges | None
     """null: no frames are stored from now on."""
+
+    learning: LearningChanges | None
+    """null: nothing is learnt from now on."""
 
     calibration: CalibrationChanges | None
 
@@ -1129,6 +1135,14 @@ class CalibrationChanges(TypedDict):
     margin: NotRequired[float | None]
 
 
+class LearningChanges(TypedDict):
+    """What to learn from runs; null restores a default."""
+
+    mode: NotRequired[Literal["off", "propose"] | None]
+
+    least_probability: NotRequired[float | None]
+
+
 class ReviewChanges(TypedDict):
     """Which frames to keep for review; null restores a default."""
 
@@ -1137,6 +1151,16 @@ class ReviewChanges(TypedDict):
     most_frames: NotRequired[int | None]
 
     most_bytes: NotRequired[int | None]
+
+
+class LearningSetting(TypedDict):
+    """What a map learns from the runs of its robots."""
+
+    mode: NotRequired[Literal["off", "propose"]]
+    """propose: looks are stored for review, and a person accepts them; off: nothing."""
+
+    least_probability: NotRequired[float]
+    """How sure the rest of a run must be of a frame's place for the frame to be proposed."""
 
 
 class ReviewSetting(TypedDict):

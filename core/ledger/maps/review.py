@@ -86,6 +86,12 @@ _LABEL = Statement(
     .where(_OF_MAP, _F.number == bindparam("which"))
     .values(label=bindparam("new_label"), seal=bindparam("new_seal"))
 )
+_BY_DIGEST = Statement(_READ.where(_F.digest == bindparam("digest")))
+_RENEW = Statement(
+    update(FRAMES)
+    .where(_OF_MAP, _F.number == bindparam("which"))
+    .values(answer=bindparam("new_answer"), seal=bindparam("new_seal"))
+)
 _DELETE = Statement(delete(FRAMES).where(_OF_MAP, among(_F.number, "numbers")))
 _DELETE_PICTURES = Statement(delete(_PICTURES).where(_P.map == bindparam("map"), among(_P.number, "numbers")))
 _PUT_PICTURE = Statement(
@@ -134,11 +140,13 @@ class ReviewTable(ABC):
         """Store a picture that its row names as an object, before the COMMIT."""
         raise NotImplementedError
 
-    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
+    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False) -> bool:
         if len(data) > setting.most_bytes:
             return False
         digest = hashlib.sha256(data).digest()
         with self._writing() as connection:
+            if renew and (known := connection.one(_BY_DIGEST, digest=digest)) is not None:
+                return _renewed(connection, known, answer)
             stored = self._picture_to_store(connection, data)
             ((number,),) = connection.execute(_NEXT)
             values = {
@@ -222,6 +230,15 @@ class ReviewTable(ABC):
         with self._writing() as connection:
             _expect(connection, number)
             drop(connection, [number])
+
+
+def _renewed(connection: MapConnection, known: tuple[Any, ...], answer: Mapping[str, Any]) -> bool:
+    """Give a stored frame another answer, unless it has a label; whether it got it."""
+    *columns, _ = known
+    before = dict(zip(_COLUMNS, columns, strict=True))
+    changed = sealed(_COLUMNS, {**before, "answer": json.dumps(answer)})
+    values = {"which": before["number"], "new_answer": changed["answer"], "new_seal": changed["seal"]}
+    return before["label"] is None and bool(connection.change(_RENEW, **values))
 
 
 def drop(connection: MapConnection, numbers: list[int]) -> None:

@@ -1,0 +1,190 @@
+"""The job that learns from a run: frames whose place the whole run knows beyond doubt are proposed as looks.
+
+It works on the notes of a run that is over (:mod:`service.learning.run_notes`), after the requests that wait, and
+changes nothing but the frames stored for review, where a proposal waits until a person accepts it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from contextlib import aclosing
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.belief import PlaceGraph, place_graph
+from core.errors import PlacerecError, UnknownCamera
+from core.frames.masks import Mask
+from core.learning import LessonOptions, Proposal, Trail, cohort_of, least_score, lesson_of
+from core.learning.proposals import LEAST_ANCHORS
+from core.maps import Map, ReviewSetting
+from core.maps.records import MOST_LOOKS
+from core.maps.stored_fields import moment_text
+from core.method.encoder import Encoder
+from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of
+from service.engine.encoders import Encoded
+from service.engine.engine import Engine
+from service.engine.queue import RequestDeadline
+from service.jobs.context import JobContext, run_after_requests
+from service.jobs.jobs import Jobs
+from service.learning.run_notes import RunNotes
+
+KIND = "learn"
+
+log = logging.getLogger("placerec.learning")
+
+TOGETHER = 16
+"""Frames that are encoded together; in between, requests go first."""
+
+
+def submit(engine: Engine, jobs: Jobs, map_id: str, made: str, camera: str | None, notes: RunNotes) -> None:
+    """Have a run's lesson drawn by a job; a run of too few frames teaches nothing.
+
+    If no job can be submitted now, the run teaches nothing, and the log says so.
+
+    Args:
+        map_id, made: of the map, and when it was created.
+        camera: of the session.
+    """
+    if len(notes.frames) < LEAST_ANCHORS:
+        return
+    work, arguments = partial(learn, engine, notes, camera), {"session": notes.session, "frames": len(notes.frames)}
+    try:
+        jobs.submit(KIND, map_id, work, arguments, {map_id: made})
+    except PlacerecError as error:
+        log.warning("session %s teaches its map nothing: %s", notes.session, error)
+
+
+def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobContext) -> Mapping[str, Any]:
+    """Propose looks from a run that is over.
+
+    Args:
+        camera: of the session.
+
+    Returns:
+        JSON: the frames of the run, how many of them were proposed as looks, and why others were not.
+
+    Raises:
+        UnknownMap, EncoderNotInstalled, StorageFull, StorageFailure: nothing but proposals was stored.
+        JobCancelled, JobInterrupted: likewise.
+    """
+    map_ = context.map(engine.maps)
+    setting = map_.record.learning
+    found: dict[str, Any] = {"session": notes.session, "frames": len(notes.frames), "proposals": 0}
+    if setting.mode == "off":
+        return found | {"contradiction": "off"}
+    encoder = engine.load_encoder(map_)
+    encoded = _encoded(engine, map_, notes, camera, context)
+    frames = [
+        replace(noted.frame, keypoints=None if isinstance(one, Exception) else one.keypoints)
+        for noted, one in zip(notes.frames, encoded, strict=True)
+    ]
+    snapshot = map_.snapshot()
+    graph = place_graph(
+        snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood_of(map_)
+    )
+    lesson = lesson_of(frames, graph, LessonOptions(least_probability=setting.least_probability))
+    scores = _Scores(encoder, encoded)
+    count = 0
+    for proposal in best_of_places(lesson.proposals):
+        context.check_cancelled()
+        least = _least(proposal, Trail.of(frames), graph, scores, map_, encoder)
+        if least is not None and _propose(map_, notes, proposal, least):
+            count += 1
+    return found | {
+        "proposals": count,
+        "contradiction": lesson.contradiction,
+        "anchors": len(lesson.anchors),
+        "refused": dict(lesson.refused),
+    }
+
+
+def best_of_places(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """Of several proposals of a run for one place the surest; in the order of the frames."""
+    best: dict[int, Proposal] = {}
+    for one in proposals:
+        if one.row not in best or one.certainty > best[one.row].certainty:
+            best[one.row] = one
+    return sorted(best.values(), key=lambda one: one.frame)
+
+
+class _Scores:
+    """The scores of frames of a run against one another."""
+
+    def __init__(self, encoder: Encoder, encoded: Sequence[Encoded | Exception]) -> None:
+        self._encoder, self._encoded = encoder, encoded
+
+    def of(self, frame: int, others: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The scores of both stages of a frame against others that could be encoded; float32 [k]."""
+        chosen = [self._encoded[number] for number in (frame, *others.tolist())]
+        usable = [one.encoding for one in chosen if not isinstance(one, Exception)]
+        if isinstance(chosen[0], Exception) or len(usable) < 2:
+            return np.zeros(0, np.float32)
+        descriptors, local = (np.stack([getattr(one, name) for one in usable]) for name in ("descriptor", "local"))
+        return likeness_of_first(self._encoder, descriptors, local)
+
+
+def _encoded(
+    engine: Engine, map_: Map, notes: RunNotes, camera: str | None, context: JobContext
+) -> list[Encoded | Exception]:
+    """The frames of a run with their keypoints, encoded after the requests that wait."""
+    mask = _mask(map_, camera)
+    found: list[Encoded | Exception] = []
+    for first in range(0, len(notes.frames), TOGETHER):
+        some = [noted.data for noted in notes.frames[first : first + TOGETHER]]
+
+        async def encode(deadline: RequestDeadline, some: Sequence[bytes] = some) -> dict[int, Encoded | Exception]:
+            made: dict[int, Encoded | Exception] = {}
+            masks = [mask] * len(some)
+            many = engine.queue.encode_many(map_.record.encoder, some, deadline, masks, keypoints=True)
+            async with aclosing(many) as outcomes:
+                async for done in outcomes:
+                    for index, one in done:
+                        made[index] = one if isinstance(one, Exception) else one.without_pixels()
+            return made
+
+        made = run_after_requests(engine, context, encode)
+        found += [made[index] for index in range(len(some))]
+        context.progress(len(found), len(notes.frames), "encoding the run")
+    return found
+
+
+def _mask(map_: Map, camera: str | None) -> Mask | None:
+    try:
+        return None if camera is None else map_.cameras.mask(camera)
+    except UnknownCamera:  # it was deleted during the run
+        return None
+
+
+def _least(
+    proposal: Proposal, trail: Trail, graph: PlaceGraph, scores: _Scores, map_: Map, encoder: Encoder
+) -> float | None:
+    """The score from which on a match with a proposed look is believed; None if the run does not tell it."""
+    cohort = cohort_of(trail, proposal.frame, graph)
+    beside, far = (scores.of(proposal.frame, part) for part in (cohort.beside, cohort.far))
+    return least_score(beside, far, calibration_of(map_, encoder))
+
+
+def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> bool:
+    """Store a proposal for review; whether there was room for it, and it is new."""
+    (place,) = map_.places_at([proposal.row])
+    if place is None or place.looks >= MOST_LOOKS:
+        return False
+    noted = notes.frames[proposal.frame]
+    told = {
+        "place": place.id,
+        "certainty": round(proposal.certainty, 6),
+        "distance": round(proposal.distance, 3),
+        "geometry": None if proposal.geometry is None else round(proposal.geometry, 1),
+        "why": proposal.why,
+        "run": notes.session,
+        "source": notes.source,
+        "least_score": least,
+        "taken": None if noted.taken is None else moment_text(noted.taken),
+    }
+    setting = map_.record.review or ReviewSetting()
+    return map_.review.keep(noted.data, {**noted.answer, "proposal": told}, setting, renew=True)

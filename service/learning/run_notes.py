@@ -1,0 +1,73 @@
+"""The notes of a run: what its lesson needs of each frame, in memory as long as the session lasts.
+
+A run that a crash ends teaches nothing: its notes are gone with the service.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+from core.learning import RunFrame
+from core.maps import Map
+from service.access.roles import Principal, covers
+
+MOST_FRAMES, MOST_BYTES = 600, 64 << 20
+"""The most frames of a run, and bytes of their files, that are noted together; a longer run has several lessons."""
+
+
+@dataclass(frozen=True)
+class NotedFrame:
+    """One frame of a run.
+
+    frame: as it was judged alone, without its keypoints.
+    data: the bytes of its file.
+    taken: when it was taken; None: the robot did not say.
+    answer: to the frame alone, as review has it; JSON values.
+    """
+
+    frame: RunFrame
+    data: bytes
+    taken: datetime | None
+    answer: dict[str, object]
+
+
+@dataclass
+class RunNotes:
+    """The frames of one session that are noted so far.
+
+    session: its id.
+    key: of its robot; None without keys.
+    source: a name for the robot and the day: runs of one source are one witness.
+    """
+
+    session: str
+    key: str | None
+    source: str
+    frames: list[NotedFrame] = field(default_factory=list)
+    bytes: int = 0
+
+    def add(self, noted: NotedFrame) -> None:
+        """Note the next frame."""
+        self.frames.append(noted)
+        self.bytes += len(noted.data)
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for a further frame."""
+        return len(self.frames) >= MOST_FRAMES or self.bytes >= MOST_BYTES
+
+    def continued(self) -> RunNotes:
+        """Empty notes of the same run."""
+        return RunNotes(self.session, self.key, self.source)
+
+
+def new_notes(map_: Map, session_id: str, principal: Principal) -> RunNotes | None:
+    """Notes of a session that begins; None if its map learns nothing, or not from this robot.
+
+    A robot whose key has the role ``query`` alone changes no map.
+    """
+    if map_.record.learning.mode == "off" or not covers(principal.role, "enrol"):
+        return None
+    today = datetime.now(UTC).date().isoformat()
+    return RunNotes(session_id, principal.key_id, f"{principal.key_id or principal.name} {today}")

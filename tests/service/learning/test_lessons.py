@@ -1,0 +1,158 @@
+"""A map that learns: frames that nobody recognized are proposed as looks of the places where the whole run puts them.
+
+The runs are those of ``eval/corridor``, a frame a metre, of which some stretches are darkened.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from service.access.keys import Keys
+from tests.service.map_jobs import finished
+from tests.service.server import Server, typed
+
+CORRIDOR = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
+DARK = range(25, 40)
+SAME = 3.0
+
+pytestmark = [
+    pytest.mark.thorough,
+    pytest.mark.skipif(not CORRIDOR.is_dir(), reason="needs the data set eval/corridor"),
+]
+
+
+def frames_of(folder: str) -> list[bytes]:
+    """The first sixty frames of a traverse, in their order."""
+    found = sorted((CORRIDOR / folder).iterdir(), key=lambda path: int(re.sub(r"\D", "", path.stem)))
+    return [path.read_bytes() for path in found[:60]]
+
+
+def darkened(data: bytes, seed: int) -> bytes:
+    """The frame at night, by a noisy camera."""
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(np.float32) / 255
+    noise = np.random.default_rng(seed).normal(0, 0.03, picture.shape)
+    shown = np.clip(255 * (0.35 * picture**2.5 + noise), 0, 255).astype(np.uint8)
+    return cv2.imencode(".png", shown)[1].tobytes()
+
+
+def by_night(number: int, data: bytes) -> bytes:
+    """A frame of a run, of which a stretch is dark."""
+    return darkened(data, number) if number in DARK else data
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server with the map ``hall``, which learns."""
+    server = Server(tmp_path_factory.mktemp("learning"), {}).wait()
+    server.create_map("hall", same_place_radius=SAME, learning={"mode": "propose"})
+    for number, data in enumerate(frames_of("ref")):
+        made = server.enrol("hall", f"p{number}", data, x=number, y=0, heading=0, sequence="day")
+        assert made.status_code == 201, made.text
+    yield server
+    assert server.stop() == 0
+
+
+def drive(server: Server, map_id: str, drift: float = 1.0, key: str | None = None) -> list[dict[str, Any]]:
+    """A run along the corridor, frame by frame; the answers.  The run is over when this returns."""
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    path = f"/v1/maps/{map_id}/sessions"
+    session = server.client.post(path, json={}, headers=headers).json()["id"]
+    answers = []
+    for number, plain in enumerate(frames_of("query")):
+        data = by_night(number, plain)
+        odometry = {"odometry_x": str(drift * number), "odometry_y": "0", "odometry_heading": "0"}
+        answer = server.client.post(
+            f"{path}/{session}/frames", params=odometry, content=data, headers=typed(data) | headers
+        )
+        assert answer.status_code == 200, answer.text
+        answers.append(answer.json())
+    assert server.client.delete(f"{path}/{session}", headers=headers).status_code == 204
+    return answers
+
+
+def lessons(server: Server, map_id: str) -> list[dict[str, Any]]:
+    """The results of the jobs that learnt for a map, the latest first, as soon as they are all over."""
+    jobs = server.client.get("/v1/jobs").json()["items"]
+    return [finished(server, job)["result"] for job in jobs if job["kind"] == "learn" and job["map"] == map_id]
+
+
+def proposals(server: Server, map_id: str) -> list[dict[str, Any]]:
+    page = server.client.get(f"/v1/maps/{map_id}/review", params={"limit": 100}).json()
+    return [frame for frame in page["items"] if "proposal" in frame["answer"]]
+
+
+def test_a_run_teaches_what_it_saw_in_the_dark(running: Server) -> None:
+    answers = drive(running, "hall")
+    doubted = [n for n in DARK if answers[n]["single"]["verdict"] != "recognized"]
+    assert len(doubted) >= 8, "the dark hides too little for a test"
+    result = lessons(running, "hall")[0]
+    assert result["frames"] == len(answers) and result["contradiction"] is None
+    found = proposals(running, "hall")
+    assert result["proposals"] == len(found) >= len(doubted) / 2
+    for frame in found:
+        proposal, alone = frame["answer"]["proposal"], frame["answer"]
+        assert alone["verdict"] != "recognized" and proposal["certainty"] >= 0.95 and proposal["why"]
+    assert running.client.get("/v1/maps/hall/looks").json()["items"] == [], "nobody has accepted any"
+    # A person accepts them all: the next run is recognized where the last one was not.
+    for frame in found:
+        place = frame["answer"]["proposal"]["place"]
+        accepted = running.client.post(f"/v1/maps/hall/review/{frame['id']}", json={"place": place, "look": True})
+        assert accepted.status_code == 200, accepted.text
+    looks = running.client.get("/v1/maps/hall/looks").json()["items"]
+    assert len(looks) == len(found)
+    assert {look["run"] for look in looks} == {result["session"]} and all(look["least_score"] for look in looks)
+    again = drive(running, "hall")
+    right = [n for n in doubted if (place := again[n]["single"]["place"]) and abs(int(place["id"][1:]) - n) <= SAME + 1]
+    wrong = [
+        n for n, answer in enumerate(again)
+        if (place := answer["single"]["place"]) and abs(int(place["id"][1:]) - n) > SAME + 2
+    ]  # fmt: skip
+    assert len(right) >= len(found) / 2 and not wrong
+    undone = running.client.delete("/v1/maps/hall/looks", params={"run": result["session"]}).json()
+    assert undone["looks"] == len(found)
+    assert running.client.get("/v1/maps/hall/looks").json()["items"] == []
+
+
+def test_a_run_with_wrong_odometry_teaches_nothing(running: Server) -> None:
+    lessons(running, "hall")  # those of the runs before are over
+    before = {frame["id"] for frame in proposals(running, "hall")}
+    drive(running, "hall", drift=4.0)
+    result = lessons(running, "hall")[0]
+    assert result["proposals"] == 0
+    assert {frame["id"] for frame in proposals(running, "hall")} == before
+
+
+def test_a_map_that_is_off_takes_no_notes(running: Server) -> None:
+    count = len(lessons(running, "hall"))
+    edited = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "off"}}).json()
+    assert edited["learning"] == {"mode": "off", "least_probability": 0.95}
+    drive(running, "hall")
+    assert len(lessons(running, "hall")) == count
+    restored = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "propose", "least_probability": 0.99}})
+    assert restored.json()["learning"] == {"mode": "propose", "least_probability": 0.99}
+    back = running.client.patch("/v1/maps/hall", json={"learning": {"least_probability": None}}).json()
+    assert back["learning"] == {"mode": "propose", "least_probability": 0.95}
+
+
+def test_a_robot_that_may_only_query_teaches_nothing(running: Server) -> None:
+    keys = Keys.of(running.data_dir)
+    _, admin = keys.create("admin", "admin")
+    _, query = keys.create("robot", "query")
+    _, enrol = keys.create("mapper", "enrol")
+    headers = {"Authorization": f"Bearer {admin}"}
+    running.client.headers.update(headers)
+    try:
+        count = len(lessons(running, "hall"))
+        drive(running, "hall", key=query)
+        assert len(lessons(running, "hall")) == count
+        drive(running, "hall", key=enrol)
+        assert len(lessons(running, "hall")) == count + 1
+    finally:
+        running.client.headers.pop("Authorization")
