@@ -232,6 +232,9 @@ class Look(BaseModel):
     least_score: float | None = Field(
         description="The score of two stages from which a match with it is believed; null: from any."
     )
+    right: int = Field(description="Frames that it won and that their runs are certain to be at its place.")
+    wrong: int = Field(description="Frames that it won and that their runs are certain to be elsewhere.")
+    passed: int = Field(description="Frames certain to be at its place that other looks of it won.")
     regions: int = Field(ge=0, description="Regions of interest found in its frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="The stored form of its frame.")
     created_at: Timestamp

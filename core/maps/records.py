@@ -48,8 +48,9 @@ class ReviewSetting(BaseModel):
         return count <= self.most_frames and size <= self.most_bytes
 
 
-LearningMode = Literal["off", "propose"]
-"""What a map learns from runs: nothing; or looks are stored for review, and a person accepts them."""
+LearningMode = Literal["off", "propose", "auto"]
+"""What a map learns from runs: nothing; looks wait for review, and a person accepts them; or the map takes those on
+which independent evidence agrees, and the others wait for a person."""
 
 
 class LearningSetting(BaseModel):
@@ -58,7 +59,10 @@ class LearningSetting(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     mode: LearningMode = Field(
-        default="off", description="propose: looks are stored for review, and a person accepts them; off: nothing."
+        default="off",
+        description="propose: looks are stored for review, and a person accepts them. auto: the map also takes those on "
+        "which two runs, or keypoints of the frames beside them, agree, and withdraws looks that later runs contradict. "
+        "off: nothing is learnt.",
     )
     least_probability: float = Field(
         strict=True,
@@ -66,6 +70,9 @@ class LearningSetting(BaseModel):
         ge=0.5,
         lt=1,
         description="How sure the rest of a run must be of a frame's place for the frame to be proposed.",
+    )
+    most_looks: Annotated[int, Field(strict=True, ge=2, le=33)] = Field(
+        default=3, description="Looks that a place has at most by what it learns, its first included."
     )
 
 

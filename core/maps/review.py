@@ -48,9 +48,7 @@ class Review(Protocol):
     """The frames of one map stored for review.  Any thread may use it; every method may raise StorageFull
     and StorageFailure."""
 
-    def keep(
-        self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False
-    ) -> bool:
+    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False) -> bool:
         """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
 
         Args:

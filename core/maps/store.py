@@ -410,6 +410,18 @@ class Map(Protocol):
             UnknownPlace, UnknownLook.
         """
 
+    def learnt_looks(self) -> dict[int, Look]:
+        """The looks that were learnt from runs, by row."""
+
+    def count_served(self, counts: Mapping[int, tuple[int, int, int]]) -> None:
+        """Add to how looks have served, by row: frames won rightly, won wrongly, and passed; in one write.
+
+        Rows that are no look's any more are left out.
+        """
+
+    def withdraw(self, rows: Sequence[int]) -> int:
+        """Delete learnt looks by row, all or, if this raises, none; returns how many were there."""
+
     def forget_learnt(self, run: str) -> int:
         """Delete the looks that were learnt from a run, all or, if this raises, none; returns how many there were."""
 

@@ -1,7 +1,8 @@
 """The job that learns from a run: frames whose place the whole run knows beyond doubt are proposed as looks.
 
-It works on the notes of a run that is over (:mod:`service.learning.run_notes`), after the requests that wait, and
-changes nothing but the frames stored for review, where a proposal waits until a person accepts it.
+It works on the notes of a run that is over (:mod:`service.learning.run_notes`), after the requests that wait.
+Proposals wait among the frames stored for review until a person accepts them or, with the setting ``auto``, until
+independent evidence agrees (:mod:`service.learning.adoption`).
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.jobs.context import JobContext, run_after_requests
 from service.jobs.jobs import Jobs
+from service.learning.adoption import Adoption
 from service.learning.run_notes import RunNotes
+from service.places.place_events import tell_change
 
 KIND = "learn"
 
@@ -78,15 +81,13 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     if setting.mode == "off":
         return found | {"contradiction": "off"}
     encoder = engine.load_encoder(map_)
-    encoded = _encoded(engine, map_, notes, camera, context)
+    encoded = _encoded(engine, map_, [noted.data for noted in notes.frames], camera, context)
     frames = [
         replace(noted.frame, keypoints=None if isinstance(one, Exception) else one.keypoints)
         for noted, one in zip(notes.frames, encoded, strict=True)
     ]
     snapshot = map_.snapshot()
-    graph = place_graph(
-        snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood_of(map_)
-    )
+    graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood_of(map_))
     lesson = lesson_of(frames, graph, LessonOptions(least_probability=setting.least_probability))
     scores = _Scores(encoder, encoded)
     count = 0
@@ -95,12 +96,26 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
         least = _least(proposal, Trail.of(frames), graph, scores, map_, encoder)
         if least is not None and _propose(map_, notes, proposal, least):
             count += 1
-    return found | {
+    found |= {
         "proposals": count,
         "contradiction": lesson.contradiction,
         "anchors": len(lesson.anchors),
         "refused": dict(lesson.refused),
     }
+    if setting.mode != "auto":
+        return found
+
+    def encode(files: Sequence[bytes]) -> list[Encoded | Exception]:
+        return _encoded(engine, map_, files, camera, context, pixels=True)
+
+    adoption = Adoption(map_, encoder, graph, encode, setting.most_looks)
+    withdrawn = adoption.observe(lesson, frames)
+    context.check_cancelled()
+    taken = adoption.take()
+    withdrawn += adoption.rehearse(lesson, frames, encoded) if taken else 0
+    tell_change(engine, map_, "look-added", taken)
+    tell_change(engine, map_, "look-removed", withdrawn)
+    return found | {"taken": taken, "withdrawn": withdrawn}
 
 
 def best_of_places(proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -129,13 +144,22 @@ class _Scores:
 
 
 def _encoded(
-    engine: Engine, map_: Map, notes: RunNotes, camera: str | None, context: JobContext
+    engine: Engine,
+    map_: Map,
+    files: Sequence[bytes],
+    camera: str | None,
+    context: JobContext,
+    pixels: bool = False,
 ) -> list[Encoded | Exception]:
-    """The frames of a run with their keypoints, encoded after the requests that wait."""
+    """Frames with their keypoints, encoded after the requests that wait.
+
+    Args:
+        pixels: keep their pixels, too.
+    """
     mask = _mask(map_, camera)
     found: list[Encoded | Exception] = []
-    for first in range(0, len(notes.frames), TOGETHER):
-        some = [noted.data for noted in notes.frames[first : first + TOGETHER]]
+    for first in range(0, len(files), TOGETHER):
+        some = files[first : first + TOGETHER]
 
         async def encode(deadline: RequestDeadline, some: Sequence[bytes] = some) -> dict[int, Encoded | Exception]:
             made: dict[int, Encoded | Exception] = {}
@@ -144,12 +168,12 @@ def _encoded(
             async with aclosing(many) as outcomes:
                 async for done in outcomes:
                     for index, one in done:
-                        made[index] = one if isinstance(one, Exception) else one.without_pixels()
+                        made[index] = one if isinstance(one, Exception) or pixels else one.without_pixels()
             return made
 
         made = run_after_requests(engine, context, encode)
         found += [made[index] for index in range(len(some))]
-        context.progress(len(found), len(notes.frames), "encoding the run")
+        context.progress(len(found), len(files), "encoding frames")
     return found
 
 
@@ -178,6 +202,9 @@ def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> bo
     told = {
         "place": place.id,
         "certainty": round(proposal.certainty, 6),
+        "frame": proposal.frame,
+        "anchors": list(proposal.anchors),
+        "misfit": round(proposal.misfit, 3),
         "distance": round(proposal.distance, 3),
         "geometry": None if proposal.geometry is None else round(proposal.geometry, 1),
         "why": proposal.why,

@@ -35,7 +35,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "same_place_frames": 3,
     "verification": True,
     "review": None,
-    "learning": {"mode": "off", "least_probability": 0.95},
+    "learning": {"mode": "off", "least_probability": 0.95, "most_looks": 3},
     "calibration": {
         "source": "encoder-default",
         "threshold": 0.09,
@@ -165,6 +165,7 @@ class LearningChanges(BaseModel):
 
     mode: LearningMode | None = None
     least_probability: float | None = Field(strict=True, default=None, ge=0.5, lt=1)
+    most_looks: int | None = Field(strict=True, default=None, ge=2, le=33)
 
 
 class MapChanges(BaseModel):

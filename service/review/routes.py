@@ -166,7 +166,8 @@ async def _add_look(engine: Engine, map_: Map, number: int, place_id: str, deadl
     """
     stored = await in_thread(map_.review.find, number)
     data = await in_thread(map_.review.picture, number)
-    proposal, taken, origin = stored.answer.get("proposal"), stored.at, LookOrigin()
+    proposal, origin = stored.answer.get("proposal"), LookOrigin()
+    taken: datetime | None = stored.at
     if proposal is not None:
         taken = None if proposal["taken"] is None else datetime.fromisoformat(proposal["taken"])
         if proposal["place"] == place_id:

@@ -38,7 +38,7 @@ class ReviewFrameView(BaseModel):
         description="How it was answered: `verdict`, `reason`, `probability`, `score`, `decision`, `threshold`, "
         "`best` (id of the best match), `matches` (`place` and `score` of the first five), `revision`; and whose it "
         "was: `camera`, `session`, `frame`, `file`, `operation`, `request_id`, `key`. `proposal`, if a run proposes the "
-        "frame as a look: `place`, `certainty`, `distance`, `geometry`, `why`, `run`, `source`, `least_score`, `taken`."
+        "frame as a look: among others `place`, `certainty`, `why`, `run`, `geometry`, `least_score`, `taken`."
     )
     label: ReviewLabel | None
     labelled_at: Timestamp | None

@@ -77,6 +77,7 @@ class LookModel:
     descriptor: Any
     keypoints: Any = None
     created: Any = ANY
+    served: tuple[int, int, int] = (0, 0, 0)
 
 
 @dataclass
@@ -227,6 +228,12 @@ class MapModel:
         if name not in self.place(place_id).looks:
             raise Refused("UnknownLook")
         del self.place(place_id).looks[name]
+
+    def count_served(self, place_id: str, name: str, more: tuple[int, int, int]) -> None:
+        """Add to how a look has served; nothing happens if it is not there."""
+        if place_id in self.places and (look := self.places[place_id].looks.get(name)) is not None:
+            right, wrong, passed = (a + b for a, b in zip(look.served, more, strict=True))
+            look.served = right, wrong, passed
 
     def forget_learnt(self, run: str) -> int:
         """Remove the looks that were learnt from a run; their number."""
@@ -422,6 +429,7 @@ class MapModel:
             "camera": look.camera,
             "run": look.run,
             "least_score": look.least,
+            **dict(zip(("right", "wrong", "passed"), look.served, strict=True)),
             "regions": shown.regions,
             "picture": look.kept,
             "created_at": look.created,

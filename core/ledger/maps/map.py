@@ -316,6 +316,35 @@ class LedgerMap(ABC):
                 raise UnknownLook(f"Place {place_id!r} has no look {look[:80]!r}.")
             write.forget(stored)
 
+    def learnt_looks(self) -> dict[int, Look]:
+        """The looks that were learnt from runs, by row."""
+        with self._reading() as connection:
+            return {
+                one.row: one.look() for one in places.looks_after(connection, -1, 1 << 62, None) if one.run is not None
+            }
+
+    def count_served(self, counts: Mapping[int, tuple[int, int, int]]) -> None:
+        """Add to how looks have served, by row: frames won rightly, won wrongly, and passed; in one commit.
+
+        Rows that are no look's any more are left out.
+        """
+        if not counts:
+            return
+        with self._writing() as write:
+            for row, stored in places.at_rows(write.connection, list(counts)).items():
+                if stored.look_of is not None:
+                    write.count_served(stored, *counts[row])
+
+    def withdraw(self, rows: Sequence[int]) -> int:
+        """Delete learnt looks by row, in one commit; returns how many were there."""
+        if not rows:
+            return 0
+        with self._writing() as write:
+            going = [one for one in places.at_rows(write.connection, list(rows)).values() if one.run is not None]
+            for stored in going:
+                write.forget(stored)
+        return len(going)
+
     def forget_learnt(self, run: str) -> int:
         """Delete the looks that were learnt from a run, all in one commit; returns how many there were."""
         with self._writing() as write:

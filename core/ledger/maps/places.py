@@ -49,7 +49,7 @@ _WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
 _STORED = _WHOLE.where(_P.map == bindparam("map"))
 _NUMBERS = (
     "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision", "look_of",
-    "seen", "run", "least",
+    "seen", "run", "least", "right", "wrong", "passed",
 )  # fmt: skip
 
 _IS_PLACE = _P.look_of.is_(None)
@@ -149,6 +149,7 @@ class StoredPlace:
     look_of: the number of the place whose look it is; None: it is a place.
     seen: when a look's frame was taken, as text; run: the run from which it was learnt.
     least: the score of two stages from which a match with a look is believed; None: from any.
+    right, wrong, passed: how a look has served.
     """
 
     number: int
@@ -166,6 +167,9 @@ class StoredPlace:
     seen: str | None = None
     run: str | None = None
     least: float | None = None
+    right: int = 0
+    wrong: int = 0
+    passed: int = 0
 
     def shown(self) -> Place:
         """The place as an answer has it: that of a look's row has the place's id, and the name of the look."""
@@ -183,6 +187,9 @@ class StoredPlace:
             camera=self.place.camera,
             run=self.run,
             least_score=self.least,
+            right=self.right,
+            wrong=self.wrong,
+            passed=self.passed,
             regions=self.place.regions,
             picture=self.place.picture,
             created_at=self.place.created_at,
@@ -441,7 +448,7 @@ def placed(item_id: str, fields: PlaceFields, sequence: int, ordinal: int, **val
     columns = {
         "id": item_id, "sequence": sequence, "ordinal": ordinal, "track": None, "station": None, "pose_of": None,
         "key": None, "look_of": None, "looks": 0, "seen": None, "run": None, "least": None,
-        **values, **field_columns(fields),
+        "right": 0, "wrong": 0, "passed": 0, **values, **field_columns(fields),
     }  # fmt: skip
     return _from_columns(columns, fields.sequence)
 

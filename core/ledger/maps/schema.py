@@ -65,6 +65,7 @@ SEQUENCES = _table(
 # of looks.  look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame,
 # camera and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run
 # from which it was learnt; least is the score of two stages from which a match with it is believed, NULL: from any.
+# right, wrong and passed are how it has served since (:class:`core.learning.LookStatistics`).
 PLACES = _table(
     "places", ("number",),
     _column("number", integer()),  # grows in the order of enrolment
@@ -88,6 +89,7 @@ PLACES = _table(
     _column("seen", text(), optional=True),
     _column("run", text(), optional=True),
     _column("least", real(), optional=True),
+    *(_column(name, integer()) for name in ("right", "wrong", "passed")),
     _column("created_at", text()),
     _column("updated_at", text()),
     _column("key", integer(), optional=True),  # of its entity in Milvus

@@ -385,6 +385,11 @@ class Write(ABC):
             return stored.place, "unchanged"
         return self._put(self._with_fields(stored, fields), stored).place, "updated"
 
+    def count_served(self, stored: StoredPlace, right: int, wrong: int, passed: int) -> None:
+        """Add to how a look has served."""
+        counted = replace(stored, right=stored.right + right, wrong=stored.wrong + wrong, passed=stored.passed + passed)
+        self._put(counted, stored, searched=False)
+
     def adopt(self, item: Enrolment, history: History) -> None:
         """Store a place of another map, or a look of a place, with its history."""
         with suppress(RepeatedLook, TooManyLooks):  # the place has other looks here

@@ -182,6 +182,29 @@ class StoreContract(RuleBasedStateMachine):
         name = shown(picture).digest[:16]
         self.agree(lambda model: model.forget_look(place_id, name), lambda lab: lab.forget_look(place_id, name))
 
+    @rule(place_id=ids, picture=pictures, more=st.tuples(st.integers(0, 2), st.integers(0, 2), st.integers(0, 2)))
+    def count_served(self, place_id: str, picture: str, more: tuple[int, int, int]) -> None:
+        name = shown(picture).digest[:16]
+
+        def counted(lab: Map) -> None:
+            (row,) = lab.rows_of([look_address(place_id, name)])
+            lab.count_served({} if row is None else {row: more})
+
+        self.agree(lambda model: model.count_served(place_id, name, more), counted)
+
+    @rule(place_id=ids, picture=pictures)
+    def withdraw(self, place_id: str, picture: str) -> None:
+        """Only a learnt look can be withdrawn by its row."""
+        name = shown(picture).digest[:16]
+        (row,) = self.map.rows_of([look_address(place_id, name)])
+        look = self.model.places[place_id].looks[name] if row is not None else None
+        learnt = look is not None and look.run is not None
+        assert (row in self.map.learnt_looks()) == learnt
+        self.agree(
+            lambda model: (model.forget_look(place_id, name) or 1) if learnt else 0,
+            lambda lab: lab.withdraw([] if row is None else [row]),
+        )
+
     @rule(run=st.sampled_from(["night", "snow"]))
     def forget_learnt(self, run: str) -> None:
         self.agree(lambda model: model.forget_learnt(run), lambda lab: lab.forget_learnt(run))

@@ -6,7 +6,7 @@ The runs are those of ``eval/corridor``, a frame a metre, of which some stretche
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +59,20 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     assert server.stop() == 0
 
 
-def drive(server: Server, map_id: str, drift: float = 1.0, key: str | None = None) -> list[dict[str, Any]]:
-    """A run along the corridor, frame by frame; the answers.  The run is over when this returns."""
+def drive(
+    server: Server, map_id: str, drift: float = 1.0, key: str | None = None, frames: Sequence[bytes] | None = None
+) -> list[dict[str, Any]]:
+    """A run along the corridor, frame by frame; the answers.  The run is over when this returns.
+
+    Args:
+        drift: metres that odometry tells for a metre.
+        frames: None: those of the second traverse.
+    """
     headers = {} if key is None else {"Authorization": f"Bearer {key}"}
     path = f"/v1/maps/{map_id}/sessions"
     session = server.client.post(path, json={}, headers=headers).json()["id"]
     answers = []
-    for number, plain in enumerate(frames_of("query")):
+    for number, plain in enumerate(frames or frames_of("query")):
         data = by_night(number, plain)
         odometry = {"odometry_x": str(drift * number), "odometry_y": "0", "odometry_heading": "0"}
         answer = server.client.post(
@@ -129,16 +136,23 @@ def test_a_run_with_wrong_odometry_teaches_nothing(running: Server) -> None:
     assert {frame["id"] for frame in proposals(running, "hall")} == before
 
 
+def test_a_run_through_another_building_teaches_nothing(running: Server) -> None:
+    elsewhere = sorted((CORRIDOR.parent / "lip6_outdoor" / "query").iterdir())[:60]
+    drive(running, "hall", frames=[path.read_bytes() for path in elsewhere])
+    result = lessons(running, "hall")[0]
+    assert (result["proposals"], result["contradiction"]) == (0, "too few recognized")
+
+
 def test_a_map_that_is_off_takes_no_notes(running: Server) -> None:
     count = len(lessons(running, "hall"))
     edited = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "off"}}).json()
-    assert edited["learning"] == {"mode": "off", "least_probability": 0.95}
+    assert edited["learning"] == {"mode": "off", "least_probability": 0.95, "most_looks": 3}
     drive(running, "hall")
     assert len(lessons(running, "hall")) == count
     restored = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "propose", "least_probability": 0.99}})
-    assert restored.json()["learning"] == {"mode": "propose", "least_probability": 0.99}
+    assert restored.json()["learning"] == {"mode": "propose", "least_probability": 0.99, "most_looks": 3}
     back = running.client.patch("/v1/maps/hall", json={"learning": {"least_probability": None}}).json()
-    assert back["learning"] == {"mode": "propose", "least_probability": 0.95}
+    assert back["learning"] == {"mode": "propose", "least_probability": 0.95, "most_looks": 3}
 
 
 def test_a_robot_that_may_only_query_teaches_nothing(running: Server) -> None:
@@ -156,3 +170,32 @@ def test_a_robot_that_may_only_query_teaches_nothing(running: Server) -> None:
         assert len(lessons(running, "hall")) == count + 1
     finally:
         running.client.headers.pop("Authorization")
+
+
+def test_a_map_takes_by_itself_what_keypoints_agree_on(running: Server) -> None:
+    running.create_map("self-taught", same_place_radius=SAME, learning={"mode": "auto"})
+    for number, data in enumerate(frames_of("ref")):
+        running.enrol("self-taught", f"p{number}", data, x=number, y=0, heading=0, sequence="day")
+    first = drive(running, "self-taught")
+    result = lessons(running, "self-taught")[0]
+    looks = running.client.get("/v1/maps/self-taught/looks", params={"limit": 100}).json()["items"]
+    assert 0 < len(looks) <= result["taken"] <= result["proposals"]
+    assert all(look["run"] == result["session"] for look in looks)
+    labelled = running.client.get("/v1/maps/self-taught/review/labels").json()["items"]
+    assert {one["place"] for one in labelled} >= {look["place"] for look in looks}
+    assert all(one["labelled_by"].startswith("learning") for one in labelled)
+    second = drive(running, "self-taught")
+
+    def right(answers: list[dict[str, Any]]) -> int:
+        places = [answer["single"]["place"] for answer in answers]
+        return sum(one is not None and abs(int(one["id"][1:]) - n) <= SAME + 1 for n, one in enumerate(places))
+
+    def wrong(answers: list[dict[str, Any]]) -> int:
+        places = [answer["single"]["place"] for answer in answers]
+        return sum(one is not None and abs(int(one["id"][1:]) - n) > SAME + 2 for n, one in enumerate(places))
+
+    assert right(second) > right(first) and wrong(second) <= wrong(first)
+    lessons(running, "self-taught")
+    after = running.client.get("/v1/maps/self-taught/looks", params={"limit": 100}).json()["items"]
+    assert sum(look["right"] for look in after) > 0 and not any(look["wrong"] for look in after)
+    running.client.delete("/v1/maps/self-taught")
