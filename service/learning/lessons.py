@@ -27,6 +27,7 @@ from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
 from core.method.encoder import Encoder
 from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of
+from service.access.audit import ASKER
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
@@ -56,10 +57,13 @@ def submit(engine: Engine, jobs: Jobs, map_id: str, made: str, camera: str | Non
     if len(notes.frames) < LEAST_ANCHORS:
         return
     work, arguments = partial(learn, engine, notes, camera), {"session": notes.session, "frames": len(notes.frames)}
+    present = ASKER.set(notes.robot)  # whoever ends the session: the audit trail names who has taught the map
     try:
         jobs.submit(KIND, map_id, work, arguments, {map_id: made})
     except PlacerecError as error:
         log.warning("session %s teaches its map nothing: %s", notes.session, error)
+    finally:
+        ASKER.reset(present)
 
 
 def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobContext) -> Mapping[str, Any]:

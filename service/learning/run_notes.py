@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 from core.learning import RunFrame
 from core.maps import Map
+from service.access.audit import ASKER, Asker
 from service.access.roles import Principal, covers
 
 MOST_FRAMES, MOST_BYTES = 600, 64 << 20
@@ -37,12 +38,12 @@ class RunNotes:
     """The frames of one session that are noted so far.
 
     session: its id.
-    key: of its robot; None without keys.
+    robot: who began it.
     source: a name for the robot and the day: runs of one source are one witness.
     """
 
     session: str
-    key: str | None
+    robot: Asker
     source: str
     frames: list[NotedFrame] = field(default_factory=list)
     bytes: int = 0
@@ -59,7 +60,7 @@ class RunNotes:
 
     def continued(self) -> RunNotes:
         """Empty notes of the same run."""
-        return RunNotes(self.session, self.key, self.source)
+        return RunNotes(self.session, self.robot, self.source)
 
 
 def new_notes(map_: Map, session_id: str, principal: Principal) -> RunNotes | None:
@@ -70,4 +71,4 @@ def new_notes(map_: Map, session_id: str, principal: Principal) -> RunNotes | No
     if map_.record.learning.mode == "off" or not covers(principal.role, "enrol"):
         return None
     today = datetime.now(UTC).date().isoformat()
-    return RunNotes(session_id, principal.key_id, f"{principal.key_id or principal.name} {today}")
+    return RunNotes(session_id, ASKER.get(), f"{principal.key_id or principal.name} {today}")

@@ -226,7 +226,7 @@ def _note(
 ) -> None:
     """Note a frame for what the map learns from the run; a run to which another key sends frames teaches nothing."""
     notes = session.notes
-    if notes is None or notes.key != ASKER.get().key:
+    if notes is None or notes.robot.key != ASKER.get().key:
         session.notes = None
         return
     rows = answered.candidates.rows

@@ -19,6 +19,9 @@ class AddedLook(Model):
     camera: str | None = None
     run: str | None = None
     least_score: float | None = None
+    right: int
+    wrong: int
+    passed: int
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
     created_at: datetime
@@ -955,8 +958,9 @@ class Layer(Model):
 class LearningSetting(Model):
     """What a map learns from the runs of its robots."""
 
-    mode: Known[Literal["off", "propose"]] = "off"
+    mode: Known[Literal["off", "propose", "auto"]] = "off"
     least_probability: float = 0.95
+    most_looks: int = 3
 
 
 class LookView(Model):
@@ -967,6 +971,9 @@ class LookView(Model):
     camera: str | None = None
     run: str | None = None
     least_score: float | None = None
+    right: int
+    wrong: int
+    passed: int
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
     created_at: datetime

@@ -1138,9 +1138,11 @@ class CalibrationChanges(TypedDict):
 class LearningChanges(TypedDict):
     """What to learn from runs; null restores a default."""
 
-    mode: NotRequired[Literal["off", "propose"] | None]
+    mode: NotRequired[Literal["off", "propose", "auto"] | None]
 
     least_probability: NotRequired[float | None]
+
+    most_looks: NotRequired[int | None]
 
 
 class ReviewChanges(TypedDict):
@@ -1156,11 +1158,17 @@ class ReviewChanges(TypedDict):
 class LearningSetting(TypedDict):
     """What a map learns from the runs of its robots."""
 
-    mode: NotRequired[Literal["off", "propose"]]
-    """propose: looks are stored for review, and a person accepts them; off: nothing."""
+    mode: NotRequired[Literal["off", "propose", "auto"]]
+    """propose: looks are stored for review, and a person accepts them. auto: the map also takes those on which two
+    runs, or keypoints of the frames beside them, agree, and withdraws looks that later runs contradict. off: nothing
+    is learnt.
+    """
 
     least_probability: NotRequired[float]
     """How sure the rest of a run must be of a frame's place for the frame to be proposed."""
+
+    most_looks: NotRequired[int]
+    """Looks that a place has at most by what it learns, its first included."""
 
 
 class ReviewSetting(TypedDict):
