@@ -962,7 +962,7 @@ class Deletion(TypedDict, total=False):
 
 
 class LabelOrder(TypedDict, total=False):
-    """A label, or that the frame is thrown away: exactly one of these."""
+    """A label, that it is taken back, or that the frame is thrown away: exactly one of these."""
 
     place: str | None
     """It shows this place of the map."""
@@ -972,6 +972,9 @@ class LabelOrder(TypedDict, total=False):
 
     stranger: bool
     """It shows no place of this map."""
+
+    clear: bool
+    """Its label is taken back."""
 
     discard: bool
     """It is thrown away."""

@@ -1,5 +1,5 @@
 // The answer to one frame: the verdict, the matches beside the frame, why the best one matches, and what took how long.
-import { Facts, Verdict } from "./elements.js";
+import { Facts, Name, Verdict } from "./elements.js";
 import { decimal, encoderName, integer, metres, milliseconds, percent, poseText } from "./formats.js";
 import { Picture, Thumbnail, thumbnailPath } from "./pictures.js";
 import { href } from "./router.js";
@@ -120,9 +120,9 @@ function MatchTile({ map, match, chosen, choose }) {
       <button type="button" class="cover" aria-pressed=${chosen} aria-label=${`Show match ${rank}, ${place.id}`} onClick=${() => choose(rank)}>
         <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
       </button>
-      <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}>${place.id}</a><span>${decimal(score)}</span></span>
+      <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}><${Name} text=${place.id} /></a><span>${decimal(score)}</span></span>
       ${parts && html`<span class="faint small">${partsOf(parts)}${parts.inliers !== null && `, ${parts.inliers} inliers`}</span>`}
-      ${place.sequence && html`<span class="faint small clip">${place.sequence}</span>`}
+      ${place.sequence && html`<span class="faint small clip"><${Name} text=${place.sequence} /></span>`}
     </li>
   `;
 }

@@ -98,6 +98,21 @@ export function Facts({ rows }) {
   `;
 }
 
+const SHORT = 12;
+const END = 7;
+
+/** A name; where there is no room it is cut in its middle, for what distinguishes names is at their ends. */
+export function Name({ text }) {
+  const letters = Array.from(String(text));
+  if (letters.length <= SHORT) return html`<span class="middle">${text}</span>`;
+  return html`
+    <span class="middle" title=${text}>
+      <span class="hidden">${text}</span>
+      <span class="start" aria-hidden="true">${letters.slice(0, -END).join("")}</span><span class="end" aria-hidden="true">${letters.slice(-END).join("")}</span>
+    </span>
+  `;
+}
+
 // Head of a view
 
 export function Head({ title, note, children }) {

@@ -2,7 +2,7 @@
 // what they would cost.
 import { all, get, may, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
-import { ByName, Facts, Field, Head, Loading, Moment, Pill, Trouble, VerdictMix } from "../shared/elements.js";
+import { ByName, Facts, Field, Head, Loading, Moment, Name, Pill, Trouble, VerdictMix } from "../shared/elements.js";
 import { decimal, integer, metres, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -75,7 +75,7 @@ function Drift({ answers }) {
 function PlaceLinks({ map, ids, most = 8 }) {
   return html`
     <ul class="thumbs narrow">
-      ${ids.slice(0, most).map((id) => html`<li class="thumb" key=${id}><a href=${href("maps", map, "places", id)}><${Thumbnail} map=${map} place=${id} /><span class="name small">${id}</span></a></li>`)}
+      ${ids.slice(0, most).map((id) => html`<li class="thumb" key=${id}><a href=${href("maps", map, "places", id)}><${Thumbnail} map=${map} place=${id} /><span class="name small"><${Name} text=${id} /></span></a></li>`)}
     </ul>
     ${ids.length > most && html`<p class="faint small">and ${integer(ids.length - most)} more</p>`}
   `;
@@ -94,7 +94,7 @@ function Hubs({ map, items, unit }) {
   return html`
     <ul class="thumbs narrow">
       ${items.slice(0, 8).map((one) => html`
-        <li class="thumb" key=${one.place}><a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="name small">${one.place}</span></a>
+        <li class="thumb" key=${one.place}><a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="name small"><${Name} text=${one.place} /></span></a>
         <span class="faint small">${integer(one.count)} ${unit} ${decimal(one.expected, 1)}</span></li>
       `)}
     </ul>
@@ -107,8 +107,8 @@ function Aliases({ map, items }) {
     <ul class="aliases">
       ${items.slice(0, 6).map((one) => html`
         <li class="alias">
-          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small">${one.place}</span></a>
-          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small">${one.other}</span></a>
+          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small"><${Name} text=${one.place} /></span></a>
+          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small"><${Name} text=${one.other} /></span></a>
           <span class="small">${decimal(one.score)} <span class="faint">own ${decimal(one.own)}</span></span>
         </li>
       `)}

@@ -1,6 +1,6 @@
 // The places of a map as thumbnails, page by page and filtered; one place, where the address names it.
 import { get, may, post } from "../shared/api.js";
-import { ByName, complain, Field, Head, Moment, Nothing, Pager, Pill } from "../shared/elements.js";
+import { ByName, complain, Field, Head, Moment, Name, Nothing, Pager, Pill } from "../shared/elements.js";
 import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -150,8 +150,8 @@ function Tile({ map, place, chosen, toggle }) {
       ${may("enrol") && html`<input type="checkbox" aria-label=${`Choose ${place.id}`} checked=${chosen} onChange=${() => toggle(place.id)} />`}
       <a href=${href("maps", map, "places", place.id)} title=${poseText(place.pose)}>
         <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
-        <span class="name">${place.id}</span>
-        <span class="under faint small"><span>${place.sequence || "no traverse"}</span>${place.timestamp && html`<${Moment} at=${place.timestamp} />`}</span>
+        <span class="name"><${Name} text=${place.id} /></span>
+        <span class="under faint small"><span>${place.sequence ? html`<${Name} text=${place.sequence} />` : "no traverse"}</span>${place.timestamp && html`<${Moment} at=${place.timestamp} />`}</span>
       </a>
     </li>
   `;

@@ -1,7 +1,7 @@
 // The plan of a map: where its places lie, coloured by traverse, and where robots are now.  Without poses the traverses
 // lie below one another as strips.
 import { epoch, follow, get, may } from "../shared/api.js";
-import { complain, Facts, Head, Loading, Nothing } from "../shared/elements.js";
+import { complain, Facts, Head, Loading, Name, Nothing } from "../shared/elements.js";
 import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
 import { counted, exact, integer, metres, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
@@ -187,7 +187,7 @@ function Legend({ groups, off, setOff }) {
         <label>
           <input type="checkbox" checked=${!off.has(one.name)} onChange=${() => toggle(one.name)} />
           <span class="swatch" style=${{ background: traverseColour(one.name === null ? -1 : number) }}></span>
-          <span class="name" title=${one.name || ""}>${one.name ?? html`<em>no traverse</em>`}</span>
+          <span class="name">${one.name === null ? html`<em>no traverse</em>` : html`<${Name} text=${one.name} />`}</span>
           <span class="faint">${integer(one.places.length)}</span>
         </label>
       `)}
