@@ -539,6 +539,7 @@ class CalibrationState(Model):
     measured: LatestMeasurement | None = None
     now: Effect | None = None
     then: Effect | None = None
+    proposed: Effect | None = None
 
 
 class Intrinsics(Model):

@@ -1095,11 +1095,16 @@ class NewPlace(TypedDict):
 
 
 class CalibrationChanges(TypedDict):
-    """Values of a calibration to set by hand; null restores the encoder's value."""
+    """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
     threshold: NotRequired[float | None]
 
     margin: NotRequired[float | None]
+
+    measured_at: NotRequired[datetime | str | None]
+    """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
+    was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
+    """
 
 
 class ReviewChanges(TypedDict):

@@ -60,6 +60,44 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
 
 
+def test_a_dry_run_says_what_it_would_store_and_is_stored_by_a_button(admin: Operator, keyed: Server) -> None:
+    world.copy(keyed, "dry")
+    path = "/v1/maps/dry"
+    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.8}}
+    assert keyed.client.post(f"{path}/calibrate", json=order | {"dry_run": True}).status_code == 200
+    page = admin.go("maps/dry/calibration")
+    table = page.get_by_role("table", name="Effect of the change")
+    row = table.get_by_role("row", name=re.compile("^unknown"))
+    first = keyed.client.get(f"{path}/calibration").json()
+    expect(row.get_by_role("cell").nth(1)).to_have_text(str(first["now"]["verdicts"]["unknown"]))
+
+    page.get_by_role("button", name="Calibrate", exact=True).click()  # another dry run, which leaves the map's ETag
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Ask").select_option("map")
+    dialog.get_by_label("Share").fill("0.5")
+    dialog.get_by_role("button", name="Try it").click()
+    page.get_by_text("The dry run is done.").wait_for()
+    state = keyed.client.get(f"{path}/calibration").json()
+    now, proposed = (state[name]["verdicts"]["recognized"] for name in ("now", "proposed"))
+    found = state["measured"]["report"]["calibration"]
+    unknown = state["now"]["verdicts"]["unknown"]
+    assert unknown != first["now"]["verdicts"]["unknown"] and state["revision"] == first["revision"]
+    expect(row.get_by_role("cell").nth(1)).to_have_text(str(unknown))
+    told = page.get_by_role("region", name="Dry run")
+    written = f"{state['calibration']['threshold']:.3f} → {found['threshold']:.3f}".replace("-", "−")
+    expect(told).to_contain_text(written)
+    expect(told).to_contain_text(f"recognized {now} → {proposed} of the")
+    assert keyed.client.get(path).json()["calibration"]["source"] == "encoder-default"
+
+    told.get_by_role("button", name="Store it").click()
+    dialog.get_by_role("button", name="Store the calibration").click()
+    told.wait_for(state="detached")
+    assert keyed.client.get(path).json()["calibration"] == found
+    page.get_by_role("status").get_by_role("button", name="Undo").click()
+    page.get_by_text("encoder-default").wait_for()
+    assert keyed.client.get(path).json()["calibration"]["source"] == "encoder-default"
+
+
 @pytest.mark.thorough
 def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     admin: Operator, keyed: Server, yard: str
