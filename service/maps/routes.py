@@ -207,9 +207,7 @@ def edit_map(
     return show_map(engine, map_, _last_day(statistics, map_))
 
 
-def _settings_changes(
-    engine: Engine, statistics: QueryStatistics, map_: Map, changes: MapChanges
-) -> dict[str, Any]:
+def _settings_changes(engine: Engine, statistics: QueryStatistics, map_: Map, changes: MapChanges) -> dict[str, Any]:
     """The values that a merge patch sets; null stands for the default of its field.
 
     Raises:

@@ -119,7 +119,8 @@ async def label_frame(
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
     Or take its label back, or throw the frame away. A label that is given again replaces the one before; enrolled
-    places stay. Labels serve to calibrate the map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
+    places stay. Labels serve to calibrate the map, with the method `labels`. Simultaneous labels of one frame are
+    applied one after the other.
     """
     map_ = await engine.map(map_id)
     async with engine.review_keeper.turn(map_, number):

@@ -252,8 +252,9 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
     )
 
 
-def session_view(session: Session) -> SessionView:
-    """The JSON view of a session, as it is listed."""
+def session_view(session: Session, private: bool) -> SessionView:
+    """The JSON view of a session, as it is listed; its key is only for those who may see what is ``private``."""
+    came = session.last_frame_came
     options = session.options.model_dump()
     return SessionView(
         **{**options, "expires_after": session.expires_after},
@@ -263,14 +264,16 @@ def session_view(session: Session) -> SessionView:
         expires_at=datetime.fromtimestamp(session.expires, UTC),
         frames=session.frames,
         last_frame=session.number,
+        last_frame_at=None if came is None else datetime.fromtimestamp(came, UTC),
+        key=session.key if private else None,
         restored=session.restored,
         frames_lost=session.lost,
     )
 
 
-def session_report(sessions: Sessions, map_: Map, session: Session, k: int = 5) -> SessionReport:
+def session_report(sessions: Sessions, map_: Map, session: Session, private: bool, k: int = 5) -> SessionReport:
     """The JSON view of a session with its present belief; call it in the session's turn, in a thread."""
     run = sessions.run(map_, session)
     found = run.look(k, alive_rows(map_))
-    view = session_view(session)
+    view = session_view(session, private)
     return SessionReport(**view.model_dump(), belief=belief_view(map_, run, found))

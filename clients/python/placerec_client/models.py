@@ -1358,6 +1358,8 @@ class SessionView(Model):
     expires_at: datetime
     frames: int
     last_frame: int | None = None
+    last_frame_at: datetime | None = None
+    key: str | None = None
     restored: bool
     frames_lost: int | None = None
 
@@ -1386,6 +1388,8 @@ class SessionReport(Model):
     expires_at: datetime
     frames: int
     last_frame: int | None = None
+    last_frame_at: datetime | None = None
+    key: str | None = None
     restored: bool
     frames_lost: int | None = None
     belief: BeliefView

@@ -8,6 +8,8 @@ export const ROOT = new URL("../../../", import.meta.url);
 const KEY = "placerec.key";
 const AT_ONCE = 6;
 const ATTEMPTS = 4;
+/** Milliseconds: the service sends a comment every three seconds, so a stream that is silent for so long is lost. */
+const SILENCE = 8000;
 
 /** A refusal by the service (RFC 9457). */
 export class Problem extends Error {
@@ -116,14 +118,14 @@ function lost() {
 
 /** Find out whether the service is there, after something else could not be fetched. */
 export function checkConnection() {
-  fetch(new URL("livez", ROOT), { cache: "no-store" }).catch(lost);
+  fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) }).catch(lost);
 }
 
 async function probe() {
   for (let wait = 500; ; wait = Math.min(wait * 1.6, 5000)) {
     await sleep(wait);
     try {
-      const answer = await fetch(new URL("livez", ROOT), { cache: "no-store" });
+      const answer = await fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) });
       if (answer.ok) break;
     } catch {
       // It is still away.
@@ -309,22 +311,41 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
-/** Follow server-sent events until the signal is aborted; a lost stream is taken up where it ended.
+/** Calls a function unless it is put off, again and again, before so many milliseconds are over. */
+class Watch {
+  constructor(milliseconds, call) {
+    Object.assign(this, { milliseconds, call });
+    this.putOff();
+  }
+
+  putOff() {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(this.call, this.milliseconds);
+  }
+
+  end() {
+    clearTimeout(this.timer);
+  }
+}
+
+/** Follow server-sent events until the signal is aborted; a lost stream, or a silent one, is taken up where it ended.
  *
  * onEvent gets the event's name and its data; onState gets true while the stream is open.  A problem ends it.
  * heard: its `last` is the id of the last event that was heard, after which a stream that is given it goes on.
  */
 export async function follow(path, { query, onEvent, onState = () => {}, signal: abort, endless = true, heard = { last: null } }) {
   for (let wait = 500; !abort.aborted; wait = Math.min(wait * 2, 8000)) {
+    const attempt = new AbortController();
+    const watch = new Watch(SILENCE, () => attempt.abort());
     try {
       const headers = withKey(heard.last === null ? {} : { "Last-Event-ID": heard.last });
-      const options = { headers, signal: abort, cache: "no-store", credentials: "omit" };
+      const options = { headers, signal: AbortSignal.any([abort, attempt.signal]), cache: "no-store", credentials: "omit" };
       const answer = await fetch(address(path, query), options);
       if (answer.status === 204) return;
       if (!answer.ok) throw await problemOf(answer);
       onState(true);
       wait = 500;
-      for await (const event of eventsOf(answer.body)) {
+      for await (const event of eventsOf(answer.body, () => watch.putOff())) {
         if (abort.aborted) return;
         if (event.id !== null) heard.last = event.id;
         onEvent(event.name, JSON.parse(event.data));
@@ -334,18 +355,22 @@ export async function follow(path, { query, onEvent, onState = () => {}, signal:
       if (abort.aborted) return;
       if (error instanceof Problem && ![429, 503].includes(error.status)) throw error;
       if (!(error instanceof Problem)) lost();
+    } finally {
+      watch.end();
     }
     onState(false);
     await sleep(wait);
   }
 }
 
-async function* eventsOf(body) {
+/** The events of a stream; onBytes is called whenever anything comes, a comment too. */
+async function* eventsOf(body, onBytes) {
   const reader = body.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";
   for (;;) {
     const { value, done } = await reader.read();
     if (done) return;
+    onBytes();
     text += value;
     const blocks = text.split("\n\n");
     text = blocks.pop();

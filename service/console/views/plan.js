@@ -1,9 +1,9 @@
 // The plan of a map: where its places lie, coloured by traverse, and where robots are now.  Without poses the traverses
 // lie below one another as strips.
 import { epoch, follow, get, may } from "../shared/api.js";
-import { complain, Facts, Head, Loading, Name, Nothing } from "../shared/elements.js";
+import { complain, Facts, Head, Loading, Name, Nothing, Verdict } from "../shared/elements.js";
 import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
-import { counted, exact, integer, metres, poseText } from "../shared/formats.js";
+import { counted, exact, integer, metres, poseText, relative } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { PlanCanvas } from "../shared/plan_canvas.js";
@@ -65,7 +65,7 @@ function Drawing({ map, plan, query }) {
   const shape = `${strips} ${map}`;
   const fitted = useRef(null);
   useEffect(() => {
-    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown"].map((name) => [name, colour(name)]));
+    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown", "faint"].map((name) => [name, colour(name)]));
     drawing.current.mark({ tints });
     drawing.current.show(content, fitted.current !== shape);
     if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);
@@ -271,11 +271,27 @@ function useRobots(map, plan, live, drawing) {
   return robots;
 }
 
+const MOST_SILENT = 12;
+
+/** Where robots are now, and apart from them those of which nothing was heard for seconds. */
 function RobotList({ robots }) {
-  if (robots.length === 0) return null;
+  const [heard, silent] = [robots.filter((one) => !one.silent), robots.filter((one) => one.silent)];
   return html`
-    <ul aria-label="Robots">
-      ${robots.map((robot) => html`<li class="spread"><span>${robot.label}</span><span class=${`verdict ${robot.verdict}`}>${robot.verdict}</span></li>`)}
-    </ul>
+    ${heard.length > 0 && html`
+      <ul aria-label="Robots">
+        ${heard.map((one) => html`<li class="spread" key=${one.session}><${RobotName} robot=${one} /><${Verdict} verdict=${one.verdict} /></li>`)}
+      </ul>
+    `}
+    ${silent.length > 0 && html`
+      <h3>Silent</h3>
+      <ul aria-label="Silent robots" class="faint">
+        ${silent.slice(0, MOST_SILENT).map((one) => html`<li class="spread" key=${one.session}><${RobotName} robot=${one} /><span>seen ${relative(one.seen)}</span></li>`)}
+      </ul>
+      ${silent.length > MOST_SILENT && html`<p class="faint small">and ${integer(silent.length - MOST_SILENT)} more</p>`}
+    `}
   `;
+}
+
+function RobotName({ robot: { label, session } }) {
+  return html`<span title=${session}><${Name} text=${label} />${label !== session && html` <code class="small faint">${session.slice(0, 6)}</code>`}</span>`;
 }

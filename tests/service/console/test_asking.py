@@ -119,7 +119,7 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
     lines.first.get_by_text("recognized").wait_for()
     expect(lines.first).to_contain_text(re.compile(r"(mon|tues)day-04"))
-    expect(lines.first).to_contain_text("admin-key")
+    expect(lines.first).to_contain_text(re.compile(r"^\s*\d\d:\d\d:\d\d\s*admin-key"))
     lines.first.get_by_role("img", name="The frame").wait_for()
     lines.first.get_by_role("button", name="Why").click()
     dialog = page.get_by_role("dialog")
@@ -171,6 +171,39 @@ def test_a_robot_is_drawn_where_its_session_is(admin: Operator, keyed: Server) -
         path = f"/v1/maps/{LAB}/sessions/{session}/frames"
         assert keyed.client.post(path, content=frame, headers={"Content-Type": "image/jpeg"}).status_code == 200
     robots = page.get_by_role("list", name="Robots")
-    robots.get_by_text(session).wait_for()
+    robots.get_by_text("admin-key").wait_for()  # robots are known by their keys
+    expect(robots.get_by_role("listitem")).to_contain_text([session[:6]])
     keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")
     robots.wait_for(state="detached")
+
+
+@pytest.mark.thorough
+def test_a_robot_that_is_silent_is_not_shown_as_recognized(
+    visit: Visit, keyed: Server, keys: dict[str, str]
+) -> None:
+    session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]
+    for number in (2, 3, 4):
+        frame = encoded(seen_again(scene(number), seed=90 + number))
+        path = f"/v1/maps/{LAB}/sessions/{session}/frames"
+        assert keyed.client.post(path, content=frame, headers={"Content-Type": "image/jpeg"}).status_code == 200
+    begun_by = []
+    for role in ("enrol", "query"):
+        headers = {"Authorization": f"Bearer {keys[role]}"}
+        (told,) = keyed.client.get(f"/v1/maps/{LAB}/sessions", headers=headers).json()["items"]
+        begun_by.append(told["key"])
+    assert begun_by == ["admin-key", None]
+    operator = visit("admin")
+    page = operator.page
+    page.clock.install()
+    operator.go(f"maps/{LAB}/plan")
+    page.get_by_role("list", name="Robots", exact=True).get_by_text("recognized").wait_for()
+    page.clock.fast_forward("09:30")
+    silent = page.get_by_role("list", name="Silent robots").get_by_role("listitem")
+    expect(silent).to_have_count(1)
+    expect(silent).to_contain_text(re.compile("admin-key.*seen 9 min ago"))
+    expect(silent).not_to_contain_text("recognized")
+    expect(page.get_by_role("list", name="Robots", exact=True)).to_have_count(0)
+    operator.go("jobs")
+    operator.go(f"maps/{LAB}/plan")  # it is silent for who comes later, too
+    expect(silent).to_contain_text(re.compile("admin-key.*seen 9 min ago"))
+    keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")

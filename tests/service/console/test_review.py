@@ -170,7 +170,8 @@ def test_long_ids_show_their_ends_and_stay_in_their_cards(visit: Visit, keyed: S
       const box = card.getBoundingClientRect();
       const inside = (one) => one.right <= box.right + 0.5 && one.left >= box.left - 0.5;
       const ends = [...card.querySelectorAll(".end")];
-      return [ends.map((end) => end.textContent), [...card.children, ...ends].map((one) => one.getBoundingClientRect()).every(inside)];
+      const boxes = [...card.children, ...ends].map((one) => one.getBoundingClientRect());
+      return [ends.map((end) => end.textContent), boxes.every(inside)];
     })""")
     assert sorted(texts for texts, _ in ends) == [[f"-{number:06d}"] * 2 for number in range(5)]
     assert all(inside for _, inside in ends)
