@@ -167,10 +167,42 @@ def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yar
     pair.get_by_role("link", name="tuesday-03").wait_for()
     page.get_by_role("button", name="Preview alignment").click()
     page.get_by_text("no, a dry run").wait_for()
-    page.get_by_role("button", name="Align", exact=True).click()
+    aligned = f"/v1/maps/{yard}/similarity?query=tuesday&reference=monday"
+    page.get_by_role("button", name="Align …", exact=True).click()
+    assert not keyed.client.get(aligned).json()["aligned"], "it asks first"
+    page.get_by_role("dialog").get_by_role("button", name="Align").click()
     page.get_by_text("aligned", exact=True).wait_for()
     page.get_by_label("as aligned").check()
-    assert keyed.client.get(f"/v1/maps/{yard}/similarity?query=tuesday&reference=monday").json()["aligned"]
+    assert keyed.client.get(aligned).json()["aligned"]
+    page.get_by_role("button", name="Undo the alignment …").click()
+    page.get_by_role("dialog").get_by_role("button", name="Undo the alignment").click()
+    page.get_by_text("not aligned").wait_for()
+    assert not keyed.client.get(aligned).json()["aligned"]
+
+
+@pytest.mark.thorough
+def test_an_alignment_does_not_prove_itself(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("handed")
+    for number in range(world.PLACES):
+        for name, data, pose in (
+            ("monday", world.frame(number), world.pose_of(number)),
+            ("tuesday", world.frame_again(number), {}),
+        ):
+            keyed.enrol("handed", f"{name}-{number:02d}", data, sequence=name, **pose)
+    page = admin.go("maps/handed/traverses")
+    page.get_by_text("none: their frames have no poses of their own").wait_for()
+    page.get_by_role("button", name="Align …", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Align").click()
+    page.get_by_text("tuesday was aligned.").wait_for()
+    place = "/v1/maps/handed/places/tuesday-03"
+    assert keyed.client.get(place).json()["pose_of"] == "monday-03"
+    page.get_by_text("aligned", exact=True).wait_for()
+    admin.settle()
+    page.get_by_text("none: their frames have no poses of their own").wait_for()
+    expect(page.get_by_text("within 3 frames")).to_have_count(0)
+    page.get_by_role("status").get_by_role("button", name="Undo").click()
+    page.get_by_text("not aligned").wait_for()
+    assert keyed.client.get(place).json()["pose_of"] is None
 
 
 def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> None:
