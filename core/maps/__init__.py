@@ -49,4 +49,5 @@ __all__ = [
     "Store",
     "TierSetting",
     "VerifyReport",
+    "own_poses",
 ]

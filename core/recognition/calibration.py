@@ -145,11 +145,7 @@ def queries_from_traverse(
     near = _SamePlace(map_, snapshot)
     if pairs is None:
         others = snapshot.alive & ~own
-        queried = [
-            place
-            for place in queried
-            if near.has_pose(rows[place]) or (near(rows[place]) & others).any()
-        ]
+        queried = [place for place in queried if near.has_pose(rows[place]) or (near(rows[place]) & others).any()]
         if not queried:
             raise CalibrationImpossible(
                 f"The frames of the sequence {sequence[:128]!r} have no poses: align the sequence with another one, or "

@@ -164,9 +164,7 @@ def _view(
     rows: tuple[Rows, Rows],
     matrix: Matrix,
 ) -> SimilarityView:
-    queries, references = (
-        own_poses(map_.counterparts, traverses.snapshot.whereabouts_at(some), some) for some in rows
-    )
+    queries, references = (own_poses(map_.counterparts, traverses.snapshot.whereabouts_at(some), some) for some in rows)
     radius = map_.record.same_place_radius
     truth, aligned = nearest_by_pose(queries, references, radius), counterparts(queries, references)
     return SimilarityView(

@@ -116,7 +116,10 @@ function health(map) {
   if (map.calibration.source === "encoder-default") {
     return { word: "not calibrated", tone: "", why: "It uses its encoder's thresholds." };
   }
-  return { word: "good", tone: "good", why: `Calibrated by ${map.calibration.source}.` };
+  const calibrated = `Calibrated by ${map.calibration.source}`;
+  if (total < 20) return { word: "calibrated", tone: "", why: `${calibrated}; too few answers of the last day to say how good they are.` };
+  if (day.recognized / total < 0.5) return { word: "in doubt", tone: "warn", why: `${calibrated}; less than half of the answers of the last day were recognized.` };
+  return { word: "good", tone: "good", why: `${calibrated}; ${Math.round((100 * day.recognized) / total)} % of ${total} answers of the last day were recognized.` };
 }
 
 function Damaged({ damaged, open, close, changed }) {

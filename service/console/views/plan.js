@@ -25,12 +25,12 @@ export default function Plan({ map, query }) {
   `;
 }
 
-function planNote({ places, posed, count, gaps }) {
+function planNote({ places, posed, count, gap_count: gapCount }) {
   const parts = [counted(places, "place")];
   if (count < places) parts.push(`${integer(count)} of them drawn`);
   if (posed === 0) parts.push("no poses: each traverse is a strip");
   else if (posed < count) parts.push(`${integer(count - posed)} without a pose`);
-  if (gaps.length) parts.push(counted(gaps.length, "gap"));
+  if (gapCount) parts.push(counted(gapCount, "gap"));
   return parts.join(" · ");
 }
 
@@ -109,7 +109,7 @@ function Drawing({ map, plan, query }) {
         </section>
         <section class="panel">
           <h2>Also shown</h2>
-          ${plan.gaps.length > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gaps.length)})</label>`}
+          ${plan.gap_count > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gap_count)})</label>`}
           ${plan.posed > 0 && html`<label class="row"><input type="checkbox" checked=${live} onChange=${() => setLive(!live)} /> Robots and answers, live</label>`}
           ${may("enrol") && html`<${Misleading} map=${map} plan=${plan} found=${misleading} setFound=${setMisleading} />`}
           <${RobotList} robots=${robots} />

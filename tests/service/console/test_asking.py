@@ -178,9 +178,7 @@ def test_a_robot_is_drawn_where_its_session_is(admin: Operator, keyed: Server) -
 
 
 @pytest.mark.thorough
-def test_a_robot_that_is_silent_is_not_shown_as_recognized(
-    visit: Visit, keyed: Server, keys: dict[str, str]
-) -> None:
+def test_a_robot_that_is_silent_is_not_shown_as_recognized(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
     session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]
     for number in (2, 3, 4):
         frame = encoded(seen_again(scene(number), seed=90 + number))

@@ -43,6 +43,9 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
     calibrate("Calibrate")
     page.get_by_text("sequence:tuesday").wait_for()
+    listed = admin.go("maps").get_by_role("row").filter(has=page.get_by_role("link", name=yard, exact=True))
+    listed.get_by_text("calibrated", exact=True).wait_for()  # which does not make it good
+    admin.go(f"maps/{yard}/calibration")
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "sequence:tuesday"
 
     page.get_by_role("button", name="Calibrate", exact=True).click()  # which now replaces one of the map's own
@@ -237,6 +240,28 @@ def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> 
     page.get_by_role("dialog").get_by_role("button", name="Delete the places").click()
     prune.get_by_text("Gone").wait_for()
     assert len(keyed.places("pruned")) < enrolled
+
+
+@pytest.mark.thorough
+def test_health_advises_to_align_a_second_drive_and_counts_what_it_leaves_out(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("street")
+    for number in range(world.PLACES):
+        for name, data in (("monday", world.frame(number)), ("tuesday", world.frame_again(number))):
+            keyed.enrol("street", f"{name}-{number:02d}", data, sequence=name)
+    keyed.query("street", world.frame_again(0))
+    page = admin.go("maps/street/health")
+    told = page.get_by_role("region", name="One route")
+    expect(told).to_contain_text("tuesday and monday seem to be one route")
+    page.get_by_text("That says nothing yet: after 1 query, of 72 that it takes.").wait_for()
+    for _ in range(71):
+        keyed.query("street", world.frame_again(0))
+    page.get_by_role("button", name="Examine again").click()
+    silent = page.locator("section").filter(has=page.get_by_role("heading", name="Never matched"))
+    count = keyed.client.get("/v1/maps/street/health").json()["never_matched"]["count"]
+    assert count > 20  # more than the report lists
+    silent.get_by_text(f"and {count - 8} more").wait_for()
+    told.get_by_role("link", name="Compare and align them").click()
+    page.wait_for_url("**/traverses?query=tuesday&reference=monday")
 
 
 @pytest.mark.thorough
