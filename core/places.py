@@ -244,8 +244,9 @@ class Whereabouts:
 
     def without_poses(self, places: ArrayLike) -> Whereabouts:
         """The same, but for the poses of some places (integers or a mask), which then have none."""
+        chosen = np.asarray(places)
         kind, position, heading = self.kind.copy(), self.position.copy(), self.heading.copy()
-        kind[places], position[places], heading[places] = NO_POSE, 0.0, np.nan
+        kind[chosen], position[chosen], heading[chosen] = NO_POSE, 0.0, np.nan
         return replace(self, kind=kind, position=position, heading=heading)
 
     @classmethod

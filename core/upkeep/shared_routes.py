@@ -61,5 +61,5 @@ def _rank_correlation(values: NDArray[np.int64], others: NDArray[np.int64]) -> f
     """Spearman's coefficient of n pairs; equal values are ranked as they come, 0 if all are equal."""
     if len(np.unique(values)) < 2 or len(np.unique(others)) < 2:
         return 0.0
-    ranks = [np.argsort(np.argsort(some, kind="stable")) for some in (values, others)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    first, second = (np.argsort(np.argsort(some, kind="stable")).astype(np.float64) for some in (values, others))
+    return float(np.corrcoef(first, second)[0, 1])
