@@ -1,5 +1,5 @@
 // The frame around every view: where one can go, who one is, whether the service is there, and what is being said.
-import { caller, checkConnection, epoch, everyMap, get, identify, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { begin as beginWithKey, caller, checkConnection, epoch, everyMap, get, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
 import { Secret } from "./shared/secret.js";
@@ -33,7 +33,7 @@ export function Frame() {
   const [refused, setRefused] = useState(null);
   const begin = () => {
     setRefused(null);
-    identify().catch(setRefused);
+    beginWithKey().catch(setRefused);
   };
   useEffect(begin, []);
   return html`
@@ -80,10 +80,7 @@ function View() {
     if (!entry) return;
     entry[1]().then(
       (module) => setLoaded({ name, component: module.default }),
-      (error) => {
-        setLoaded({ name, error });
-        checkConnection();
-      },
+      async (error) => setLoaded({ name, error, there: await checkConnection() }),
     );
   }, [name, epoch.value]);
   useEffect(() => {
@@ -95,7 +92,7 @@ function View() {
     if (!entry) return html`<${Missing} />`;
     if (!may(entry[2]) || (entry[3] && !everyMap.value)) return html`<${Forbidden} role=${entry[2]} />`;
     if (loaded.name !== name) return html`<${Loading} />`;
-    if (loaded.error) return html`<${Stale} />`;
+    if (loaded.error) return loaded.there ? html`<${Stale} />` : html`<${Away} />`;
     return html`<${loaded.component} key=${map} map=${map} rest=${rest} query=${route.value.query} />`;
   };
   return html`<div class="view" data-view=${route.value.parts.join("/")}>${shown()}</div>`;
@@ -107,6 +104,10 @@ function Missing() {
 
 function Forbidden({ role }) {
   return html`<div class="nothing"><h1>Not for this key</h1><p>This view needs a key of role ${role}${role === "admin" && " for all maps"}.</p></div>`;
+}
+
+function Away() {
+  return html`<div class="nothing"><h1>The view is not loaded yet</h1><p>It is shown as soon as the service can be reached.</p></div>`;
 }
 
 function Stale() {
@@ -222,7 +223,7 @@ function KeyPage({ problem }) {
   return html`
     <main class="key-page">
       <h1><${Mark} /> placerec</h1>
-      <p>The service asks for a key. It is stored in this tab and sent to this service only.</p>
+      <p>The service asks for a key. It is kept by the open tabs of this browser and sent to this service only.</p>
       ${problem.slug !== "key-needed" && html`<${Trouble} error=${problem} />`}
       <${KeyForm} />
     </main>

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from typing import Any
 
 from core.belief import NOTHING, Candidate, Estimate, Run, Step, View, evidence_of, view_of
 from core.maps import Map
@@ -73,7 +75,7 @@ async def process_frame(
             return repeated
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
-        queried = QueriedFrame(session.options.camera, session.id, options.frame)
+        queried = QueriedFrame(session.options.camera, session.id, options.frame, _question(session, options.k))
         single = answer_of(map_, answered.frame, answered.answer)
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
@@ -250,6 +252,14 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
         lost=run.lost,
         candidates=candidates,
     )
+
+
+def _question(session: Session, k: int) -> dict[str, Any]:
+    """The parameters of a query that asks what each frame of a session does."""
+    given: dict[str, Any] = session.options.model_dump(include={"verify", "camera"}, exclude_none=True)
+    if session.options.sequences is not None:
+        given["sequences"] = json.dumps(session.options.sequences)
+    return given | {"k": k}
 
 
 def session_view(session: Session, private: bool) -> SessionView:

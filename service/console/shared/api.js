@@ -1,5 +1,6 @@
-// The one way to the service: its API, with the key that the user typed.  The key is kept for this tab only, travels in
-// a header, and never in an address.
+// The one way to the service: its API, with the key that the user typed.  The key is kept by the open tabs only, travels
+// in a header, and never in an address.
+import { Tabs } from "./tabs.js";
 import { computed, signal } from "./view.js";
 
 /** The service, under whatever path a proxy publishes it. */
@@ -74,26 +75,50 @@ export function may(role) {
 /** Whether the key may use all maps. */
 export const everyMap = computed(() => caller.value !== null && caller.value.maps === null);
 
-export async function useKey(text) {
+/** Take another key; an empty one forgets the present one, in all tabs.
+ *
+ * known: the service has just made it, so that it need not be tried first.
+ *
+ * Throws, and leaves the present key in force, if the service does not accept it.
+ */
+export async function useKey(text, { known = false } = {}) {
   const given = text.trim();
   if (!/^[!-~]*$/.test(given)) {
     throw Object.assign(new Error("A key consists of letters, digits, - and _."), { title: "This is no key" });
   }
+  const told = given && !known ? await get("/key", {}, { headers: bearer(given) }) : null;
+  hold(given);
+  tabs.told(given);
+  keyNeeded.value = null;
+  if (told) caller.value = told;
+  else await identify();
+  epoch.value += 1;
+}
+
+function hold(given) {
   key.value = given;
   try {
-    if (key.value) sessionStorage.setItem(KEY, key.value);
+    if (given) sessionStorage.setItem(KEY, given);
     else sessionStorage.removeItem(KEY);
   } catch {
     // It is kept in memory only.
   }
-  keyNeeded.value = null;
-  try {
-    await identify();
-  } catch (error) {
-    if (error instanceof Problem) keyNeeded.value = error; // Without who we are there is nothing to show.
-    throw error;
-  }
-  epoch.value += 1;
+}
+
+const tabs = new Tabs(ROOT.pathname, {
+  present: () => (caller.value?.keys_needed ? key.value : ""),
+  forget: () => {
+    if (!key.value) return;
+    hold("");
+    identify().catch(() => {});
+  },
+});
+
+/** Begin: with the key of this tab or of another one, ask the service who we are. */
+export async function begin() {
+  if (key.value) tabs.told(key.value);
+  else hold(await tabs.ask());
+  await identify();
 }
 
 /** Ask the service who we are. */
@@ -117,8 +142,14 @@ function lost() {
 }
 
 /** Find out whether the service is there, after something else could not be fetched. */
-export function checkConnection() {
-  fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) }).catch(lost);
+export async function checkConnection() {
+  try {
+    await fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) });
+    return true;
+  } catch {
+    lost();
+    return false;
+  }
 }
 
 async function probe() {
@@ -182,8 +213,12 @@ function address(path, query = {}) {
   return url;
 }
 
+function bearer(text) {
+  return { Authorization: `Bearer ${text}` };
+}
+
 function withKey(headers = {}) {
-  return key.value ? { ...headers, Authorization: `Bearer ${key.value}` } : headers;
+  return key.value ? { ...bearer(key.value), ...headers } : headers;
 }
 
 async function problemOf(answer) {

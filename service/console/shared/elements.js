@@ -139,8 +139,8 @@ export function Field({ label, hint, children, inline = false }) {
   `;
 }
 
-/** A dialog; it closes with Esc, and gives the focus back. */
-export function Dialog({ title, close, wide = false, children }) {
+/** A dialog; it closes with Esc, unless it stays until a button in it is pressed, and gives the focus back. */
+export function Dialog({ title, close, wide = false, stays = false, children }) {
   const element = useRef(null);
   const id = useId();
   useLayoutEffect(() => {
@@ -157,11 +157,13 @@ export function Dialog({ title, close, wide = false, children }) {
   }, []);
   const cancelled = (event) => {
     event.preventDefault();
-    close();
+    if (!stays) close();
   };
+  // A browser may close a dialog in spite of that when Esc is pressed again.
+  const typed = (event) => stays && event.key === "Escape" && event.preventDefault();
   return html`
-    <dialog ref=${element} class=${wide ? "wide" : ""} aria-labelledby=${id} onCancel=${cancelled}>
-      <header><h2 id=${id}>${title}</h2><button type="button" class="quiet" aria-label="Close" onClick=${close}>✕</button></header>
+    <dialog ref=${element} class=${wide ? "wide" : ""} aria-labelledby=${id} onCancel=${cancelled} onKeyDown=${typed}>
+      <header><h2 id=${id}>${title}</h2>${!stays && html`<button type="button" class="quiet" aria-label="Close" onClick=${close}>✕</button>`}</header>
       <div class="body">${children}</div>
     </dialog>
   `;
@@ -212,13 +214,32 @@ export function ByName({ title, name, action, close, send, children }) {
 }
 
 export function Copy({ text, label = "Copy" }) {
-  const [done, setDone] = useState(false);
-  const copy = async () => {
-    await navigator.clipboard.writeText(text);
-    setDone(true);
-    setTimeout(() => setDone(false), 2000);
+  const [done, setDone] = useState(null);
+  const copy = async (event) => {
+    const { parentElement: beside } = event.currentTarget; // what is outside an open dialog cannot be selected
+    setDone((await written(text, beside)) ? "Copied" : "Select and copy it");
+    setTimeout(() => setDone(null), 2000);
   };
-  return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done ? "Copied" : label}</button>`;
+  return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done || label}</button>`;
+}
+
+/** Write a text to the clipboard; over plain HTTP browsers only copy what is selected.  Whether it is there. */
+async function written(text, beside) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    const field = document.createElement("textarea");
+    const focused = document.activeElement;
+    field.value = text;
+    field.className = "hidden";
+    beside.append(field);
+    field.select();
+    const done = document.execCommand("copy");
+    field.remove();
+    focused?.focus();
+    return done;
+  }
 }
 
 // Pages of a list

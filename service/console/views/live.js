@@ -130,10 +130,14 @@ function Line({ map, event, open }) {
   `;
 }
 
+function asText(question) {
+  return Object.entries(question || {}).map(([name, value]) => `${name} ${value}`).join(", ") || "none";
+}
+
 function Details({ map, event, close }) {
   const { verdict, probability, place, best, pose, score, decision, threshold, reason, picture, explanation } = event;
   const again = () => {
-    handedOver.value = blobOf(picture);
+    handedOver.value = { file: blobOf(picture), question: event.question || {} };
     go("maps", map, "try");
   };
   return html`
@@ -154,13 +158,18 @@ function Details({ map, event, close }) {
           ["Asked by", event.key || "–"],
           event.camera && ["Camera", event.camera],
           event.session && ["Session", `${event.session}${event.frame !== null && event.frame !== undefined ? `, frame ${event.frame}` : ""}`],
+          ["Filters", event.question === null ? "longer than is told" : asText(event.question)],
           ["Operation", (event.operation || "").replaceAll("_", " ")],
           ["Request", html`<code>${event.request_id}</code>`],
         ]} />
         <${Timings} milliseconds=${event.milliseconds} />
       </div>
       ${explanation && html`<${Picture} path=${explanation.replace(/^.*?\/v1/, "")} alt="The frame beside its best match, with what connects them" />`}
-      ${picture && html`<footer class="row"><button type="button" onClick=${again}>Ask again with this thumbnail, and explain</button></footer>`}
+      ${picture && html`<footer class="row">
+        <button type="button" onClick=${again}>Ask again with this thumbnail, and explain</button>
+        ${event.question === null && html`<span class="faint">without its filters, which are longer than is told</span>`}
+        ${event.session && html`<span class="faint">as a single frame: its session knew the frames before it, too</span>`}
+      </footer>`}
     <//>
   `;
 }

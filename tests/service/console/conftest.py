@@ -88,7 +88,8 @@ def browser() -> Iterator[Browser]:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
     expect.set_options(timeout=PATIENCE)
     with sync_playwright() as playwright:
-        options = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+        options = ["--host-resolver-rules=MAP console.test 127.0.0.1"]
+        options += ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
         running = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
         yield running
         running.close()

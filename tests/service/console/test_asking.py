@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
+from urllib.parse import parse_qsl, urlsplit
 
 import cv2
 import pytest
@@ -126,6 +127,28 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     dialog.get_by_text("Decision value").wait_for()
     dialog.get_by_role("button", name=re.compile("Ask again")).click()
     page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
+
+
+def test_a_question_is_asked_again_with_its_filters(admin: Operator, keyed: Server) -> None:
+    page = admin.go(f"maps/{LAB}/live")
+    page.get_by_label("frames as thumbnails").check()
+    page.get_by_text("listening").wait_for()
+    filters = {"sequences": "tuesday", "where": '{"floor": 2}', "x": "0", "y": "0", "radius": "500"}
+    told = keyed.client.post(
+        f"/v1/maps/{LAB}/query", params=filters, content=frame_again(4), headers={"Content-Type": "image/jpeg"}
+    )
+    assert told.status_code == 200
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    lines.first.get_by_role("button", name="Why").click()
+    with page.expect_request(lambda request: request.method == "POST") as asked:
+        page.get_by_role("dialog").get_by_role("button", name=re.compile("Ask again")).click()
+    sent = dict(parse_qsl(urlsplit(asked.value.url).query))
+    assert filters.items() <= {name: value.removesuffix(".0") for name, value in sent.items()}.items()
+    page.get_by_role("group", name="Filters of the question").get_by_text("sequences = tuesday").wait_for()
+    matches = page.get_by_role("region", name="Matches").get_by_role("listitem")
+    expect(matches).to_contain_text(["tuesday-04"] + ["tuesday"] * 4)
+    page.get_by_role("button", name="Drop them").click()
+    expect(page.get_by_label("The same request", exact=True)).not_to_contain_text("sequences")
 
 
 @pytest.mark.thorough

@@ -279,3 +279,17 @@ def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -
     page.get_by_role("dialog").get_by_role("button", name="Copy the places").click()
     merge.get_by_text("Came").wait_for()
     assert keyed.places("target").keys() == {"target-0", "target-1", "source-2", "source-3"}
+
+
+def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin: Operator, keyed: Server) -> None:
+    for name, pose in (("metric", {"x": 1, "y": 2}), ("geographic", {"latitude": 48.1, "longitude": 11.5})):
+        keyed.create_map(name)
+        assert keyed.enrol(name, f"{name}-0", world.frame(len(name)), sequence=name, **pose).status_code == 201
+    page = admin.go("maps/metric/health")
+    merge = page.get_by_role("region", name="Merge")
+    merge.get_by_label("From").select_option("geographic")
+    merge.get_by_role("button", name="Preview the merge").click()
+    warning = "The poses of geographic are geographic, those of metric metric"
+    merge.get_by_text(warning).wait_for()
+    merge.get_by_role("button", name="Copy 1 places").click()
+    page.get_by_role("dialog").get_by_text(warning).wait_for()
