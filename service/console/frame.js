@@ -1,5 +1,6 @@
 // The frame around every view: where one can go, who one is, whether the service is there, and what is being said.
 import { begin as beginWithKey, caller, checkConnection, epoch, everyMap, get, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { mapNames, remember, remembered } from "./shared/chosen_map.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
 import { Secret } from "./shared/secret.js";
@@ -22,9 +23,15 @@ const OF_SERVICE = {
   audit: ["Audit", () => import("./views/audit.js"), "admin", true],
   service: ["Service", () => import("./views/service.js"), "query", false],
 };
-const LAST_MAP = "placerec.map";
 
 const menuOpen = signal(false);
+
+// A file that is dropped where nothing takes it must not take the place of the console.
+for (const kind of ["dragover", "drop"]) {
+  addEventListener(kind, (event) => {
+    if (event.dataTransfer?.types.includes("Files") && !event.target.closest?.("input")) event.preventDefault();
+  });
+}
 
 // The view of the present address is fetched while the service is asked who we are.
 viewOf(route.value).entry?.[1]().catch(() => {});
@@ -122,22 +129,6 @@ function Stale() {
 
 // The side
 
-function remember(map) {
-  try {
-    sessionStorage.setItem(LAST_MAP, map);
-  } catch {
-    // Then it is not remembered.
-  }
-}
-
-function remembered() {
-  try {
-    return sessionStorage.getItem(LAST_MAP);
-  } catch {
-    return null;
-  }
-}
-
 function Side() {
   const { name, map } = viewOf(route.value);
   const chosen = map || remembered();
@@ -145,7 +136,7 @@ function Side() {
     may(entry[2]) && (!entry[3] || everyMap.value) &&
     html`<li><a href=${address} aria-current=${current ? "page" : undefined}>${entry[0]}</a></li>`;
   return html`
-    <div class="side">
+    <header class="side">
       <div class="brand">
         <a href=${href("maps")}><${Mark} /> placerec</a>
         <button type="button" class="menu" aria-expanded=${menuOpen.value} aria-controls="menu" onClick=${() => (menuOpen.value = !menuOpen.value)}>Menu</button>
@@ -165,7 +156,7 @@ function Side() {
         <${Identity} />
         <${Theme} />
       </nav>
-    </div>
+    </header>
   `;
 }
 
@@ -177,9 +168,6 @@ function Mark() {
   `;
 }
 
-/** All maps by name; it grows with the list, and shrinks when a map is gone. */
-export const mapNames = signal([]);
-
 function MapChoice({ chosen, name }) {
   useEffect(() => {
     get("/maps", { limit: 1000 }).then(
@@ -187,7 +175,8 @@ function MapChoice({ chosen, name }) {
       () => {},
     );
   }, [epoch.value, route.value.parts.length < 2, chosen]);
-  const names = chosen && !mapNames.value.includes(chosen) ? [chosen, ...mapNames.value] : mapNames.value;
+  const known = mapNames.value || [];
+  const names = chosen && !known.includes(chosen) ? [chosen, ...known] : known;
   if (names.length === 0) return null;
   const view = name in OF_MAPS ? name : "plan";
   return html`

@@ -166,9 +166,15 @@ function Words({ words }) {
   `;
 }
 
-/** Stages of the work as a bar and as a list. */
+const LEAST_REST = 0.1;
+
+/** Stages of the work as a bar and as a list, which add up to the total. */
 export function Timings({ milliseconds: told }) {
-  const stages = Object.entries(told).filter(([name]) => name !== "total");
+  const named = Object.entries(told).filter(([name]) => name !== "total");
+  const known = named.reduce((all, [, value]) => all + value, 0);
+  const total = told.total ?? known;
+  const rest = total - known;
+  const stages = rest >= LEAST_REST ? [...named, ["other: waiting, reading, writing", rest]] : named;
   const sum = stages.reduce((all, [, value]) => all + value, 0) || 1;
   return html`
     <div class="timings" aria-hidden="true">
@@ -176,7 +182,8 @@ export function Timings({ milliseconds: told }) {
     </div>
     <ul class="stages">
       ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
-      <li><span></span><strong>total</strong><strong class="number">${milliseconds(told.total)}</strong></li>
+      <li><span></span><strong>total</strong><strong class="number">${milliseconds(total)}</strong></li>
+      ${rest <= -LEAST_REST && html`<li><span></span><span class="faint">some stages ran at the same time</span></li>`}
     </ul>
   `;
 }

@@ -242,6 +242,34 @@ async function written(text, beside) {
   }
 }
 
+// Menus
+
+const ROW_HEIGHT = 48; // at most
+
+/** A button that opens a menu of what can be done with something: items are [text, function, class]. */
+export function Menu({ of, items }) {
+  const [button, list] = [useRef(null), useRef(null)];
+  const id = useId();
+  const place = () => {
+    const { top, bottom, right } = button.current.getBoundingClientRect();
+    const high = items.length * ROW_HEIGHT;
+    const below = bottom + high < innerHeight;
+    const vertical = below ? { top: `${bottom + 4}px`, bottom: "auto" } : { top: "auto", bottom: `${innerHeight - top + 4}px` };
+    Object.assign(list.current.style, { ...vertical, right: `${Math.max(4, document.documentElement.clientWidth - right)}px` });
+  };
+  const choose = (call) => () => {
+    list.current.hidePopover();
+    button.current.focus(); // which a dialog that opens now gives back
+    call();
+  };
+  return html`
+    <button ref=${button} type="button" class="small" popovertarget=${id} aria-label=${`Actions for ${of}`}>⋯</button>
+    <div ref=${list} id=${id} class="menu-list" popover="auto" role="group" aria-label=${`Actions for ${of}`} onBeforeToggle=${place}>
+      ${items.map(([text, call, tone = ""]) => html`<button type="button" class=${`quiet ${tone}`} aria-label=${`${text} ${of}`} onClick=${choose(call)}>${text}</button>`)}
+    </div>
+  `;
+}
+
 // Pages of a list
 
 /** The way to the pages before and after: `cursors` are those of the pages up to this one, `next` that of the one after. */

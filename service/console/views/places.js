@@ -55,6 +55,7 @@ function List({ map, query }) {
     <${Shown} resource=${page}>
       ${({ items, next_cursor: next }) => html`
         ${items.length === 0 && html`<${Nothing} title="No places">${present === "{}" ? "Nothing was enrolled into this map yet." : "No place fits the filters."}<//>`}
+        ${items.length === 0 && asTexts(filter.where) && html`<${AsTexts} where=${filter.where} />`}
         <ul class="thumbs" aria-label="Places">
           ${items.map((place) => html`<${Tile} key=${place.id} map=${map} place=${place} chosen=${chosen.has(place.id)} toggle=${toggle} />`)}
         </ul>
@@ -111,6 +112,24 @@ function Filters({ map, filter }) {
       <//>
       ${Object.keys(filter).length > 0 && html`<button type="button" onClick=${() => restate(Object.fromEntries(FILTERS.map((name) => [name, ""])))}>Clear</button>`}
     </div>
+  `;
+}
+
+/** The same conditions with texts for numbers and truth values; null if there are none of these. */
+function asTexts(where) {
+  const told = Object.entries(where ? JSON.parse(where) : {});
+  if (told.every(([, value]) => typeof value === "string")) return null;
+  return JSON.stringify(Object.fromEntries(told.map(([name, value]) => [name, String(value)])));
+}
+
+/** What was typed without quotation marks is a number, which no text equals: the other reading is offered. */
+function AsTexts({ where }) {
+  const texts = asTexts(where);
+  return html`
+    <p class="row">
+      <span class="faint">A number equals no text.</span>
+      <button type="button" onClick=${() => restate({ where: texts })}>Look for ${shownWhere(texts)}</button>
+    </p>
   `;
 }
 

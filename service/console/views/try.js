@@ -83,19 +83,24 @@ function Source({ ask }) {
   const [over, setOver] = useState(false);
   const [webcam, setWebcam] = useState(false);
   const input = useRef(null);
-  const dropped = (event) => {
-    event.preventDefault();
-    setOver(false);
-    ask([...event.dataTransfer.files]);
-  };
-  const dragged = (event) => {
-    event.preventDefault();
-    setOver(true);
-  };
+  const latest = useRef(ask);
+  latest.current = ask;
+  useEffect(() => {
+    const controller = new AbortController();
+    const on = (kind, call) => addEventListener(kind, call, { signal: controller.signal });
+    on("dragover", (event) => event.dataTransfer?.types.includes("Files") && setOver(true));
+    on("dragleave", (event) => event.relatedTarget === null && setOver(false));
+    on("drop", (event) => {
+      setOver(false);
+      const files = [...(event.dataTransfer?.files || [])];
+      if (files.length > 0 && !event.target.closest?.("input")) latest.current(files);
+    });
+    return () => controller.abort();
+  }, []);
   if (webcam) return html`<${Webcam} ask=${ask} close=${() => setWebcam(false)} />`;
   return html`
-    <div class=${over ? "drop over" : "drop"} onDragOver=${dragged} onDragLeave=${() => setOver(false)} onDrop=${dropped}>
-      <p><strong>Drop pictures here</strong></p>
+    <div class=${over ? "drop over" : "drop"}>
+      <p><strong>Drop pictures here</strong> <span class="faint">or beside</span></p>
       <div class="row">
         <button type="button" class="primary" onClick=${() => input.current.click()}>Choose pictures</button>
         <button type="button" onClick=${() => setWebcam(true)}>Use the webcam</button>

@@ -58,6 +58,11 @@ class Operator:
         self.page.locator(f"main .view{path} h1").wait_for()
         expect(self.page.locator("main .loading")).to_have_count(0)
 
+    def manage(self, map_id: str, action: str) -> None:
+        """Choose an action, such as ``Edit``, from the menu of a map in the list."""
+        self.page.get_by_role("button", name=f"Actions for {map_id}", exact=True).click()
+        self.page.get_by_role("button", name=f"{action} {map_id}", exact=True).click()
+
     def foresee(self, *texts: str) -> None:
         """Complaints that contain one of these are part of the test."""
         self.foreseen += texts

@@ -187,7 +187,8 @@ def test_to_open_the_console_without_a_key_is_no_refusal(visit: Visit, keyed: Se
     operator.foresee("401")
     operator.page.goto(f"{operator.root}/console#/maps/{LAB}/plan")
     operator.page.get_by_text("The service asks for a key.").wait_for()
-    assert keyed.client.get("/v1/maps", headers={"Authorization": ""}).status_code == 401  # which is one, and comes later
+    refused = keyed.client.get("/v1/maps", headers={"Authorization": ""})  # which is one, and comes later
+    assert refused.status_code == 401
     assert eventually(lambda: refusals() > before)
     assert refusals() == before + 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shlex
 import subprocess
@@ -61,6 +62,36 @@ def test_several_pictures_are_queried_one_after_the_other_and_a_bad_one_fails_al
     told = {"known.jpg": "recognized", "foreign.jpg": "ambiguous|unknown", "known.bmp": "recognized"}
     for name, text in (told | {"text.jpg": "Not a picture"}).items():
         expect(rows.filter(has_text=name)).to_contain_text(re.compile(text))
+
+
+DROP = """([selector, base64, name]) => {
+  const bytes = Uint8Array.from(atob(base64), (one) => one.charCodeAt(0));
+  const data = new DataTransfer();
+  data.items.add(new File([bytes], name, { type: "image/jpeg" }));
+  const event = (kind) => new DragEvent(kind, { dataTransfer: data, bubbles: true, cancelable: true });
+  const target = document.querySelector(selector);
+  return ["dragover", "drop"].map((kind) => target.dispatchEvent(event(kind)));
+}"""
+
+
+def test_a_picture_that_is_dropped_beside_the_box_is_asked_and_never_shown_instead(
+    admin: Operator, pictures: Path
+) -> None:
+    file = base64.b64encode((pictures / "known.jpg").read_bytes()).decode()
+    page = admin.go("maps")
+    assert page.evaluate(DROP, ["main", file, "known.jpg"]) == [False, False], "the browser would leave the page"
+    page = admin.go(f"maps/{LAB}/try")
+    assert page.evaluate(DROP, ["h1", file, "known.jpg"]) == [False, False]
+    page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
+
+
+def test_the_stages_of_an_answer_add_up(admin: Operator, pictures: Path) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
+    page.get_by_role("region", name="Answer").wait_for()
+    written = page.locator(".stages .number").all_inner_texts()
+    *stages, total = [float(text.removesuffix(" ms")) for text in written]
+    assert len(stages) > 2 and sum(stages) == pytest.approx(total, abs=0.5 * len(written))
 
 
 def test_the_pictures_of_frames_that_are_cleared_are_given_up(admin: Operator, pictures: Path) -> None:

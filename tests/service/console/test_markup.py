@@ -52,7 +52,7 @@ def hostile(keyed: Server) -> Iterator[str]:
 def test_descriptions(admin: Operator, hostile: str) -> None:
     page = admin.go("maps")
     check_plain(admin)
-    page.get_by_role("button", name=f"Edit {hostile}").click()
+    admin.manage(hostile, "Edit")
     expect(page.get_by_role("dialog").get_by_label("Description")).to_have_value(MARKUP)
 
 
