@@ -98,19 +98,33 @@ export function Facts({ rows }) {
   `;
 }
 
-const SHORT = 12;
+const SHORT = 8;
 const END = 7;
+const LONGEST_END = 16;
 
-/** A name; where there is no room it is cut in its middle, for what distinguishes names is at their ends. */
-export function Name({ text }) {
+/** A name; where there is no room its beginning gives way, for what distinguishes names is at their ends.
+ *
+ * among: the names beside which it stands; what they do not begin with in common stays, too.
+ */
+export function Name({ text, among = [] }) {
   const letters = Array.from(String(text));
   if (letters.length <= SHORT) return html`<span class="middle">${text}</span>`;
+  const end = Math.min(LONGEST_END, letters.length - 1, Math.max(END, letters.length - commonStart(among)));
   return html`
     <span class="middle" title=${text}>
       <span class="hidden">${text}</span>
-      <span class="start" aria-hidden="true">${letters.slice(0, -END).join("")}</span><span class="end" aria-hidden="true">${letters.slice(-END).join("")}</span>
+      <span class="start" aria-hidden="true">${letters.slice(0, -end).join("")}</span><span class="end" aria-hidden="true">${letters.slice(-end).join("")}</span>
     </span>
   `;
+}
+
+/** With how many letters all of these names begin in common; as many as there are for fewer than two. */
+function commonStart(names) {
+  const [first, ...others] = [...new Set(names)].map((name) => Array.from(name));
+  if (others.length === 0) return Infinity;
+  let count = 0;
+  while (count < first.length && others.every((one) => one[count] === first[count])) count += 1;
+  return count;
 }
 
 // Head of a view

@@ -126,8 +126,8 @@ function Aliases({ map, items, count }) {
     <ul class="aliases">
       ${items.slice(0, 6).map((one) => html`
         <li class="alias">
-          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small"><${Name} text=${one.place} /></span></a>
-          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small"><${Name} text=${one.other} /></span></a>
+          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small"><${Name} text=${one.place} among=${[one.place, one.other]} /></span></a>
+          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small"><${Name} text=${one.other} among=${[one.place, one.other]} /></span></a>
           <span class="small">${decimal(one.score)} <span class="faint">own ${decimal(one.own)}</span></span>
         </li>
       `)}

@@ -279,19 +279,21 @@ function RobotList({ robots }) {
   return html`
     ${heard.length > 0 && html`
       <ul aria-label="Robots">
-        ${heard.map((one) => html`<li class="spread" key=${one.session}><${RobotName} robot=${one} /><${Verdict} verdict=${one.verdict} /></li>`)}
+        ${heard.map((one) => html`<li class="robot" key=${one.session}><${RobotName} robot=${one} robots=${robots} /><${Verdict} verdict=${one.verdict} /></li>`)}
       </ul>
     `}
     ${silent.length > 0 && html`
       <h3>Silent</h3>
       <ul aria-label="Silent robots" class="faint">
-        ${silent.slice(0, MOST_SILENT).map((one) => html`<li class="spread" key=${one.session}><${RobotName} robot=${one} /><span>seen ${relative(one.seen)}</span></li>`)}
+        ${silent.slice(0, MOST_SILENT).map((one) => html`<li class="robot" key=${one.session}><${RobotName} robot=${one} robots=${robots} /><span class="nowrap">seen ${relative(one.seen)}</span></li>`)}
       </ul>
       ${silent.length > MOST_SILENT && html`<p class="faint small">and ${integer(silent.length - MOST_SILENT)} more</p>`}
     `}
   `;
 }
 
-function RobotName({ robot: { label, session } }) {
-  return html`<span title=${session}><${Name} text=${label} />${label !== session && html` <code class="small faint">${session.slice(0, 6)}</code>`}</span>`;
+/** The name of a robot, with the beginning of its session where another one has the same. */
+function RobotName({ robot: { label, session }, robots }) {
+  const twice = robots.filter((one) => one.label === label).length > 1;
+  return html`<span class="who" title=${session}><${Name} text=${label} />${twice && label !== session && html` <code class="small faint nowrap">${session.slice(0, 6)}</code>`}</span>`;
 }

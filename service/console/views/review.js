@@ -213,8 +213,8 @@ function Labelling({ map, frame, label, discard }) {
         ${answer.matches.map((one, number) => html`
           <li class=${one.place === against ? "thumb chosen" : "thumb"} key=${one.place}>
             <button type="button" class="cover" aria-pressed=${one.place === against} aria-label=${`Compare with ${one.place}`} onClick=${() => setAgainst(one.place)}><${Thumbnail} map=${map} place=${one.place} /></button>
-            <span class="under small"><a class="name" href=${href("maps", map, "places", one.place)}><${Name} text=${one.place} /></a><span>${decimal(one.score)}</span></span>
-            <button type="button" class="small narrow" disabled=${busy} aria-keyshortcuts=${number + 1} onClick=${clicked({ place: one.place })}><kbd aria-hidden="true">${number + 1}</kbd> It is <${Name} text=${one.place} /></button>
+            <span class="under small"><a class="name" href=${href("maps", map, "places", one.place)}><${Name} text=${one.place} among=${candidates} /></a><span>${decimal(one.score)}</span></span>
+            <button type="button" class="small narrow" disabled=${busy} aria-keyshortcuts=${number + 1} onClick=${clicked({ place: one.place })}><kbd aria-hidden="true">${number + 1}</kbd> It is <${Name} text=${one.place} among=${candidates} /></button>
           </li>
         `)}
       </ol>
