@@ -72,7 +72,7 @@ class MergePlan:
 
 
 def poses_apart(map_: Map, other: Map) -> str | None:
-    """What keeps the poses of two maps apart, in a sentence; None where they are of one kind, or a map has none.
+    """Say, in a sentence, that the poses of two maps are of different kinds; None where they are not, or one has none.
 
     Raises:
         StorageFailure.
