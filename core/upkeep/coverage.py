@@ -80,9 +80,10 @@ def long_steps(steps: NDArray[np.float64], measure: Measure) -> list[Gap]:
 
 def walks(where: Whereabouts) -> Iterator[NDArray[np.int64]]:
     """The positions of the places of each sequence of n places, in their order; places without one are in none."""
-    for code in np.unique(where.sequence[where.sequence != NO_SEQUENCE]):
-        members = np.flatnonzero(where.sequence == code)
-        yield members[np.argsort(where.ordinal[members], kind="stable")]
+    members = np.flatnonzero(where.sequence != NO_SEQUENCE)
+    order = members[np.lexsort((where.ordinal[members], where.sequence[members]))]
+    if len(order):
+        yield from np.split(order, np.flatnonzero(np.diff(where.sequence[order])) + 1)
 
 
 def long_ways(where: Whereabouts, walk: NDArray[np.int64], first: NDArray[np.int64]) -> list[Gap]:

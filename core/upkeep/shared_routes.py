@@ -31,25 +31,32 @@ class SharedRoute:
     aliases: list[Alias]
 
 
-def shared_routes(where: Whereabouts, aliases: Iterable[Alias]) -> list[SharedRoute]:
+def shared_routes(where: Whereabouts, aliases: Iterable[Alias], examined: NDArray[np.int64]) -> list[SharedRoute]:
     """Find traverses whose frames look alike one after the other in the same order; those of most frames come first.
 
     Frames that poses of one kind put at different places only look alike, so they do not count.
+
+    Args:
+        where: of all places.
+        examined: int64 [k], the positions of those among which the aliases were found.
     """
+    looked_at = where.sequence[examined]
     found: dict[tuple[int, int], list[Alias]] = {}
     for alias in aliases:
         first, second = sorted((int(where.sequence[alias.place]), int(where.sequence[alias.other])))
         known = where.kind[alias.place] == where.kind[alias.other] != NO_POSE
         if NO_SEQUENCE != first != second and not known:
             found.setdefault((first, second), []).append(alias)
-    routes = [SharedRoute(pair, some) for pair, some in found.items() if _is_one_route(where, pair, some)]
+    routes = [SharedRoute(pair, some) for pair, some in found.items() if _is_one_route(where, pair, some, looked_at)]
     return sorted(routes, key=lambda route: -len(route.aliases))
 
 
-def _is_one_route(where: Whereabouts, pair: tuple[int, int], aliases: list[Alias]) -> bool:
+def _is_one_route(
+    where: Whereabouts, pair: tuple[int, int], aliases: list[Alias], looked_at: NDArray[np.int32]
+) -> bool:
     places = np.array([alias.place for alias in aliases])
     others = np.array([alias.other for alias in aliases])
-    shares = [(where.sequence[places] == code).sum() / (where.sequence == code).sum() for code in pair]
+    shares = [(where.sequence[places] == code).sum() / max(1, (looked_at == code).sum()) for code in pair]
     if len(aliases) < LEAST_FRAMES or max(shares) < LEAST_SHARE:
         return False
     turned = where.sequence[places] == pair[1]

@@ -22,6 +22,7 @@ from service.places.schemas import PlaceView
 from service.queries.answers import answer_of
 from service.queries.following import follow_answer
 from service.queries.given_answers import QueriedFrame
+from service.queries.parameters import QueryParameters
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -259,7 +260,8 @@ def _question(session: Session, k: int) -> dict[str, Any]:
     given: dict[str, Any] = session.options.model_dump(include={"verify", "camera"}, exclude_none=True)
     if session.options.sequences is not None:
         given["sequences"] = json.dumps(session.options.sequences)
-    return given | {"k": k}
+    usual = QueryParameters().model_dump()
+    return {name: value for name, value in {**given, "k": k}.items() if value != usual[name]}
 
 
 def session_view(session: Session, private: bool) -> SessionView:

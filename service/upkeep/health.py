@@ -225,7 +225,7 @@ def _aliasing(own: SelfQueries, first: NDArray[np.int64], until: float) -> _Alia
                 aliases.append(Alias(position, int(others[best[0]]), float(found[0]), mine))
         done += len(some)
     counts = hubness.occurrences(np.concatenate(lists), len(own))[views]
-    routes = shared_routes(own.where, aliases)
+    routes = shared_routes(own.where, aliases, np.array(order[:done], np.int64))
     along = {(one.place, one.other) for route in routes for one in route.aliases}
     aliases = [alias for alias in aliases if (alias.place, alias.other) not in along]
     aliases.sort(key=lambda alias: -alias.score)

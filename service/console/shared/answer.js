@@ -178,14 +178,14 @@ export function Timings({ milliseconds: told }) {
   const sum = stages.reduce((all, [, value]) => all + value, 0) || 1;
   return html`
     <div class="stack">
-    <div class="timings" aria-hidden="true">
-      ${stages.map(([name, value], one) => html`<span class=${`tint-${one % 8}`} title=${`${name} ${milliseconds(value)}`} style=${{ flexGrow: value / sum }}></span>`)}
-    </div>
-    <ul class="stages">
-      ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
-      <li><span></span><strong>total</strong><strong class="number">${milliseconds(total)}</strong></li>
-      ${rest <= -LEAST_REST && html`<li><span></span><span class="faint">some stages ran at the same time</span></li>`}
-    </ul>
+      <div class="timings" aria-hidden="true">
+        ${stages.map(([name, value], one) => html`<span class=${`tint-${one % 8}`} title=${`${name} ${milliseconds(value)}`} style=${{ flexGrow: value / sum }}></span>`)}
+      </div>
+      <ul class="stages">
+        ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
+        <li><span></span><strong>total</strong><strong class="number">${milliseconds(total)}</strong></li>
+        ${rest <= -LEAST_REST && html`<li><span></span><span class="faint">some stages ran at the same time</span></li>`}
+      </ul>
     </div>
   `;
 }

@@ -131,7 +131,7 @@ function Line({ map, event, open }) {
 }
 
 function asText(question) {
-  return Object.entries(question || {}).map(([name, value]) => `${name} ${value}`).join(", ") || "none";
+  return Object.entries(question || {}).map(([name, value]) => `${name} ${value}`).join(", ") || "nothing but the frame";
 }
 
 function Details({ map, event, close }) {
@@ -158,7 +158,7 @@ function Details({ map, event, close }) {
           ["Asked by", event.key || "–"],
           event.camera && ["Camera", event.camera],
           event.session && ["Session", `${event.session}${event.frame !== null && event.frame !== undefined ? `, frame ${event.frame}` : ""}`],
-          ["Filters", event.question === null ? "longer than is told" : asText(event.question)],
+          ["Asked with", event.question === null ? "longer than is told" : asText(event.question)],
           ["Operation", (event.operation || "").replaceAll("_", " ")],
           ["Request", html`<code>${event.request_id}</code>`],
         ]} />
