@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
 
@@ -314,6 +314,13 @@ class Whereabouts:
         """The places ``rows`` (integers or a mask) in that order."""
         chosen = np.asarray(rows)
         return Whereabouts(**{name: column[chosen] for name, column in vars(self).items()})
+
+    def without_poses(self, places: ArrayLike) -> Whereabouts:
+        """The same, but for the poses of some places (integers or a mask), which then have none."""
+        chosen = np.asarray(places)
+        kind, position, heading = self.kind.copy(), self.position.copy(), self.heading.copy()
+        kind[chosen], position[chosen], heading[chosen] = NO_POSE, 0.0, np.nan
+        return replace(self, kind=kind, position=position, heading=heading)
 
     @classmethod
     def joined(cls, parts: Iterable[Whereabouts]) -> Whereabouts:

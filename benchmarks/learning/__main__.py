@@ -20,7 +20,7 @@ from benchmarks.learning.learner import EncodedRun, Learner, Mode, Tally
 from benchmarks.learning.living_map import EncodedPicture, LivingMap
 from benchmarks.learning.worlds import WORLDS, RobotWorld
 from benchmarks.learning.year import Plan, curve, moments, year
-from benchmarks.report import report, verdict
+from benchmarks.report import report
 from core.belief import view_of
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints

@@ -11,21 +11,21 @@ from core.learning.corroboration import PendingProposal, corroborated
 from core.learning.frames import RunFrame, Trail
 from core.learning.looks import MOST_LOOKS, kept
 from core.learning.proposals import Lesson, LessonOptions, Proposal, lesson_of
-from core.learning.smoothing import WeighedFrame, Posterior, smoothed
+from core.learning.smoothing import Posterior, WeighedFrame, smoothed
 from core.learning.statistics import LookStatistics, services
 
 __all__ = [
     "MOST_LOOKS",
     "Cohort",
     "Lesson",
-    "WeighedFrame",
     "LessonOptions",
+    "LookStatistics",
     "PendingProposal",
     "Posterior",
     "Proposal",
     "RunFrame",
-    "LookStatistics",
     "Trail",
+    "WeighedFrame",
     "cohort_of",
     "corroborated",
     "kept",

@@ -198,7 +198,9 @@ class _Judge:
 
     def _near(self, fit: Fit, place: int) -> bool:
         same = self.graph.neighborhood
-        return self.way.distance(fit, place) <= (0.5 * same.radius if fit.point is not None else 0.5 * same.frames + 0.5)
+        return self.way.distance(fit, place) <= (
+            0.5 * same.radius if fit.point is not None else 0.5 * same.frames + 0.5
+        )
 
     def outcome(self, number: int, place: int | None) -> Proposal | Refusal:
         """The proposal that a frame is, or why it is none."""

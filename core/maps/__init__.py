@@ -1,6 +1,6 @@
 """Maps, whatever stores them: their records, a caller's knowledge of a place, and the interfaces of a store."""
 
-from core.maps.counterparts import Correspondence
+from core.maps.counterparts import Correspondence, own_poses
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     Change,
@@ -51,4 +51,5 @@ __all__ = [
     "Store",
     "TierSetting",
     "VerifyReport",
+    "own_poses",
 ]

@@ -7,7 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
-from core.places import NO_SEQUENCE, Place, Pose
+import numpy as np
+from numpy.typing import NDArray
+
+from core.places import NO_SEQUENCE, Place, Pose, Whereabouts
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Counterparts(Protocol):
     """Reads and writes where the places of one map have counterparts.  Any thread may use it."""
 
     def handed_over(self) -> dict[int, str]:
-        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+        """The rows of the places, and looks, whose pose was handed over, each with the id of the place that it is from."""
 
     def store(self, change: Correspondence) -> None:
         """Store stations and poses, all of them or, if this raises, none.
@@ -95,6 +98,21 @@ class Counterparts(Protocol):
             other: the counterparts of the map from which they were copied, of the same store.
             names: the ids of the copied places in this map, by their ids in the other.
         """
+
+
+def own_poses(counterparts: Counterparts, where: Whereabouts, rows: NDArray[np.int64] | None = None) -> Whereabouts:
+    """Places with the poses that are their own, which alone are truth: an alignment would prove itself by those that it
+    has handed over.
+
+    Args:
+        where: of the places.
+        rows: int64 [n], their rows; None: those of ``where``, from 0 on.
+
+    Raises:
+        StorageFailure.
+    """
+    handed = np.fromiter(counterparts.handed_over(), np.int64)
+    return where.without_poses(np.isin(np.arange(len(where)) if rows is None else rows, handed))
 
 
 @dataclass(frozen=True)

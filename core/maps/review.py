@@ -93,8 +93,8 @@ class Review(Protocol):
         This waits for nothing.
         """
 
-    def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
-        """Label a frame; the label replaces an earlier one.
+    def label(self, number: int, label: Mapping[str, Any] | None) -> ReviewFrame:
+        """Label a frame; the label replaces an earlier one, and None takes it back.
 
         Raises:
             UnknownFrame: it is not stored.

@@ -20,10 +20,10 @@ from core.judgement.background import GUARD_FACTOR
 from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered, joined
 from core.judgement.verdict import Calibration, judge
-from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot
+from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot, own_poses
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
-from core.places import NO_POSE, Neighborhood
+from core.places import NO_POSE
 from core.recognition.stages import agree, neighborhood_of
 
 Item = TypeVar("Item")
@@ -76,11 +76,13 @@ class LabelledQueries:
     count: how many there are.
     made: the queries; each is read when it is needed.
     allowed: bool [rows], the rows that are searched; None: all.
+    aligned: how many of the queries have no pose of their own, so that an alignment says which place they show.
     """
 
     count: int
     made: Iterator[LabelledQuery]
     allowed: Flags | None = None
+    aligned: int = 0
 
 
 def queries_from_labels(
@@ -103,7 +105,7 @@ def queries_from_labels(
     """
     rows = _rows_of(map_, snapshot, [place for place in places if place is not None])
     own_rows = [None if one is None else map_.rows_of([one])[0] for one in own or [None] * len(places)]
-    near = _SamePlace(snapshot, neighborhood_of(map_))
+    near = _SamePlace(map_, snapshot)
     nothing = np.zeros(snapshot.rows, np.bool_)
 
     def made() -> Iterator[LabelledQuery]:
@@ -141,14 +143,10 @@ def queries_from_traverse(
         raise UnknownPlace(f"The sequence {sequence[:128]!r} has no place {strangers[0][:128]!r}.")
     rows = _rows_of(map_, snapshot, members + [place for place in (pairs or {}).values() if place is not None])
     own = snapshot.whereabouts.of_views(np.array([rows[place] for place in members], np.int64))  # with their looks
-    near = _SamePlace(snapshot, neighborhood_of(map_))
+    near = _SamePlace(map_, snapshot)
     if pairs is None:
         others = snapshot.alive & ~own
-        queried = [
-            place
-            for place in queried
-            if snapshot.whereabouts.kind[rows[place]] != NO_POSE or (near(rows[place]) & others).any()
-        ]
+        queried = [place for place in queried if near.has_pose(rows[place]) or (near(rows[place]) & others).any()]
         if not queried:
             raise CalibrationImpossible(
                 f"The frames of the sequence {sequence[:128]!r} have no poses: align the sequence with another one, or "
@@ -165,7 +163,8 @@ def queries_from_traverse(
             around = nothing if partner is None else near(partner, GUARD_FACTOR)
             yield LabelledQuery(*_stored(snapshot, row), true, own, around)
 
-    return LabelledQueries(len(queried), made(), snapshot.alive & ~own)
+    aligned = 0 if pairs is not None else sum(not near.has_pose(rows[place]) for place in queried)
+    return LabelledQueries(len(queried), made(), snapshot.alive & ~own, aligned)
 
 
 def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQueries:
@@ -177,7 +176,7 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
     Args:
         most: the largest number of queries; they are spread evenly over the map.
     """
-    near = _SamePlace(snapshot, neighborhood_of(map_))
+    near = _SamePlace(map_, snapshot)
     queried = _spread(np.flatnonzero(snapshot.alive).tolist(), most)
 
     def made() -> Iterator[LabelledQuery]:
@@ -293,9 +292,18 @@ def adjust_to_labels(
     return adjust_calibration(trials, base, source)
 
 
-def calibration_warnings(found: FittedCalibration, method: str) -> list[str]:
-    """Sentences that the owner of a map should read about its calibration."""
+def calibration_warnings(found: FittedCalibration, method: str, aligned: int = 0) -> list[str]:
+    """Sentences that the owner of a map should read about its calibration.
+
+    Args:
+        aligned: as in :class:`LabelledQueries`.
+    """
     warnings = [{"map": FROM_ITSELF, "labels": FROM_DOUBT}[method]] if method in ("map", "labels") else []
+    if aligned:
+        warnings.append(
+            f"Which place {aligned} of the frames show is known from an alignment alone, not from poses of their own: "
+            "where it errs, these figures err with it."
+        )
     if found.measurement.frames < FEW_FRAMES:
         warnings.append(f"It rests on {found.measurement.frames} frames; {FEW_FRAMES} or more make it steadier.")
     held = found.measurement.cross_validated
@@ -311,13 +319,21 @@ def calibration_warnings(found: FittedCalibration, method: str) -> list[str]:
 
 
 class _SamePlace:
-    """The rows that are the same place as a row, within a multiple of the map's same-place distance; bool [rows]."""
+    """The rows that are the same place as a row, within a multiple of the map's same-place distance; bool [rows].
 
-    def __init__(self, snapshot: Snapshot, neighborhood: Neighborhood) -> None:
-        self._whereabouts, self._neighborhood = snapshot.whereabouts, neighborhood
+    Poses count that are the places' own.
+    """
+
+    def __init__(self, map_: Map, snapshot: Snapshot) -> None:
+        self._neighborhood = neighborhood_of(map_)
+        self._whereabouts = own_poses(map_.counterparts, snapshot.whereabouts)
 
     def __call__(self, row: int, times: float = 1) -> Flags:
         return self._whereabouts.near(row, self._neighborhood.times(times))
+
+    def has_pose(self, row: int) -> bool:
+        """Whether the place has a pose of its own."""
+        return bool(self._whereabouts.kind[row] != NO_POSE)
 
 
 def _trial(

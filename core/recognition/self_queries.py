@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.maps import Map
+from core.maps import Map, own_poses
 from core.maps.records import Outline
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
@@ -34,7 +34,7 @@ class SelfQueries:
 
     places: id, row and fields of each place.
     rows: int64 [places], the rows of the places in ``snapshot``.
-    where: the poses and sequences of the places.
+    where: the poses and sequences of the places, without poses that an alignment has handed over.
     """
 
     def __init__(self, map_: Map, encoder: Encoder) -> None:
@@ -45,7 +45,7 @@ class SelfQueries:
         there = (place for place in outline if place.row < self.snapshot.rows)
         self.places: list[Outline] = sorted(there, key=lambda place: place.row)
         self.rows = np.array([place.row for place in self.places], np.int64)
-        self.where = self.snapshot.whereabouts_at(self.rows)
+        self.where = own_poses(map_.counterparts, self.snapshot.whereabouts_at(self.rows), self.rows)
         self._position = np.full(self.snapshot.rows, -1, np.int64)
         self._position[self.rows] = np.arange(len(self.rows))
 

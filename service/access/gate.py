@@ -29,13 +29,16 @@ from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_of, 
 from service.access.keyring import Keyring
 from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
-from service.errors.faults import Fault, ForeignPage, KeyRefused, MapForbidden, RoleTooLow
+from service.errors.faults import Fault, ForeignPage, KeyNeeded, KeyRefused, MapForbidden, RoleTooLow
 from service.errors.problems import KINDS, problem_response
 from service.settings import PREFIX, Settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
 
 Headers = list[tuple[bytes, bytes]]
+
+WHO_AM_I = "read_own_key"
+"""The operation by which a caller without a key learns that it needs one, as the console does when it is opened."""
 
 OWN_SITES = frozenset({b"same-origin", b"none"})
 """Values of ``Sec-Fetch-Site``: a page of this service, and an address that a person typed."""
@@ -310,7 +313,8 @@ class Access:
         kind = KINDS[type(error)]
         scope["route"] = endpoint  # for the log and the metrics
         asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
-        self._refusals.note(asker, path, kind.status, kind.slug)
+        if not (isinstance(error, KeyNeeded) and asker.operation == WHO_AM_I):
+            self._refusals.note(asker, path, kind.status, kind.slug)
         if scope["type"] == "websocket":
             self.metrics.problems.labels(kind.slug).inc()
             answer = problem_response(Request({**scope, "type": "http", "method": "GET"}), error)

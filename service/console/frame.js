@@ -1,5 +1,6 @@
 // The frame around every view: where one can go, who one is, whether the service is there, and what is being said.
-import { caller, checkConnection, epoch, everyMap, get, identify, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { begin as beginWithKey, caller, checkConnection, epoch, everyMap, get, isName, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { mapNames, remember, remembered } from "./shared/chosen_map.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
 import { Secret } from "./shared/secret.js";
@@ -22,9 +23,15 @@ const OF_SERVICE = {
   audit: ["Audit", () => import("./views/audit.js"), "admin", true],
   service: ["Service", () => import("./views/service.js"), "query", false],
 };
-const LAST_MAP = "placerec.map";
 
 const menuOpen = signal(false);
+
+// A file that is dropped where nothing takes it must not take the place of the console.
+for (const kind of ["dragover", "drop"]) {
+  addEventListener(kind, (event) => {
+    if (event.dataTransfer?.types.includes("Files") && !event.target.closest?.("input")) event.preventDefault();
+  });
+}
 
 // The view of the present address is fetched while the service is asked who we are.
 viewOf(route.value).entry?.[1]().catch(() => {});
@@ -33,7 +40,7 @@ export function Frame() {
   const [refused, setRefused] = useState(null);
   const begin = () => {
     setRefused(null);
-    identify().catch(setRefused);
+    beginWithKey().catch(setRefused);
   };
   useEffect(begin, []);
   return html`
@@ -80,10 +87,7 @@ function View() {
     if (!entry) return;
     entry[1]().then(
       (module) => setLoaded({ name, component: module.default }),
-      (error) => {
-        setLoaded({ name, error });
-        checkConnection();
-      },
+      async (error) => setLoaded({ name, error, there: await checkConnection() }),
     );
   }, [name, epoch.value]);
   useEffect(() => {
@@ -95,7 +99,7 @@ function View() {
     if (!entry) return html`<${Missing} />`;
     if (!may(entry[2]) || (entry[3] && !everyMap.value)) return html`<${Forbidden} role=${entry[2]} />`;
     if (loaded.name !== name) return html`<${Loading} />`;
-    if (loaded.error) return html`<${Stale} />`;
+    if (loaded.error) return loaded.there ? html`<${Stale} />` : html`<${Away} />`;
     return html`<${loaded.component} key=${map} map=${map} rest=${rest} query=${route.value.query} />`;
   };
   return html`<div class="view" data-view=${route.value.parts.join("/")}>${shown()}</div>`;
@@ -107,6 +111,10 @@ function Missing() {
 
 function Forbidden({ role }) {
   return html`<div class="nothing"><h1>Not for this key</h1><p>This view needs a key of role ${role}${role === "admin" && " for all maps"}.</p></div>`;
+}
+
+function Away() {
+  return html`<div class="nothing"><h1>The view is not loaded yet</h1><p>It is shown as soon as the service can be reached.</p></div>`;
 }
 
 function Stale() {
@@ -121,22 +129,6 @@ function Stale() {
 
 // The side
 
-function remember(map) {
-  try {
-    sessionStorage.setItem(LAST_MAP, map);
-  } catch {
-    // Then it is not remembered.
-  }
-}
-
-function remembered() {
-  try {
-    return sessionStorage.getItem(LAST_MAP);
-  } catch {
-    return null;
-  }
-}
-
 function Side() {
   const { name, map } = viewOf(route.value);
   const chosen = map || remembered();
@@ -144,7 +136,7 @@ function Side() {
     may(entry[2]) && (!entry[3] || everyMap.value) &&
     html`<li><a href=${address} aria-current=${current ? "page" : undefined}>${entry[0]}</a></li>`;
   return html`
-    <div class="side">
+    <header class="side">
       <div class="brand">
         <a href=${href("maps")}><${Mark} /> placerec</a>
         <button type="button" class="menu" aria-expanded=${menuOpen.value} aria-controls="menu" onClick=${() => (menuOpen.value = !menuOpen.value)}>Menu</button>
@@ -164,7 +156,7 @@ function Side() {
         <${Identity} />
         <${Theme} />
       </nav>
-    </div>
+    </header>
   `;
 }
 
@@ -176,9 +168,6 @@ function Mark() {
   `;
 }
 
-/** All maps by name; it grows with the list, and shrinks when a map is gone. */
-export const mapNames = signal([]);
-
 function MapChoice({ chosen, name }) {
   useEffect(() => {
     get("/maps", { limit: 1000 }).then(
@@ -186,7 +175,8 @@ function MapChoice({ chosen, name }) {
       () => {},
     );
   }, [epoch.value, route.value.parts.length < 2, chosen]);
-  const names = chosen && !mapNames.value.includes(chosen) ? [chosen, ...mapNames.value] : mapNames.value;
+  const known = mapNames.value || [];
+  const names = chosen && !known.includes(chosen) ? [chosen, ...known] : known;
   if (names.length === 0) return null;
   const view = name in OF_MAPS ? name : "plan";
   return html`
@@ -222,7 +212,7 @@ function KeyPage({ problem }) {
   return html`
     <main class="key-page">
       <h1><${Mark} /> placerec</h1>
-      <p>The service asks for a key. It is stored in this tab and sent to this service only.</p>
+      <p>The service asks for a key. It is kept by the open tabs of this browser and sent to this service only.</p>
       ${problem.slug !== "key-needed" && html`<${Trouble} error=${problem} />`}
       <${KeyForm} />
     </main>

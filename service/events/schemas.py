@@ -64,6 +64,11 @@ class QueryEvent(Event):
     camera: str | None = None
     session: str | None = Field(default=None, description="The session that the frame belongs to.")
     frame: int | None = Field(default=None, description="The robot's number of the frame.")
+    question: dict[str, Any] | None = Field(
+        default=None,
+        description="The parameters of a query that asks the same, without those at their defaults; null if they are "
+        "longer than 2000 characters.",
+    )
     file: str | None = Field(default=None, description="The name of the file part that the frame was.")
     milliseconds: dict[str, float]
     revision: int | None = Field(description="The revision of the map that answered.")

@@ -11,8 +11,8 @@ from starlette.responses import Response, StreamingResponse
 
 EVENT_STREAM = "text/event-stream"
 
-HEARTBEAT_SECONDS = 10.0
-"""A stream sends a comment at least so often, so that connections stay open."""
+HEARTBEAT_SECONDS = 3.0
+"""A stream sends a comment at least so often, so that connections stay open and a service that hangs is noticed."""
 
 OPENING, HEARTBEAT = ": placerec\n\n", ": still there\n\n"
 

@@ -273,7 +273,7 @@ def measure(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=calibration_warnings(found, "adjusted" if adjusted else order.method),
+        warnings=calibration_warnings(found, "adjusted" if adjusted else order.method, queries.aligned),
     )
     return report, found.trials
 

@@ -53,6 +53,9 @@ class CalibrationState(BaseModel):
     measured: LatestMeasurement | None = Field(description="Null if nothing was measured, or it is not known any more.")
     now: Effect | None = Field(description="The effect of the calibration in force on the frames that were measured.")
     then: Effect | None = Field(description="Its effect with the threshold and the margin that were given.")
+    proposed: Effect | None = Field(
+        description="The effect of the calibration that was measured, which a dry run has found and not stored."
+    )
 
 
 @router.get("", responses=problem_documentation(errors.StorageFull))
@@ -72,8 +75,10 @@ def read_calibration(
     record = map_.record
     in_force = record.calibration or engine.default_calibration(record.encoder)
     response.headers["ETag"] = entity_tag(record.revision)
-    found = _measured(statistics.calibration(map_key(map_)))
-    now = then = None
+    found = measured_of(statistics.calibration(map_key(map_)))
+    now = then = proposed = None
+    if found is not None and not found[0].report.stored:
+        proposed = effect_of(found[1], found[0].report.calibration)
     if in_force is not None and found is not None:
         trials, changes = found[1], options.model_dump(exclude_none=True)
         now = effect_of(trials, in_force)
@@ -85,10 +90,11 @@ def read_calibration(
         measured=None if found is None else found[0],
         now=now,
         then=then,
+        proposed=proposed,
     )
 
 
-def _measured(stored: tuple[datetime, str, str] | None) -> tuple[LatestMeasurement, Trials] | None:
+def measured_of(stored: tuple[datetime, str, str] | None) -> tuple[LatestMeasurement, Trials] | None:
     """The measurement and its trials; None if there is none that this version can read."""
     if stored is None:
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from contextlib import suppress
+from datetime import datetime
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -34,6 +35,7 @@ from service.http.schemas import PageParameters
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
+from service.maps.calibration_preview import measured_of
 from service.maps.limits import check_map_count
 from service.maps.map_events import tell_end, tell_map
 from service.maps.schemas import (
@@ -191,11 +193,12 @@ def edit_map(
     """Edit a map by a merge patch.
 
     A calibration that is set here becomes the map's own (`"source": "manual"`); values that are left out are those
-    of the calibration in force. `null` restores the encoder's default.
+    of the calibration in force. `null` restores the encoder's default. With `measured_at` it is the one that the latest
+    calibrate has found.
     """
     map_ = engine.maps.get(map_id)
     expected = expected_revision(if_match, map_.record.revision)
-    settings = _settings_changes(engine, map_, changes)
+    settings = _settings_changes(engine, statistics, map_, changes)
     edited = map_.edit(settings, expected)
     tell_map(engine, map_, "edited", sorted(settings))
     if edited.review is not None and "review" in settings:
@@ -207,15 +210,24 @@ def edit_map(
     return show_map(engine, map_, _last_day(statistics, map_))
 
 
-def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[str, Any]:
-    """The values that a merge patch sets; null stands for the default of its field."""
+def _settings_changes(engine: Engine, statistics: QueryStatistics, map_: Map, changes: MapChanges) -> dict[str, Any]:
+    """The values that a merge patch sets; null stands for the default of its field.
+
+    Raises:
+        InvalidField, RevisionMismatch.
+    """
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     calibration, review = given.pop("calibration", None), given.pop("review", None)
     learning = given.pop("learning", None)
     values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
     if "calibration" in changes.model_fields_set:
-        values["calibration"] = _own_calibration(engine, map_, calibration)
+        measured_at = None if calibration is None else calibration.measured_at
+        values["calibration"] = (
+            _own_calibration(engine, map_, calibration)
+            if measured_at is None
+            else _measured_calibration(statistics, map_, measured_at)
+        )
     if "review" in changes.model_fields_set:
         kept = map_.record.review or ReviewSetting()
         values["review"] = None if review is None else _changed(kept, ReviewSetting(), review)
@@ -230,6 +242,18 @@ def _changed(now: Setting, default: Setting, changes: ReviewChanges | LearningCh
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     changed = {name: getattr(default, name) if value is None else value for name, value in given.items()}
     return type(now)(**now.model_dump() | changed)
+
+
+def _measured_calibration(statistics: QueryStatistics, map_: Map, at: datetime) -> Calibration:
+    """The calibration that the latest calibrate of a map has found, at this time.
+
+    Raises:
+        RevisionMismatch: it was measured at another time, or nothing was.
+    """
+    found = measured_of(statistics.calibration(map_key(map_)))
+    if found is None or found[0].at != at or found[0].report.encoder != map_.record.encoder:
+        raise errors.RevisionMismatch("The map was measured again meanwhile; read its calibration again.")
+    return found[0].report.calibration
 
 
 def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:

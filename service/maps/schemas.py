@@ -140,12 +140,23 @@ class NewMap(MapSettings):
 
 
 class CalibrationChanges(BaseModel):
-    """Values of a calibration to set by hand; null restores the encoder's value."""
+    """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
     model_config = ConfigDict(extra="forbid")
 
     threshold: float | None = Field(strict=True, default=None, allow_inf_nan=False)
     margin: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
+    measured_at: Timestamp | None = Field(
+        default=None,
+        description="Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time "
+        "at which it was measured, `measured.at` of the calibration. If it was measured again since, this is refused.",
+    )
+
+    @model_validator(mode="after")
+    def _sets_or_stores(self) -> CalibrationChanges:
+        if self.measured_at is not None and len(self.model_fields_set) > 1:
+            raise ValueError("give measured_at alone, or threshold and margin")
+        return self
 
 
 class ReviewChanges(BaseModel):

@@ -36,6 +36,8 @@ PLAN_EXAMPLE: dict[str, Any] = {
     "heading": [90.0, 90.0, None],
     "timestamp": [1795168800000, 1795168801000, None],
     "flags": [2, 3, 0],
+    "gaps": [{"before": "p0", "after": "p1", "metres": 2.5}],
+    "gap_count": 1,
 }
 
 Numbers = list[float | None] | None
@@ -45,6 +47,14 @@ class PlanParameters(Parameters):
     """How many of the places."""
 
     step: int = Field(default=1, ge=1, le=1_000_000, description="List about one place in every `step`.")
+
+
+class PlannedGap(BaseModel):
+    """Two successive places of a traverse that are unusually far apart."""
+
+    before: str
+    after: str
+    metres: float
 
 
 class PlanView(BaseModel):
@@ -72,6 +82,8 @@ class PlanView(BaseModel):
     flags: list[int] = Field(
         description="The sum of 1, if the pose was handed over by an alignment, and 2, if a picture is stored."
     )
+    gaps: list[PlannedGap] = Field(description="The gaps in metres of the health report, longest first; 500 at most.")
+    gap_count: int = Field(description="How many gaps in metres there are.")
 
 
 @router.get(

@@ -9,9 +9,14 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
+import numpy as np
 from anyio import CapacityLimiter
 
-from core.maps import Map
+from core.maps import Map, own_poses
+from core.places import NO_POSE
+from core.recognition.stages import neighborhood_of
+from core.upkeep import coverage
+from core.upkeep.redundancy import first_looks
 from service.errors.faults import PlanTooLarge
 
 MOST_PLACES = 200_000
@@ -19,6 +24,9 @@ MOST_PLACES = 200_000
 
 MOST_BYTES = 64 * 1024 * 1024
 """Bytes of all cached plans together, compressed."""
+
+MOST_GAPS = 500
+"""Gaps that a plan lists; all are counted."""
 
 MOST_CACHED = 64
 """Number of cached plans: small ones, such as those of many steps, weigh more than their bytes."""
@@ -84,7 +92,8 @@ class Plans:
                 f"step={-(-count // MOST_PLACES)} or more."
             )
         state = map_.state  # of now: a write while the plan is read makes it old
-        columns = map_.plan.columns(step)
+        gaps, gap_count = gaps_of(map_)
+        columns = f'{map_.plan.columns(step)}, "gaps": {json.dumps(gaps)}, "gap_count": {gap_count}'
         revision = hashlib.sha256(columns.encode()).hexdigest()[:32]
         head = {"map": map_.record.id, "revision": revision, "places": count, "step": step}
         text = f"{json.dumps(head)[:-1]}, {columns}}}"
@@ -100,6 +109,31 @@ class Plans:
             while self._bytes > MOST_BYTES or len(self._cached) > MOST_CACHED:
                 _, oldest = self._cached.popitem(last=False)
                 self._bytes -= len(oldest.compressed)
+
+
+def gaps_of(map_: Map) -> tuple[list[dict[str, object]], int]:
+    """The gaps of a map in metres as the health report counts them, the ``MOST_GAPS`` longest, and how many there are.
+
+    It blocks.
+
+    Raises:
+        UnknownMap, MapQuarantined, StorageFailure.
+    """
+    snapshot = map_.snapshot()
+    rows = np.flatnonzero(snapshot.alive)
+    where = own_poses(map_.counterparts, snapshot.whereabouts_at(rows), rows)
+    if not (where.kind != NO_POSE).any():
+        return [], 0
+    first = first_looks(where, neighborhood_of(map_))
+    found = [(walk, gap) for walk in coverage.walks(where) for gap in coverage.long_ways(where, walk, first)]
+    found.sort(key=lambda one: -one[1].value)
+    ends = [int(rows[walk[gap.before + end]]) for walk, gap in found[:MOST_GAPS] for end in (0, 1)]
+    names = ["" if place is None else place.id for place in map_.places_at(ends)]
+    listed: list[dict[str, object]] = [
+        {"before": before, "after": after, "metres": round(gap.value, 3)}
+        for before, after, (_, gap) in zip(names[::2], names[1::2], found, strict=False)
+    ]
+    return listed, len(found)
 
 
 def _key(map_: Map, step: int) -> PlanKey:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -14,6 +15,9 @@ from service.queries.schemas import EstimatedPose, QueryAnswer
 MOST_MATCHES = 5
 """Matches that are stored of one answer, the best ones."""
 
+LONGEST_QUESTION = 2000
+"""Characters of the JSON of a question that listeners get."""
+
 MapKey = tuple[str, str]
 """The id of a map and the time of its creation: a new map of the same id has answers of its own."""
 
@@ -23,11 +27,13 @@ class QueriedFrame(NamedTuple):
 
     camera: the name of the camera that took it.
     session, number: the session that it belongs to, and the robot's number of it.
+    question: the parameters of the question, as :meth:`~service.queries.parameters.FilterParameters.again` gives them.
     """
 
     camera: str | None = None
     session: str | None = None
     number: int | None = None
+    question: Mapping[str, Any] | None = None
 
 
 class GivenAnswer(NamedTuple):
@@ -96,6 +102,8 @@ class GivenAnswer(NamedTuple):
             explanation: the path of the picture that explains the answer.
         """
         same = {name: getattr(self, name) for name in _SAME}
+        question = dict(self.frame.question or {})
+        short = len(json.dumps(question)) <= LONGEST_QUESTION
         return QueryEvent(
             **same,
             map=map_id,
@@ -106,6 +114,7 @@ class GivenAnswer(NamedTuple):
             camera=self.frame.camera,
             session=self.frame.session,
             frame=self.frame.number,
+            question=question if short else None,
             file=file,
             milliseconds=dict(self.milliseconds),
             explanation=explanation,

@@ -162,6 +162,6 @@ async def query_or_enrol(
     response.status_code = 201 if change == "created" else 200
     request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
-    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera))
+    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera, question=options.again()))
     shown = None if enrolled is None else PlaceView.of(enrolled)
     return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)

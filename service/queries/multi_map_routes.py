@@ -82,7 +82,7 @@ async def query_maps(
     recognized = together.best if together.verdict == "recognized" else None
     wholes = [_whole_answer(report) for report in reports]
     answers = [_map_answer(request, report, whole) for report, whole in zip(reports, wholes, strict=True)]
-    queried, data = QueriedFrame(frames[0].camera), frames[0].data
+    queried, data = QueriedFrame(frames[0].camera, question=options.again()), frames[0].data
     total = rounded({"total": milliseconds_since(started(request))})
     for report, whole in zip(reports, wholes, strict=True):
         if report.map_ is None or whole is None:

@@ -119,6 +119,15 @@ class FilterParameters(PlaceDescription):
         )
         return made if made else None
 
+    def again(self) -> dict[str, Any]:
+        """The parameters of a query that asks the same, as JSON values; those at their defaults are left out."""
+        unused = {"radius": ("x", "y", "z", "latitude", "longitude"), "heading_tolerance": ("heading",)}
+        left_out = {name for needed, names in unused.items() if getattr(self, needed) is None for name in names}
+        if self._recent() is None:
+            left_out |= {"sequence", "timestamp"}
+        names = {*FilterParameters.model_fields, "k", "verify"} - left_out
+        return self.model_dump(mode="json", include=names, exclude_defaults=True)
+
     def _geometry(self) -> dict[Kind, Constraint]:
         found: dict[Kind, Constraint] = {}
         if self.radius is not None:

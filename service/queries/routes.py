@@ -82,7 +82,7 @@ async def query(
         answer.explanation = await explain_match(engine, pictures, map_, encoded, answered.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
-    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera))
+    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera, question=options.again()))
     return answer
 
 
@@ -132,7 +132,7 @@ async def query_batch(
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     answered = await engine.searches.answer(map_, list(encoded.values()), question)
-    queried = QueriedFrame(options.camera)
+    queried = QueriedFrame(options.camera, question=options.again())
     for index, one in zip(encoded, answered, strict=True):
         answer = items[index].answer = answer_of(map_, one.frame, one.answer)
         follow_answer(engine, statistics, map_, answer, files[index].data, queried, file=files[index].name)

@@ -120,9 +120,9 @@ async def label_frame(
 ) -> Labelled:
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
-    With `"look": true` it is also added to the looks of the place. Or throw it away. A label that is given again
-    replaces the one before; enrolled places and looks stay. Labels serve to calibrate the map, with the method
-    `labels`. Simultaneous labels of one frame are applied one after the other.
+    With `"look": true` it is also added to the looks of the place. Or take its label back, or throw the frame away. A
+    label that is given again replaces the one before; enrolled places and looks stay. Labels serve to calibrate the
+    map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)
     async with engine.review_keeper.turn(map_, number):
@@ -133,6 +133,9 @@ async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, dead
     if order.discard:
         await in_thread(map_.review.discard, number)
         return Labelled(id=number, discarded=True, frame=None, enrolled=None)
+    if order.clear:
+        frame = await in_thread(map_.review.label, number, None)
+        return Labelled(id=number, discarded=False, frame=ReviewFrameView.of(frame), enrolled=None)
     if order.new is not None:
         with map_.review.held(number):
             enrolled = await _enrol(engine, map_, number, order.new, deadline)

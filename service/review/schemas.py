@@ -79,7 +79,7 @@ class NewPlace(PlaceDescription):
 
 
 class LabelOrder(BaseModel):
-    """A label, or that the frame is thrown away: exactly one of these."""
+    """A label, that it is taken back, or that the frame is thrown away: exactly one of these."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -92,12 +92,14 @@ class LabelOrder(BaseModel):
     )
     new: NewPlace | None = Field(default=None, description="It shows a new place, as which it is enrolled.")
     stranger: bool = Field(default=False, strict=True, description="It shows no place of this map.")
+    clear: bool = Field(default=False, strict=True, description="Its label is taken back.")
     discard: bool = Field(default=False, strict=True, description="It is thrown away.")
 
     @model_validator(mode="after")
     def _says_one_thing(self) -> LabelOrder:
-        if [self.place is not None, self.new is not None, self.stranger, self.discard].count(True) != 1:
-            raise ValueError("give exactly one of place, new, stranger and discard")
+        said = [self.place is not None, self.new is not None, self.stranger, self.clear, self.discard]
+        if said.count(True) != 1:
+            raise ValueError("give exactly one of place, new, stranger, clear and discard")
         if self.look and self.place is None:
             raise ValueError("a look needs the place that it is of")
         return self

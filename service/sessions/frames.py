@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from typing import Any
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence_of, view_of
 from core.learning import RunFrame
@@ -23,6 +25,7 @@ from service.places.schemas import PlaceView
 from service.queries.answers import answer_of
 from service.queries.following import follow_answer
 from service.queries.given_answers import GivenAnswer, QueriedFrame
+from service.queries.parameters import QueryParameters
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -76,7 +79,7 @@ async def process_frame(
             return repeated
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
-        queried = QueriedFrame(session.options.camera, session.id, options.frame)
+        queried = QueriedFrame(session.options.camera, session.id, options.frame, _question(session, options.k))
         single = answer_of(map_, answered.frame, answered.answer)
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
@@ -285,8 +288,18 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
     )
 
 
-def session_view(session: Session) -> SessionView:
-    """The JSON view of a session, as it is listed."""
+def _question(session: Session, k: int) -> dict[str, Any]:
+    """The parameters of a query that asks what each frame of a session does."""
+    given: dict[str, Any] = session.options.model_dump(include={"verify", "camera"}, exclude_none=True)
+    if session.options.sequences is not None:
+        given["sequences"] = json.dumps(session.options.sequences)
+    usual = QueryParameters().model_dump()
+    return {name: value for name, value in {**given, "k": k}.items() if value != usual[name]}
+
+
+def session_view(session: Session, private: bool) -> SessionView:
+    """The JSON view of a session, as it is listed; its key is only for those who may see what is ``private``."""
+    came = session.last_frame_came
     options = session.options.model_dump()
     return SessionView(
         **{**options, "expires_after": session.expires_after},
@@ -296,14 +309,16 @@ def session_view(session: Session) -> SessionView:
         expires_at=datetime.fromtimestamp(session.expires, UTC),
         frames=session.frames,
         last_frame=session.number,
+        last_frame_at=None if came is None else datetime.fromtimestamp(came, UTC),
+        key=session.key if private else None,
         restored=session.restored,
         frames_lost=session.lost,
     )
 
 
-def session_report(sessions: Sessions, map_: Map, session: Session, k: int = 5) -> SessionReport:
+def session_report(sessions: Sessions, map_: Map, session: Session, private: bool, k: int = 5) -> SessionReport:
     """The JSON view of a session with its present belief; call it in the session's turn, in a thread."""
     run = sessions.run(map_, session)
     found = run.look(k, alive_rows(map_))
-    view = session_view(session)
+    view = session_view(session, private)
     return SessionReport(**view.model_dump(), belief=belief_view(map_, run, found))

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
 from core.maps.pagination import Listing, decode_name, page_of
+from service.access.roles import Principal, covers
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,
@@ -56,6 +57,11 @@ FrameOptions = Annotated[FrameParameters, Query()]
 GONE = problem_documentation(UnknownSession, SessionExpired)
 
 
+def _may_see_keys(principal: Principal) -> bool:
+    """Whether a caller learns who the others are."""
+    return covers(principal.role, "enrol")
+
+
 @router.post(
     "",
     status_code=201,
@@ -79,27 +85,32 @@ def create_session(
     session = sessions.create(map_, new)
     session.notes = new_notes(map_, session.id, principal)
     response.headers["Location"] = f"{engine.settings.root_path}/v1/maps/{map_id}/sessions/{session.id}"
-    return session_view(session)
+    return session_view(session, _may_see_keys(principal))
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: SessionsDep) -> SessionPage:
+async def list_sessions(
+    map_id: MapId, page: Page, engine: EngineDep, sessions: SessionsDep, principal: PrincipalDep
+) -> SessionPage:
     """List the sessions of a map that have not ended."""
     map_ = await engine.map(map_id)
     listing: Listing = ["sessions-of", map_id]
     after = decode_name(listing, page.cursor)
     found = [session for session in await in_thread(sessions.of_map, map_) if session.id > after]
     shown, more = page_of(listing, found, page.limit, lambda session: session.id)
-    return SessionPage(items=[session_view(session) for session in shown], next_cursor=more)
+    private = _may_see_keys(principal)
+    return SessionPage(items=[session_view(session, private) for session in shown], next_cursor=more)
 
 
 @router.get("/{session}", responses=GONE)
-async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> SessionReport:
+async def read_session(
+    map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep, principal: PrincipalDep
+) -> SessionReport:
     """Read a session and the present belief about where its robot is."""
     map_ = await engine.map(map_id)
     session = await in_thread(sessions.find, map_, session_id)
     async with session.turn():
-        return await in_thread(session_report, sessions, map_, session)
+        return await in_thread(session_report, sessions, map_, session, _may_see_keys(principal))
 
 
 @router.delete("/{session}", status_code=204, dependencies=[WHOLE_DELETION], responses=GONE)

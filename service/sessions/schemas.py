@@ -28,6 +28,8 @@ SESSION_EXAMPLE: dict[str, Any] = {
     "expires_at": "2026-11-20T10:15:42Z",
     "frames": 27,
     "last_frame": 27,
+    "last_frame_at": "2026-11-20T10:00:42Z",
+    "key": "fleet-7",
     "restored": False,
     "frames_lost": None,
 }
@@ -323,6 +325,10 @@ class SessionView(NewSession):
     expires_at: Timestamp
     frames: int = Field(description="How many frames the session has processed.")
     last_frame: int | None = Field(description="The robot's number of the last frame.")
+    last_frame_at: Timestamp | None = Field(description="When the last frame came; null before the first.")
+    key: str | None = Field(
+        description="The name of the key that began the session; null without one. Only for keys of the role enrol."
+    )
     restored: bool
     frames_lost: int | None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -39,6 +40,7 @@ class Session:
     revision: of the record that the belief was saved as.
     recorded: the revision of the record, as it was last seen.
     restored: whether the session was restored after a restart.
+    key: the name of the key that began the session; None without one.
     streaming: whether a WebSocket streams into the session.
     notes: what the map learns from, of the frames that this service has processed; None: it learns nothing.
     waiting: how many frames are being processed or wait for that.
@@ -63,6 +65,7 @@ class Session:
     revision: int = 0
     recorded: int = 0
     restored: bool = False
+    key: str | None = None
     streaming: bool = False
     notes: RunNotes | None = None
     waiting: int = 0
@@ -79,6 +82,7 @@ class Session:
         options = NewSession.model_validate_json(record.options)
         session = cls(record.id, record.map, record.map_created_at, options, record.expires_after, record.created)
         session.read_fields(record)
+        session.key = _key_of(record.begun_by)
         session.idle_since = time.monotonic() - max(0.0, record.idle)
         return session
 
@@ -115,6 +119,11 @@ class Session:
     def idle(self) -> float:
         """Seconds since the last frame."""
         return time.monotonic() - self.idle_since
+
+    @property
+    def last_frame_came(self) -> float | None:
+        """When the last frame came, seconds since 1970 UTC, by the clock as it is set now; None before the first."""
+        return self.expires - self.expires_after if self.frames else None
 
     @property
     def over(self) -> bool:
@@ -156,6 +165,14 @@ class Session:
                 yield
         finally:
             self.waiting -= 1
+
+
+def _key_of(begun_by: str | None) -> str | None:
+    """The name of the key with which a session was begun, by its record; None without one."""
+    if begun_by is None:
+        return None
+    principal, key, _ = json.loads(begun_by)
+    return None if key is None else str(principal)
 
 
 def creation_time(map_: Map) -> str:

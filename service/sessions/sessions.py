@@ -118,7 +118,8 @@ class Sessions:
         expires_after = min(options.expires_after or longest, longest)
         session = Session(f"s-{secrets.token_hex(8)}", map_.record.id, creation_time(map_), options, expires_after)
         self._end_expired()
-        begun_by = _begun_by()
+        begun_by, asker = _begun_by(), ASKER.get()
+        session.key = None if asker.key is None else asker.principal
         if (begun := self._begun_before(map_, session, begun_by)) is not None:
             return begun
         session.run = Run(options.run_options(), self._graphs.graph(map_, session.selection))

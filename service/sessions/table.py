@@ -59,6 +59,7 @@ class SessionRecord:
     expires_after: seconds.
     created, used: when the session was created and when its last frame came; the table gives them.
     idle: seconds since its last frame when it was read.
+    begun_by: the caller that began it and the request, JSON; None if that is not known.
     number, moment, request, lost, frames: as in :class:`service.sessions.session.Session`.
     revision: grows with every frame.
     ended: why the session has ended; None if it has not.
@@ -81,6 +82,7 @@ class SessionRecord:
     revision: int = 0
     ended: str | None = None
     idle: float = 0.0
+    begun_by: str | None = None
     state: bytes | None = None
     answer: str | None = None
 
@@ -220,13 +222,13 @@ class SessionTable:
             ((living,),) = connection.execute(_COUNT)
             if living >= most:
                 raise TooManySessions(f"There are {living} sessions already; delete one that is over.")
-            ((created,),) = connection.execute(_ADD, **vars(session), begun_by=begun_by)
+            ((created,),) = connection.execute(_ADD, **{**vars(session), "begun_by": begun_by})
         return float(created)
 
     def begun(self, begun_by: str, session: SessionRecord) -> str | None:
         """The id of the session without a frame that a request has begun a moment ago, with the map and the options of
         ``session``; None if there is none."""
-        found = self._ledger.execute("find a session", _BEGUN, **vars(session), begun_by=begun_by)
+        found = self._ledger.execute("find a session", _BEGUN, **{**vars(session), "begun_by": begun_by})
         return found[0][0] if found else None
 
     def head(self, session_id: str) -> SessionRecord | None:

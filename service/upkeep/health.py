@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import asdict, dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from core.upkeep.drift import Trend, score_trend, unknown_trend
 from core.upkeep.hubness import Alias
 from core.upkeep.redundancy import first_looks, stops
 from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
+from core.upkeep.shared_routes import SharedRoute, shared_routes
 from service.queries.counts import Statistics
 from service.upkeep.schemas import (
     AliasingView,
@@ -31,6 +33,7 @@ from service.upkeep.schemas import (
     GapView,
     HubView,
     MapHealth,
+    SharedRouteView,
     SilentPlaces,
     StopView,
     StretchView,
@@ -40,6 +43,9 @@ from service.upkeep.schemas import (
 
 ALIASING_SHARE = 0.5
 """Share of the time for places that look alike; the rest is for the sequences."""
+
+QUERIES_A_PLACE = 3
+"""From this number of queries a place on, a place that never matched means something: by chance one in twenty does."""
 
 STEPS_TOGETHER = 64
 """How many steps of a sequence are compared at a time."""
@@ -63,6 +69,8 @@ class _Aliasing:
     views: int64 [v], positions of places, of those of a stop the first alone.
     counts: int64 [v], of these, as of :func:`core.upkeep.hubness.occurrences`.
     hubs: positions of places.
+    aliases: of places that look like other places, but for those of the routes.
+    routes: traverses that seem to follow one route.
     """
 
     examined: int
@@ -71,6 +79,7 @@ class _Aliasing:
     counts: NDArray[np.int64]
     hubs: NDArray[np.int64]
     aliases: list[Alias]
+    routes: list[SharedRoute]
 
 
 def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds: float, limit: int) -> MapHealth:
@@ -90,6 +99,7 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
     first = first_looks(own.where, own.neighborhood)
     aliasing = _aliasing(own, first, began + ALIASING_SHARE * seconds)
     walks, all_compared = _walks(own, first, began + seconds)
+    enough = _compared(statistics) >= QUERIES_A_PLACE * len(aliasing.views)
     seen = [i for i, place in enumerate(own.places) if place.id in statistics.places]
     silent = np.flatnonzero(~np.isin(first, first[seen])).tolist()
     names = [place.id for place in own.places]
@@ -107,6 +117,7 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         for gap in walk.gaps
     ]
     gaps.sort(key=lambda gap: -gap.severity)
+    again = _retraverse(own, walks, aliasing, set(silent) if enough else None)
     stopped = [
         StopView(
             sequence=own.places[stop.places[0]].sequence or "", place=names[stop.places[0]], frames=len(stop.places)
@@ -118,13 +129,16 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         places=len(own),
         complete=all_compared and aliasing.examined == len(aliasing.views),
         answers=_answers(statistics),
-        never_matched=_never_matched(own, aliasing.views, statistics, silent, limit),
+        never_matched=_never_matched(own, aliasing.views, statistics, silent, enough, limit),
         aliasing=_aliasing_view(own, first, aliasing, statistics, limit),
         gaps=gaps[:limit],
         gap_count=len(gaps),
+        gap_counts={measure: sum(gap.measure == measure for gap in gaps) for measure in get_args(Measure)},
         stops=stopped[:limit],
         stop_count=len(stopped),
-        retraverse=_retraverse(own, walks, aliasing, statistics, set(silent))[:limit],
+        retraverse=again[:limit],
+        retraverse_count=len(again),
+        shared_routes=_shared_routes(own, aliasing),
     )
 
 
@@ -161,17 +175,33 @@ def _trend_view(found: Trend | None) -> TrendView | None:
     return None if found is None else TrendView(**asdict(found), significant=found.significant)
 
 
+def _compared(statistics: Statistics) -> int:
+    """How many queries were compared with the map's places."""
+    return sum(week.compared for week in statistics.weeks)
+
+
+def _shared_routes(own: SelfQueries, found: _Aliasing) -> list[SharedRouteView]:
+    names = {int(code): place.sequence or "" for code, place in zip(own.where.sequence, own.places, strict=True)}
+    return [
+        SharedRouteView(sequence=names[route.sequences[1]], other=names[route.sequences[0]], frames=len(route.aliases))
+        for route in found.routes
+    ]
+
+
 def _never_matched(
-    own: SelfQueries, views: NDArray[np.int64], statistics: Statistics, silent: list[int], limit: int
+    own: SelfQueries, views: NDArray[np.int64], statistics: Statistics, silent: list[int], enough: bool, limit: int
 ) -> SilentPlaces | None:
-    queries = sum(week.compared for week in statistics.weeks)
+    queries = _compared(statistics)
     if not queries or not len(views):
         return None
     places = [own.places[i] for i in np.intersect1d(views, silent).tolist()]
     # Poisson: how many places no query would match if each query matched a place drawn at random.
     by_chance = len(views) * math.exp(-queries / len(views))
     ids = [place.id for place in sorted(places, key=lambda place: place.number)[:limit]]
-    return SilentPlaces(count=len(places), by_chance=by_chance, places=ids)
+    wanted = QUERIES_A_PLACE * len(views)
+    return SilentPlaces(
+        count=len(places), by_chance=by_chance, queries=queries, wanted=wanted, enough=enough, places=ids
+    )
 
 
 def _aliasing(own: SelfQueries, first: NDArray[np.int64], until: float) -> _Aliasing:
@@ -195,8 +225,11 @@ def _aliasing(own: SelfQueries, first: NDArray[np.int64], until: float) -> _Alia
                 aliases.append(Alias(position, int(others[best[0]]), float(found[0]), mine))
         done += len(some)
     counts = hubness.occurrences(np.concatenate(lists), len(own))[views]
+    routes = shared_routes(own.where, aliases, np.array(order[:done], np.int64))
+    along = {(one.place, one.other) for route in routes for one in route.aliases}
+    aliases = [alias for alias in aliases if (alias.place, alias.other) not in along]
     aliases.sort(key=lambda alias: -alias.score)
-    return _Aliasing(done, views, k, counts, views[hubness.hubs(counts)], aliases)
+    return _Aliasing(done, views, k, counts, views[hubness.hubs(counts)], aliases, routes)
 
 
 def _aliasing_view(
@@ -208,26 +241,28 @@ def _aliasing_view(
     unsure = np.zeros(len(own), np.int64)
     np.add.at(unsure, first, single)
     named = [names[view] for view in found.views.tolist()]
+    pairs = list({frozenset((one.place, one.other)): one for one in reversed(found.aliases)}.values())[::-1]
+    hubs, doubted = _hubs(named, found.counts), _hubs(named, unsure[found.views])
     return AliasingView(
         examined=found.examined,
         of=len(found.views),
         neighbours=found.neighbours,
         skewness=hubness.skewness(found.counts),
-        hubs=_hubs(named, found.counts, limit),
+        hubs=hubs[:limit],
+        hub_count=len(hubs),
         aliases=[
             AliasView(place=names[one.place], other=names[one.other], score=one.score, own=one.own)
-            for one in found.aliases[:limit]
+            for one in pairs[:limit]
         ],
-        alias_count=len(found.aliases),
-        unsure=_hubs(named, unsure[found.views], limit),
+        alias_count=len(pairs),
+        unsure=doubted[:limit],
+        unsure_count=len(doubted),
     )
 
 
-def _hubs(names: list[str], counts: NDArray[np.int64], limit: int) -> list[HubView]:
+def _hubs(names: list[str], counts: NDArray[np.int64]) -> list[HubView]:
     expected = float(counts.mean()) if len(counts) else 0.0
-    return [
-        HubView(place=names[i], count=int(counts[i]), expected=expected) for i in hubness.hubs(counts)[:limit].tolist()
-    ]
+    return [HubView(place=names[i], count=int(counts[i]), expected=expected) for i in hubness.hubs(counts).tolist()]
 
 
 def _walks(own: SelfQueries, first: NDArray[np.int64], until: float) -> tuple[list[_Walk], bool]:
@@ -235,22 +270,16 @@ def _walks(own: SelfQueries, first: NDArray[np.int64], until: float) -> tuple[li
 
     From one frame of a stop to the next is no step.
     """
-    by_name: dict[str | None, list[int]] = {}
-    for position, place in enumerate(own.places):
-        by_name.setdefault(place.sequence, []).append(position)
     walks, complete = [], True
-    for name, members in by_name.items():
-        if name is None:  # these places are in no order
-            continue
-        ordered = np.array(sorted(members, key=lambda i: own.places[i].ordinal), np.int64)
+    for ordered in coverage.walks(own.where):
         where = own.where.take(ordered)
         stood = first[ordered[1:]] == first[ordered[:-1]]
-        gaps = coverage.long_steps(np.where(stood, np.nan, coverage.distances(where)), "distance")
+        gaps = coverage.long_ways(own.where, ordered, first)
         gaps += coverage.long_steps(np.where(stood, np.nan, coverage.durations(where)), "time")
         similarities, all_seen = _similarities(own, ordered, until)
         gaps += coverage.unlike_steps(np.where(stood, np.nan, similarities))
         complete = complete and all_seen
-        walks.append(_Walk(name, ordered, gaps))
+        walks.append(_Walk(own.places[ordered[0]].sequence or "", ordered, gaps))
     return walks, complete
 
 
@@ -266,9 +295,13 @@ def _similarities(own: SelfQueries, ordered: NDArray[np.int64], until: float) ->
 
 
 def _retraverse(
-    own: SelfQueries, walks: list[_Walk], aliasing: _Aliasing, statistics: Statistics, silent: set[int]
+    own: SelfQueries, walks: list[_Walk], aliasing: _Aliasing, silent: set[int] | None
 ) -> list[StretchView]:
-    """The stretches of sequences that should be recorded again; those with the most signs come first."""
+    """The stretches of sequences that should be recorded again; those with the most signs come first.
+
+    Args:
+        silent: positions of places that never matched; None while there are too few queries to tell.
+    """
     aliased, hubs = {alias.place for alias in aliasing.aliases}, set(aliasing.hubs.tolist())
     made = []
     for walk in walks:
@@ -276,7 +309,7 @@ def _retraverse(
         for index, position in enumerate(walk.positions.tolist()):
             signs += [Sign(index, index, "aliased")] if position in aliased else []
             signs += [Sign(index, index, "hub")] if position in hubs else []
-        if statistics.places:
+        if silent is not None:
             signs += silent_runs(position not in silent for position in walk.positions.tolist())
         made += [
             StretchView(

@@ -20,7 +20,7 @@ from core.maps import Enrolment, History, Map, Snapshot
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
-from core.places import check_place_id, look_address, place_and_look
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, check_place_id, look_address, place_and_look
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
@@ -75,6 +75,30 @@ class MergePlan:
             "renamed": {"places": self.renamed, "sequences": dict(self.sequences), "cameras": dict(self.cameras)},
             "conflicts": list(self.conflicts),
         }
+
+
+def poses_apart(map_: Map, other: Map) -> str | None:
+    """Say, in a sentence, that the poses of two maps are of different kinds; None where they are not, or one has none.
+
+    Raises:
+        StorageFailure.
+    """
+    ours, theirs = _kinds(map_), _kinds(other)
+    if not ours or not theirs or ours & theirs:
+        return None
+    names = {METRIC: "metric", GEOGRAPHIC: "geographic"}
+    (here, *_), (there, *_) = ours, theirs
+    return (
+        f"The poses of {other.record.id} are {names[there]}, those of {map_.record.id} {names[here]}: they lie in no "
+        "common frame, so that no distance between their places is known."
+    )
+
+
+def _kinds(map_: Map) -> set[int]:
+    """The kinds of the poses of a map."""
+    snapshot = map_.snapshot()
+    kinds = snapshot.whereabouts_at(np.flatnonzero(snapshot.alive)).kind
+    return set(np.unique(kinds).tolist()) - {NO_POSE}
 
 
 def check_same_encoder(map_: Map, other: Map) -> None:
@@ -211,8 +235,10 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     if "after" not in context.notes:
         outline = map_.transfer.outline(looks=True)
         plan = plan_merge(map_, other, context.arguments, outline)
+        apart = poses_apart(map_, other)
         report = plan.report() | {
-            "overlap": measure_overlap(engine, context, map_, other) if context.arguments["sample"] else None
+            "warnings": [] if apart is None else [apart],
+            "overlap": measure_overlap(engine, context, map_, other) if context.arguments["sample"] else None,
         }
         if context.arguments["dry_run"]:
             return report

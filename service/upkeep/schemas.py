@@ -157,6 +157,9 @@ class SilentPlaces(BaseModel):
     by_chance: float = Field(
         description="How many would be expected if the queries were spread evenly over all places."
     )
+    queries: int = Field(description="How many queries were compared with the places.")
+    wanted: int = Field(description="The number of queries from which on silence means something: three a place.")
+    enough: bool = Field(description="Whether there were so many. Before, no stretch is listed for its silence.")
     places: list[str] = Field(description="Some of them, in the order of enrolment.")
 
 
@@ -169,7 +172,7 @@ class HubView(BaseModel):
 
 
 class AliasView(BaseModel):
-    """A place that looks more like another place than like its own neighbours."""
+    """A place that looks more like another place than like its own neighbours; each pair is listed once."""
 
     place: str
     other: str
@@ -189,13 +192,15 @@ class AliasingView(BaseModel):
         description="Skewness of the counts: 0 if all are alike; over 2 if a few are neighbours of most."
     )
     hubs: list[HubView] = Field(description="The places that are among the most alike of unusually many others.")
+    hub_count: int
     aliases: list[AliasView] = Field(
         description="Places that look more like another place than like their own; the most alike come first."
     )
-    alias_count: int
+    alias_count: int = Field(description="How many pairs there are.")
     unsure: list[HubView] = Field(
         description="The places that are unusually often the best match of queries that were not recognized."
     )
+    unsure_count: int
 
 
 class GapView(BaseModel):
@@ -222,6 +227,17 @@ class StopView(BaseModel):
     frames: int = Field(description="How many frames of the sequence show this view.")
 
 
+class SharedRouteView(BaseModel):
+    """Two traverses that seem to follow one route, which neither poses nor an alignment say: align them."""
+
+    sequence: str
+    other: str
+    frames: int = Field(
+        description="How many of their frames look more like one of the other traverse than like their own neighbours; "
+        "they do not count as places that look alike."
+    )
+
+
 class StretchView(BaseModel):
     """A stretch of a sequence that should be recorded again."""
 
@@ -246,16 +262,25 @@ HEALTH_EXAMPLE: dict[str, Any] = {
         "score_trend": None,
         "unknown_trend": None,
     },
-    "never_matched": {"count": 2, "by_chance": 0.0, "places": ["p40", "p41"]},
+    "never_matched": {
+        "count": 2,
+        "by_chance": 0.0,
+        "queries": 5102,
+        "wanted": 333,
+        "enough": True,
+        "places": ["p40", "p41"],
+    },
     "aliasing": {
         "examined": 111,
         "of": 111,
         "neighbours": 10,
         "skewness": 1.1,
         "hubs": [{"place": "p12", "count": 48, "expected": 10.0}],
+        "hub_count": 1,
         "aliases": [{"place": "p12", "other": "p90", "score": 0.31, "own": 0.22}],
         "alias_count": 1,
         "unsure": [],
+        "unsure_count": 0,
     },
     "gaps": [
         {
@@ -269,9 +294,12 @@ HEALTH_EXAMPLE: dict[str, Any] = {
         }
     ],
     "gap_count": 1,
+    "gap_counts": {"distance": 1, "time": 0, "similarity": 0},
     "stops": [{"sequence": "monday", "place": "p57", "frames": 127}],
     "stop_count": 1,
     "retraverse": [{"sequence": "monday", "first": "p39", "last": "p42", "reasons": ["distance-gap"], "weight": 3.0}],
+    "retraverse_count": 1,
+    "shared_routes": [{"sequence": "tuesday", "other": "monday", "frames": 42}],
 }
 
 
@@ -288,9 +316,12 @@ class MapHealth(BaseModel):
     aliasing: AliasingView
     gaps: list[GapView] = Field(description="The most severe gaps come first.")
     gap_count: int
+    gap_counts: dict[Measure, int] = Field(description="How many of each measure; the plan has those of distance.")
     stops: list[StopView] = Field(description="Views of ten frames or more; those of most frames come first.")
     stop_count: int
     retraverse: list[StretchView] = Field(description="Stretches that should be recorded again, the most urgent first.")
+    retraverse_count: int
+    shared_routes: list[SharedRouteView] = Field(description="Traverses to align; those of most frames come first.")
 
 
 class ComparedTraverse(BaseModel):

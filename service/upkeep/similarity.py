@@ -18,7 +18,7 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.judgement.alignment import SharedStretch
-from core.maps import Map
+from core.maps import Map, own_poses
 from core.method.encoder import Encoder
 from core.upkeep.similarity import NONE, GreyScale, Rows, counterparts, nearest_by_pose, score_pairs, stretches_of
 from service.errors.faults import EncoderNotInstalled, TooManyPairs
@@ -164,7 +164,7 @@ def _view(
     rows: tuple[Rows, Rows],
     matrix: Matrix,
 ) -> SimilarityView:
-    queries, references = (traverses.snapshot.whereabouts_at(some) for some in rows)
+    queries, references = (own_poses(map_.counterparts, traverses.snapshot.whereabouts_at(some), some) for some in rows)
     radius = map_.record.same_place_radius
     truth, aligned = nearest_by_pose(queries, references, radius), counterparts(queries, references)
     return SimilarityView(

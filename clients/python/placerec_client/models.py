@@ -53,7 +53,7 @@ class AgreementDefinition(Model):
 
 
 class AliasView(Model):
-    """A place that looks more like another place than like its own neighbours."""
+    """A place that looks more like another place than like its own neighbours; each pair is listed once."""
 
     place: str
     other: str
@@ -77,9 +77,11 @@ class AliasingView(Model):
     neighbours: int
     skewness: float
     hubs: list[HubView]
+    hub_count: int
     aliases: list[AliasView]
     alias_count: int
     unsure: list[HubView]
+    unsure_count: int
 
 
 class TrendView(Model):
@@ -561,6 +563,7 @@ class CalibrationState(Model):
     measured: LatestMeasurement | None = None
     now: Effect | None = None
     then: Effect | None = None
+    proposed: Effect | None = None
 
 
 class Intrinsics(Model):
@@ -1006,11 +1009,22 @@ class MapAnswer(Model):
     problem: Problem | None = None
 
 
+class SharedRouteView(Model):
+    """Two traverses that seem to follow one route, which neither poses nor an alignment say: align them."""
+
+    sequence: str
+    other: str
+    frames: int
+
+
 class SilentPlaces(Model):
     """Places that were never the best match."""
 
     count: int
     by_chance: float
+    queries: int
+    wanted: int
+    enough: bool
     places: list[str]
 
 
@@ -1043,9 +1057,12 @@ class MapHealth(Model):
     aliasing: AliasingView
     gaps: list[GapView]
     gap_count: int
+    gap_counts: dict[str, int]
     stops: list[StopView]
     stop_count: int
     retraverse: list[StretchView]
+    retraverse_count: int
+    shared_routes: list[SharedRouteView]
 
 
 class MapMatch(Model):
@@ -1216,6 +1233,14 @@ class PlacePage(Model):
     next_cursor: str | None = None
 
 
+class PlannedGap(Model):
+    """Two successive places of a traverse that are unusually far apart."""
+
+    before: str
+    after: str
+    metres: float
+
+
 class PlanView(Model):
     """Where the places of a map are: columns of equal length, in the order of enrolment. A column in which no place
     has a value is null.
@@ -1236,6 +1261,8 @@ class PlanView(Model):
     heading: list[float | None] | None = None
     timestamp: list[int | None] | None = None
     flags: list[int]
+    gaps: list[PlannedGap]
+    gap_count: int
 
 
 class QueueState(Model):
@@ -1422,6 +1449,8 @@ class SessionView(Model):
     expires_at: datetime
     frames: int
     last_frame: int | None = None
+    last_frame_at: datetime | None = None
+    key: str | None = None
     restored: bool
     frames_lost: int | None = None
 
@@ -1450,6 +1479,8 @@ class SessionReport(Model):
     expires_at: datetime
     frames: int
     last_frame: int | None = None
+    last_frame_at: datetime | None = None
+    key: str | None = None
     restored: bool
     frames_lost: int | None = None
     belief: BeliefView

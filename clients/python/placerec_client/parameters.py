@@ -995,7 +995,7 @@ class Deletion(TypedDict, total=False):
 
 
 class LabelOrder(TypedDict, total=False):
-    """A label, or that the frame is thrown away: exactly one of these."""
+    """A label, that it is taken back, or that the frame is thrown away: exactly one of these."""
 
     place: str | None
     """It shows this place of the map."""
@@ -1008,6 +1008,9 @@ class LabelOrder(TypedDict, total=False):
 
     stranger: bool
     """It shows no place of this map."""
+
+    clear: bool
+    """Its label is taken back."""
 
     discard: bool
     """It is thrown away."""
@@ -1128,11 +1131,16 @@ class NewPlace(TypedDict):
 
 
 class CalibrationChanges(TypedDict):
-    """Values of a calibration to set by hand; null restores the encoder's value."""
+    """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
     threshold: NotRequired[float | None]
 
     margin: NotRequired[float | None]
+
+    measured_at: NotRequired[datetime | str | None]
+    """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
+    was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
+    """
 
 
 class LearningChanges(TypedDict):

@@ -33,6 +33,8 @@ class Counterparts:
         with self._writing() as write:
             found = places.at_rows(write.connection, [*change.rows, *change.givers])
             for stored, track, station, pose, pose_of in changes_by(change, found):
+                if stored.look_of is not None:  # it follows its place
+                    continue
                 write.set_counterpart(stored, track, station, pose, pose_of)
 
     def copy(self, other: Counterparts, names: Mapping[str, str]) -> None:

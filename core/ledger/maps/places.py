@@ -110,9 +110,7 @@ _STATIONS = Statement(
     .where(_P.map == bindparam("map"), _IS_PLACE)
     .order_by(_P.number)
 )
-_HANDED_OVER = Statement(
-    select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _IS_PLACE, _P.pose_of.is_not(None))
-)
+_HANDED_OVER = Statement(select(_P.row, _P.pose_of).where(_P.map == bindparam("map"), _P.pose_of.is_not(None)))
 _WITHOUT_IMAGE = Statement(
     select(func.count()).select_from(PLACES).where(_P.map == bindparam("map"), _P.picture != "image")
 )
@@ -401,7 +399,7 @@ def stations(connection: MapConnection) -> dict[str, PlaceStation]:
 
 
 def handed_over(connection: MapConnection) -> dict[int, str]:
-    """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+    """The rows of the places, and looks, whose pose was handed over, each with the id of the place that it is from."""
     return dict(connection.execute(_HANDED_OVER))
 
 

@@ -217,10 +217,10 @@ class ReviewTable(ABC):
         finally:
             self._held.discard(number)
 
-    def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
+    def label(self, number: int, label: Mapping[str, Any] | None) -> ReviewFrame:
         with self._writing() as connection:
             *stored, _ = values = _expect(connection, number)
-            after = {**dict(zip(_COLUMNS, stored, strict=True)), "label": json.dumps(label)}
+            after = {**dict(zip(_COLUMNS, stored, strict=True)), "label": None if label is None else json.dumps(label)}
             changed = sealed(_COLUMNS, after)
             if not connection.change(_LABEL, which=number, new_label=changed["label"], new_seal=changed["seal"]):
                 raise _unknown(number)

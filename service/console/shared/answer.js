@@ -1,5 +1,5 @@
 // The answer to one frame: the verdict, the matches beside the frame, why the best one matches, and what took how long.
-import { Facts, Verdict } from "./elements.js";
+import { Facts, Name, Verdict } from "./elements.js";
 import { decimal, encoderName, integer, metres, milliseconds, percent, poseText } from "./formats.js";
 import { Picture, Thumbnail, thumbnailPath } from "./pictures.js";
 import { href } from "./router.js";
@@ -26,7 +26,7 @@ export function Answer({ map, answer, frame }) {
         <section class="panel" aria-label="Matches">
           <h2>Matches</h2>
           <ol class="matches">
-            ${answer.matches.map((one) => html`<${MatchTile} key=${one.place.id} map=${map} match=${one} chosen=${one === match} choose=${setRank} />`)}
+            ${answer.matches.map((one) => html`<${MatchTile} key=${one.place.id} map=${map} match=${one} chosen=${one === match} among=${answer.matches.map(({ place }) => place.id)} choose=${setRank} />`)}
           </ol>
         </section>
       `}
@@ -113,16 +113,16 @@ function RegionPair({ why, pair }) {
   `);
 }
 
-function MatchTile({ map, match, chosen, choose }) {
+function MatchTile({ map, match, chosen, among, choose }) {
   const { place, rank, score, parts } = match;
   return html`
     <li class=${chosen ? "thumb chosen" : "thumb"}>
       <button type="button" class="cover" aria-pressed=${chosen} aria-label=${`Show match ${rank}, ${place.id}`} onClick=${() => choose(rank)}>
         <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
       </button>
-      <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}>${place.id}</a><span>${decimal(score)}</span></span>
+      <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}><${Name} text=${place.id} among=${among} /></a><span>${decimal(score)}</span></span>
       ${parts && html`<span class="faint small">${partsOf(parts)}${parts.inliers !== null && `, ${parts.inliers} inliers`}</span>`}
-      ${place.sequence && html`<span class="faint small clip">${place.sequence}</span>`}
+      ${place.sequence && html`<span class="faint small clip"><${Name} text=${place.sequence} /></span>`}
     </li>
   `;
 }
@@ -166,17 +166,26 @@ function Words({ words }) {
   `;
 }
 
-/** Stages of the work as a bar and as a list. */
+const LEAST_REST = 0.1;
+
+/** Stages of the work as a bar and as a list, which add up to the total. */
 export function Timings({ milliseconds: told }) {
-  const stages = Object.entries(told).filter(([name]) => name !== "total");
+  const named = Object.entries(told).filter(([name]) => name !== "total");
+  const known = named.reduce((all, [, value]) => all + value, 0);
+  const total = told.total ?? known;
+  const rest = total - known;
+  const stages = rest >= LEAST_REST ? [...named, ["other", rest]] : named;
   const sum = stages.reduce((all, [, value]) => all + value, 0) || 1;
   return html`
-    <div class="timings" aria-hidden="true">
-      ${stages.map(([name, value], one) => html`<span class=${`tint-${one % 8}`} title=${`${name} ${milliseconds(value)}`} style=${{ flexGrow: value / sum }}></span>`)}
+    <div class="stack">
+      <div class="timings" aria-hidden="true">
+        ${stages.map(([name, value], one) => html`<span class=${`tint-${one % 8}`} title=${`${name} ${milliseconds(value)}`} style=${{ flexGrow: value / sum }}></span>`)}
+      </div>
+      <ul class="stages">
+        ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
+        <li><span></span><strong>total</strong><strong class="number">${milliseconds(total)}</strong></li>
+        ${rest <= -LEAST_REST && html`<li><span></span><span class="faint">some stages ran at the same time</span></li>`}
+      </ul>
     </div>
-    <ul class="stages">
-      ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
-      <li><span></span><strong>total</strong><strong class="number">${milliseconds(told.total)}</strong></li>
-    </ul>
   `;
 }

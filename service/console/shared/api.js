@@ -1,5 +1,6 @@
-// The one way to the service: its API, with the key that the user typed.  The key is kept for this tab only, travels in
-// a header, and never in an address.
+// The one way to the service: its API, with the key that the user typed.  The key is kept by the open tabs only, travels
+// in a header, and never in an address.
+import { Tabs } from "./tabs.js";
 import { computed, signal } from "./view.js";
 
 /** The service, under whatever path a proxy publishes it. */
@@ -8,6 +9,8 @@ export const ROOT = new URL("../../../", import.meta.url);
 const KEY = "placerec.key";
 const AT_ONCE = 6;
 const ATTEMPTS = 4;
+/** Milliseconds: the service sends a comment every three seconds, so a stream that is silent for so long is lost. */
+const SILENCE = 8000;
 
 /** A refusal by the service (RFC 9457). */
 export class Problem extends Error {
@@ -72,26 +75,50 @@ export function may(role) {
 /** Whether the key may use all maps. */
 export const everyMap = computed(() => caller.value !== null && caller.value.maps === null);
 
-export async function useKey(text) {
+/** Take another key; an empty one forgets the present one, in all tabs.
+ *
+ * known: the service has just made it, so that it need not be tried first.
+ *
+ * Throws, and leaves the present key in force, if the service does not accept it.
+ */
+export async function useKey(text, { known = false } = {}) {
   const given = text.trim();
   if (!/^[!-~]*$/.test(given)) {
     throw Object.assign(new Error("A key consists of letters, digits, - and _."), { title: "This is no key" });
   }
+  const told = given && !known ? await get("/key", {}, { headers: bearer(given) }) : null;
+  hold(given);
+  tabs.told(given);
+  keyNeeded.value = null;
+  if (told) caller.value = told;
+  else await identify();
+  epoch.value += 1;
+}
+
+function hold(given) {
   key.value = given;
   try {
-    if (key.value) sessionStorage.setItem(KEY, key.value);
+    if (given) sessionStorage.setItem(KEY, given);
     else sessionStorage.removeItem(KEY);
   } catch {
     // It is kept in memory only.
   }
-  keyNeeded.value = null;
-  try {
-    await identify();
-  } catch (error) {
-    if (error instanceof Problem) keyNeeded.value = error; // Without who we are there is nothing to show.
-    throw error;
-  }
-  epoch.value += 1;
+}
+
+const tabs = new Tabs(ROOT.pathname, {
+  present: () => (caller.value?.keys_needed ? key.value : ""),
+  forget: () => {
+    if (!key.value) return;
+    hold("");
+    identify().catch(() => {});
+  },
+});
+
+/** Begin: with the key of this tab or of another one, ask the service who we are. */
+export async function begin() {
+  if (key.value) tabs.told(key.value);
+  else hold(await tabs.ask());
+  await identify();
 }
 
 /** Ask the service who we are. */
@@ -115,15 +142,21 @@ function lost() {
 }
 
 /** Find out whether the service is there, after something else could not be fetched. */
-export function checkConnection() {
-  fetch(new URL("livez", ROOT), { cache: "no-store" }).catch(lost);
+export async function checkConnection() {
+  try {
+    await fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) });
+    return true;
+  } catch {
+    lost();
+    return false;
+  }
 }
 
 async function probe() {
   for (let wait = 500; ; wait = Math.min(wait * 1.6, 5000)) {
     await sleep(wait);
     try {
-      const answer = await fetch(new URL("livez", ROOT), { cache: "no-store" });
+      const answer = await fetch(new URL("livez", ROOT), { cache: "no-store", signal: AbortSignal.timeout(SILENCE) });
       if (answer.ok) break;
     } catch {
       // It is still away.
@@ -180,8 +213,12 @@ function address(path, query = {}) {
   return url;
 }
 
+function bearer(text) {
+  return { Authorization: `Bearer ${text}` };
+}
+
 function withKey(headers = {}) {
-  return key.value ? { ...headers, Authorization: `Bearer ${key.value}` } : headers;
+  return key.value ? { ...bearer(key.value), ...headers } : headers;
 }
 
 async function problemOf(answer) {
@@ -309,22 +346,41 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
-/** Follow server-sent events until the signal is aborted; a lost stream is taken up where it ended.
+/** Calls a function unless it is put off, again and again, before so many milliseconds are over. */
+class Watch {
+  constructor(milliseconds, call) {
+    Object.assign(this, { milliseconds, call });
+    this.putOff();
+  }
+
+  putOff() {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(this.call, this.milliseconds);
+  }
+
+  end() {
+    clearTimeout(this.timer);
+  }
+}
+
+/** Follow server-sent events until the signal is aborted; a lost stream, or a silent one, is taken up where it ended.
  *
  * onEvent gets the event's name and its data; onState gets true while the stream is open.  A problem ends it.
  * heard: its `last` is the id of the last event that was heard, after which a stream that is given it goes on.
  */
 export async function follow(path, { query, onEvent, onState = () => {}, signal: abort, endless = true, heard = { last: null } }) {
   for (let wait = 500; !abort.aborted; wait = Math.min(wait * 2, 8000)) {
+    const attempt = new AbortController();
+    const watch = new Watch(SILENCE, () => attempt.abort());
     try {
       const headers = withKey(heard.last === null ? {} : { "Last-Event-ID": heard.last });
-      const options = { headers, signal: abort, cache: "no-store", credentials: "omit" };
+      const options = { headers, signal: AbortSignal.any([abort, attempt.signal]), cache: "no-store", credentials: "omit" };
       const answer = await fetch(address(path, query), options);
       if (answer.status === 204) return;
       if (!answer.ok) throw await problemOf(answer);
       onState(true);
       wait = 500;
-      for await (const event of eventsOf(answer.body)) {
+      for await (const event of eventsOf(answer.body, () => watch.putOff())) {
         if (abort.aborted) return;
         if (event.id !== null) heard.last = event.id;
         onEvent(event.name, JSON.parse(event.data));
@@ -334,18 +390,22 @@ export async function follow(path, { query, onEvent, onState = () => {}, signal:
       if (abort.aborted) return;
       if (error instanceof Problem && ![429, 503].includes(error.status)) throw error;
       if (!(error instanceof Problem)) lost();
+    } finally {
+      watch.end();
     }
     onState(false);
     await sleep(wait);
   }
 }
 
-async function* eventsOf(body) {
+/** The events of a stream; onBytes is called whenever anything comes, a comment too. */
+async function* eventsOf(body, onBytes) {
   const reader = body.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";
   for (;;) {
     const { value, done } = await reader.read();
     if (done) return;
+    onBytes();
     text += value;
     const blocks = text.split("\n\n");
     text = blocks.pop();

@@ -98,6 +98,35 @@ export function Facts({ rows }) {
   `;
 }
 
+const SHORT = 8;
+const END = 7;
+const LONGEST_END = 16;
+
+/** A name; where there is no room its beginning gives way, for what distinguishes names is at their ends.
+ *
+ * among: the names beside which it stands; what they do not begin with in common stays, too.
+ */
+export function Name({ text, among = [] }) {
+  const letters = Array.from(String(text));
+  if (letters.length <= SHORT) return html`<span class="middle">${text}</span>`;
+  const end = Math.min(LONGEST_END, letters.length - 1, Math.max(END, letters.length - commonStart(among)));
+  return html`
+    <span class="middle" title=${text}>
+      <span class="hidden">${text}</span>
+      <span class="start" aria-hidden="true">${letters.slice(0, -end).join("")}</span><span class="end" aria-hidden="true">${letters.slice(-end).join("")}</span>
+    </span>
+  `;
+}
+
+/** With how many letters all of these names begin in common; as many as there are for fewer than two. */
+function commonStart(names) {
+  const [first, ...others] = [...new Set(names)].map((name) => Array.from(name));
+  if (others.length === 0) return Infinity;
+  let count = 0;
+  while (count < first.length && others.every((one) => one[count] === first[count])) count += 1;
+  return count;
+}
+
 // Head of a view
 
 export function Head({ title, note, children }) {
@@ -124,8 +153,8 @@ export function Field({ label, hint, children, inline = false }) {
   `;
 }
 
-/** A dialog; it closes with Esc, and gives the focus back. */
-export function Dialog({ title, close, wide = false, children }) {
+/** A dialog; it closes with Esc, unless it stays until a button in it is pressed, and gives the focus back. */
+export function Dialog({ title, close, wide = false, stays = false, children }) {
   const element = useRef(null);
   const id = useId();
   useLayoutEffect(() => {
@@ -142,11 +171,13 @@ export function Dialog({ title, close, wide = false, children }) {
   }, []);
   const cancelled = (event) => {
     event.preventDefault();
-    close();
+    if (!stays) close();
   };
+  // A browser may close a dialog in spite of that when Esc is pressed again.
+  const typed = (event) => stays && event.key === "Escape" && event.preventDefault();
   return html`
-    <dialog ref=${element} class=${wide ? "wide" : ""} aria-labelledby=${id} onCancel=${cancelled}>
-      <header><h2 id=${id}>${title}</h2><button type="button" class="quiet" aria-label="Close" onClick=${close}>✕</button></header>
+    <dialog ref=${element} class=${wide ? "wide" : ""} aria-labelledby=${id} onCancel=${cancelled} onKeyDown=${typed}>
+      <header><h2 id=${id}>${title}</h2>${!stays && html`<button type="button" class="quiet" aria-label="Close" onClick=${close}>✕</button>`}</header>
       <div class="body">${children}</div>
     </dialog>
   `;
@@ -197,13 +228,60 @@ export function ByName({ title, name, action, close, send, children }) {
 }
 
 export function Copy({ text, label = "Copy" }) {
-  const [done, setDone] = useState(false);
-  const copy = async () => {
-    await navigator.clipboard.writeText(text);
-    setDone(true);
-    setTimeout(() => setDone(false), 2000);
+  const [done, setDone] = useState(null);
+  const copy = async (event) => {
+    const { parentElement: beside } = event.currentTarget; // what is outside an open dialog cannot be selected
+    setDone((await written(text, beside)) ? "Copied" : "Select and copy it");
+    setTimeout(() => setDone(null), 2000);
   };
-  return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done ? "Copied" : label}</button>`;
+  return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done || label}</button>`;
+}
+
+/** Write a text to the clipboard; over plain HTTP browsers only copy what is selected.  Whether it is there. */
+async function written(text, beside) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    const field = document.createElement("textarea");
+    const focused = document.activeElement;
+    field.value = text;
+    field.className = "hidden";
+    beside.append(field);
+    field.select();
+    const done = document.execCommand("copy");
+    field.remove();
+    focused?.focus();
+    return done;
+  }
+}
+
+// Menus
+
+const ROW_HEIGHT = 48; // at most
+
+/** A button that opens a menu of what can be done with something: items are [text, function, class]. */
+export function Menu({ of, items }) {
+  const [button, list] = [useRef(null), useRef(null)];
+  const id = useId();
+  const place = () => {
+    const { top, bottom, right } = button.current.getBoundingClientRect();
+    const high = items.length * ROW_HEIGHT;
+    const below = bottom + high < innerHeight;
+    const vertical = below ? { top: `${bottom + 4}px`, bottom: "auto" } : { top: "auto", bottom: `${innerHeight - top + 4}px` };
+    Object.assign(list.current.style, { ...vertical, right: `${Math.max(4, document.documentElement.clientWidth - right)}px` });
+  };
+  const choose = (call) => () => {
+    list.current.hidePopover();
+    button.current.focus(); // which a dialog that opens now gives back
+    call();
+  };
+  return html`
+    <button ref=${button} type="button" class="small" popovertarget=${id} aria-label=${`Actions for ${of}`}>⋯</button>
+    <div ref=${list} id=${id} class="menu-list" popover="auto" role="group" aria-label=${`Actions for ${of}`} onBeforeToggle=${place}>
+      ${items.map(([text, call, tone = ""]) => html`<button type="button" class=${`quiet ${tone}`} aria-label=${`${text} ${of}`} onClick=${choose(call)}>${text}</button>`)}
+    </div>
+  `;
 }
 
 // Pages of a list

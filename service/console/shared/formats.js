@@ -61,6 +61,11 @@ export function relative(moment, now = Date.now()) {
   return seconds > 0 ? `${duration(seconds)} ago` : `in ${duration(seconds)}`;
 }
 
+/** The time of day of a moment, to the second, as clocks here show it. */
+export function clock(moment) {
+  return new Date(moment).toLocaleTimeString("en-GB");
+}
+
 /** A moment exactly, in UTC. */
 export function exact(moment) {
   return new Date(moment).toISOString().replace("T", " ").replace(/\.\d+Z$/, " UTC");

@@ -3,7 +3,7 @@ import { signal } from "./view.js";
 
 const TAKEN = ["image/jpeg", "image/png", "image/webp"];
 
-/** A frame that another view hands over to be tried. */
+/** A frame that another view hands over to be tried: {file, question}, the parameters with which it was asked. */
 export const handedOver = signal(null);
 
 /** A file as a frame: {blob, type, url, ratio}.

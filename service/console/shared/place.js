@@ -1,6 +1,6 @@
 // One place, large: what is kept of it, its neighbours, and what matched it lately.
 import { get, may, patch, remove } from "./api.js";
-import { ByName, ExactMoment, Facts, Field, FormDialog, Head, Moment, say, Verdict } from "./elements.js";
+import { ByName, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, say, Verdict } from "./elements.js";
 import { decimal, integer, metres, milliseconds, percent, poseText } from "./formats.js";
 import { mapPath } from "./map_path.js";
 import { Thumbnail } from "./pictures.js";
@@ -90,7 +90,7 @@ function Row({ map, items, present }) {
         <li class=${id === present ? "thumb chosen" : "thumb"} key=${id}>
           <a href=${href("maps", map, "places", id)} aria-current=${id === present ? "true" : undefined}>
             <${Thumbnail} map=${map} place=${id} />
-            <span class="under small"><span class="name">${id}</span><span class="faint nowrap">${note}</span></span>
+            <span class="under small"><span class="name"><${Name} text=${id} /></span><span class="faint nowrap">${note}</span></span>
           </a>
         </li>
       `)}

@@ -1,5 +1,6 @@
 // A plan on two canvases: places below, what moves and what is chosen above.  Up to a few thousand places are drawn as
 // discs with their headings; more of them as squares written straight into the picture, which takes milliseconds.
+import { plain } from "./view.js";
 
 const DENSE = 5000;
 const NEAR = 14;
@@ -266,14 +267,14 @@ export class PlanCanvas {
   }
 
   drawRobot(context, robot, tints) {
-    const tint = tints[robot.verdict] || tints.accent;
+    const tint = robot.silent ? tints.faint : tints[robot.verdict] || tints.accent;
     context.strokeStyle = context.fillStyle = tint;
     context.lineWidth = 2;
     context.beginPath();
     robot.trail.forEach(({ x, y }, one) => (one ? context.lineTo(...this.at(x, y)) : context.moveTo(...this.at(x, y))));
     context.stroke();
     const [px, py] = this.at(robot.x, robot.y);
-    if (robot.ellipse) {
+    if (robot.ellipse && !robot.silent) {
       const { major, minor, turn } = robot.ellipse;
       const { scale } = this.view;
       context.beginPath();
@@ -294,11 +295,12 @@ export class PlanCanvas {
     context.strokeStyle = tints.surface;
     context.lineWidth = 4;
     context.lineJoin = "round";
-    const room = this.width - px - 16 - context.measureText(robot.label).width;
+    const label = plain(robot.label);
+    const room = this.width - px - 16 - context.measureText(label).width;
     const beside = px > this.width || room > 0 ? [px + 12, py - 8] : [px + 12 + room, py - 18];
-    context.strokeText(robot.label, ...beside);
-    context.fillStyle = tints.text;
-    context.fillText(robot.label, ...beside);
+    context.strokeText(label, ...beside);
+    context.fillStyle = robot.silent ? tints.faint : tints.text;
+    context.fillText(label, ...beside);
   }
 
   // Hands

@@ -26,7 +26,7 @@ function prepared(columns) {
   let posed = 0;
   for (let one = 0; one < count; one += 1) posed += px[one] === px[one] ? 1 : 0; // NaN is not itself
   const plan = { ...columns, count, index, projection, px, py, angle, posed, traverses: traversesOf(columns) };
-  plan.gaps = gapsOf(plan);
+  plan.gaps = columns.gaps.map(({ before, after }) => ({ from: index.get(before), to: index.get(after) })).filter(({ from, to }) => from !== undefined && to !== undefined);
   return plan;
 }
 
@@ -89,30 +89,6 @@ function traversesOf({ ids, sequence, sequences }) {
   for (let one = 0; one < ids.length; one += 1) (found[sequence[one]] || loose).places.push(one);
   if (loose.places.length) found.push(loose);
   return found;
-}
-
-const GAP = 4;
-const MOST_GAPS = 500;
-
-/** Steps of a traverse that are several times longer than its usual one: {from, to, length}. */
-function gapsOf({ traverses, px, py }) {
-  const found = [];
-  for (const { name, places } of traverses) {
-    if (name === null || places.length < 5) continue;
-    const lengths = new Float64Array(places.length - 1);
-    for (let one = 0; one < lengths.length; one += 1) {
-      const [from, to] = [places[one], places[one + 1]];
-      const [dx, dy] = [px[to] - px[from], py[to] - py[from]];
-      lengths[one] = Math.sqrt(dx * dx + dy * dy);
-    }
-    const known = lengths.filter((length) => !Number.isNaN(length)).sort();
-    const median = known[Math.floor(known.length / 2)];
-    if (!(median > 0)) continue;
-    lengths.forEach((length, one) => {
-      if (length > GAP * median) found.push({ from: places[one], to: places[one + 1], length });
-    });
-  }
-  return found.sort((a, b) => b.length - a.length).slice(0, MOST_GAPS);
 }
 
 /** The places of the same traverse up to so many steps before and after: {id, step}. */

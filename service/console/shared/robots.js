@@ -3,6 +3,8 @@ import { all, get } from "./api.js";
 import { mapPath } from "./map_path.js";
 
 const TRAIL = 80;
+/** Milliseconds without a frame after which nobody can say where a robot is now. */
+const SILENT_AFTER = 10_000;
 const FADES_AFTER = 30_000;
 
 export class Robots {
@@ -17,8 +19,9 @@ export class Robots {
   async begin(map, signal) {
     const sessions = await all(mapPath(map, "sessions"), {}, { signal });
     for (const { id } of sessions.slice(0, 50)) {
-      const { belief } = await get(mapPath(map, "sessions", id), {}, { signal });
-      if (belief?.place?.pose) this.move(id, belief.place.pose, belief.verdict);
+      const told = await get(mapPath(map, "sessions", id), {}, { signal });
+      const { belief, key, camera, last_frame_at: at } = told;
+      if (at && belief?.place?.pose) this.move({ session: id, key, camera, pose: belief.place.pose, verdict: belief.verdict, at });
     }
   }
 
@@ -27,7 +30,7 @@ export class Robots {
     if (name === "session") return this.takeSession(event);
     if (name !== "query" || !event.pose) return false;
     if (event.session) {
-      this.move(event.session, event.pose, event.verdict);
+      this.move(event);
       return true;
     }
     const point = this.projection(event.pose);
@@ -39,28 +42,36 @@ export class Robots {
   takeSession(event) {
     if (event.change === "ended") return this.robots.delete(event.session);
     const robot = this.robots.get(event.session);
-    if (robot) robot.verdict = event.verdict || robot.verdict;
-    else if (event.pose) this.move(event.session, event.pose, event.verdict);
+    if (robot) Object.assign(robot, { verdict: event.verdict || robot.verdict, seen: moment(event.at) });
+    else if (event.pose) this.move(event);
     return true;
   }
 
-  move(id, pose, verdict) {
+  /** Take a session's pose and verdict; its robot is called after its key, else after its camera or the session. */
+  move({ session, key, camera, pose, verdict, at }) {
     const point = this.projection(pose);
     if (!point) return;
-    const { trail = [] } = this.robots.get(id) || {};
-    const robot = { x: point.x, y: point.y, angle: point.heading, verdict, label: id, ellipse: ellipseOf(pose) };
-    this.robots.set(id, { ...robot, trail: [...trail, point].slice(-TRAIL) });
+    const { trail = [], label } = this.robots.get(session) || {};
+    const robot = { session, label: key || camera || label || session, verdict, seen: moment(at) };
+    const place = { x: point.x, y: point.y, angle: point.heading, ellipse: ellipseOf(pose) };
+    this.robots.set(session, { ...robot, ...place, trail: [...trail, point].slice(-TRAIL) });
   }
 
   /** What is to be drawn. */
   now() {
     const since = Date.now() - FADES_AFTER;
     this.dots = this.dots.filter((dot) => dot.at > since);
+    const robots = [...this.robots.values()].sort((one, other) => other.seen - one.seen);
     return {
-      robots: [...this.robots.values()],
+      robots: robots.map((one) => ({ ...one, silent: Date.now() - one.seen > SILENT_AFTER })),
       dots: this.dots.map((dot) => ({ ...dot, age: (Date.now() - dot.at) / FADES_AFTER })),
     };
   }
+}
+
+/** When something happened, which by this machine's clock is not later than now. */
+function moment(at) {
+  return Math.min(new Date(at).getTime(), Date.now());
 }
 
 /** The ellipse of two standard deviations of a pose, by its covariance or else its spread. */

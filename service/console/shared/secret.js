@@ -12,7 +12,7 @@ export function Secret() {
     newKey.value = null;
   };
   return html`
-    <${Dialog} title=${`The key ${name}`} close=${close}>
+    <${Dialog} title=${`The key ${name}`} close=${close} stays>
       <p><strong>Copy it now.</strong> It is shown this once; the service keeps only its hash.</p>
       <pre tabindex="0" class="secret" aria-label="The key">${key}</pre>
       <footer class="row"><${Copy} text=${key} label="Copy the key" /><button type="button" class="primary" onClick=${close}>Done</button></footer>

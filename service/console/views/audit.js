@@ -72,7 +72,7 @@ function Table({ items, open }) {
               <td class="long">${line.map && html`<a href=${href("maps", line.map, "plan")}>${line.map}</a>`} ${line.place || line.sequence || line.camera || line.changed_key_name || ""}</td>
               <td class="number">${line.status === null || line.status === undefined ? "–" : html`<span class=${line.status >= 400 ? "pill warn" : ""}>${line.status}</span>`}</td>
               <td>${line.client || "–"}</td>
-              <td class="actions-cell"><button type="button" class="small" aria-label=${`All of the line of ${line.time}`} onClick=${() => open(line)}>More</button></td>
+              <td class="actions-cell"><button type="button" class="small" aria-label=${`More of the line of ${line.time}`} onClick=${() => open(line)}>More</button></td>
             </tr>
           `)}
         </tbody>

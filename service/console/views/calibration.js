@@ -1,7 +1,7 @@
 // When answers are believed: how probable they really are, what a threshold costs, and another one to try and apply.
 import { getTagged, get, may, patch, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
-import { ByName, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
+import { ByName, complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
 import { decimal, integer, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -15,6 +15,7 @@ export default function Calibration({ map }) {
   const close = () => setDialog(null);
   const own = state.data !== undefined && !ofEncoder(state.data.data.calibration);
   const calibrate = () => setDialog(html`<${Order} map=${map} own=${own} tag=${state.data?.tag} started=${setJob} close=${close} />`);
+  const storeIt = () => setDialog(html`<${Store} map=${map} data=${state.data.data} tag=${state.data.tag} own=${own} changed=${state.reload} close=${close} />`);
   const giveUp = () => setDialog(html`<${GiveUp} map=${map} tag=${state.data.tag} changed=${state.reload} close=${close} />`);
   const ended = (told) => {
     if (told.state === "succeeded") {
@@ -27,7 +28,7 @@ export default function Calibration({ map }) {
       ${may("admin") && html`<button type="button" class="primary" onClick=${calibrate}>Calibrate</button>`}
     <//>
     ${job && html`<section class="panel"><${JobProgress} key=${job.id} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Dry run" : "Calibration"} /></section>`}
-    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} giveUp=${giveUp} />`}<//>
+    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} giveUp=${giveUp} storeIt=${storeIt} />`}<//>
     ${dialog}
   `;
 }
@@ -49,9 +50,40 @@ function GiveUp({ map, tag, changed, close }) {
   `;
 }
 
-function State({ map, data, tag, changed, giveUp }) {
-  const { calibration, measured } = data;
+/** Store what a dry run has found: at once, or by the map's name where it replaces a calibration of the map's own. */
+function Store({ map, data, tag, own, changed, close }) {
+  const send = async () => {
+    await patch(mapPath(map), { calibration: { measured_at: data.measured.at } }, tag);
+    say("The calibration was stored.", own ? undefined : () => patch(mapPath(map), { calibration: null }).then(changed, complain));
+    changed();
+  };
+  const action = "Store the calibration";
+  const text = html`<p><${Change} data=${data} /></p>`;
+  if (own) return html`<${ByName} title=${action} name=${map} action=${action} close=${close} send=${send}>${text}<p>It replaces the calibration that the map has of its own.</p><//>`;
+  return html`<${FormDialog} title=${action} action=${action} close=${close} send=${send}>${text}<//>`;
+}
+
+/** What would be set, and what then became of the measured queries. */
+function Change({ data: { calibration, measured, now, proposed } }) {
+  const found = measured.report.calibration;
+  const [one, other] = [calibration.margin, found.margin].map((margin) => decimal(margin, 4));
   return html`
+    Would set the threshold <strong>${decimal(calibration.threshold)} → ${decimal(found.threshold)}</strong>${one !== other && html`, the margin ${one} → ${other}`};
+    recognized <strong>${integer(now?.verdicts.recognized)} → ${integer(proposed.verdicts.recognized)}</strong> of the ${integer(measured.report.measurement.trials)} measured queries,
+    precision ${percent(now?.precision.value, 1)} → ${percent(proposed.precision.value, 1)}.
+  `;
+}
+
+function State({ map, data, tag, changed, giveUp, storeIt }) {
+  const { calibration, measured } = data;
+  const proposes = data.proposed && JSON.stringify(measured.report.calibration) !== JSON.stringify(calibration);
+  return html`
+    ${proposes && html`
+      <section class="notice good spread" aria-label="Dry run">
+        <p><${Change} data=${data} /> Nothing was stored.</p>
+        ${may("admin") && html`<button type="button" class="primary" onClick=${storeIt}>Store it</button>`}
+      </section>
+    `}
     <div class="columns">
       <section class="panel">
         <h2>In force</h2>
@@ -114,7 +146,9 @@ function Threshold({ map, data, tag, changed }) {
     setThreshold(calibration.threshold);
     setMargin(calibration.margin);
   }, [calibration.threshold, calibration.margin]);
-  const effect = useResource((signal) => get(mapPath(map, "calibration"), settled, { signal }), [map, settled, tag]);
+  // A dry run measures anew and leaves the map's tag as it is.
+  const effect = useResource((signal) => get(mapPath(map, "calibration"), settled, { signal }), [map, settled, tag, measured.at]);
+  const present = effect.data?.measured?.at === measured.at ? effect.data : null;
   const same = threshold === calibration.threshold && margin === calibration.margin;
   const apply = async () => {
     setError(null);
@@ -150,7 +184,7 @@ function Threshold({ map, data, tag, changed }) {
           ${error && html`<${Trouble} error=${error} again=${error.slug === "revision-mismatch" ? readAgain : undefined} />`}
         </div>
         ${effect.error && html`<${Trouble} error=${effect.error} />`}
-        ${effect.data?.now && html`<${Effect} now=${effect.data.now} then=${effect.data.then || effect.data.now} />`}
+        ${present?.now && html`<${Effect} now=${present.now} then=${present.then || present.now} />`}
       </div>
     </section>
   `;
@@ -208,7 +242,7 @@ function Curves({ data }) {
       <section class="panel">
         <h2>By threshold</h2>
         <${Chart} data=${byThreshold} series=${[{ label: "precision" }, { label: "recall", tint: "recognized" }]} axes=${[{ label: "threshold" }, { label: "share" }]} scales=${{ y: unit }}
-          marks=${[{ x: data.calibration.threshold, tint: "faint", label: "in force" }]} label="Precision and recall by threshold" />
+          marks=${[{ x: data.calibration.threshold, tint: "faint", label: "in force" }, ...(data.proposed ? [{ x: report.calibration.threshold, tint: "accent", label: "dry run" }] : [])]} label="Precision and recall by threshold" />
       </section>
     </div>
   `;

@@ -2,8 +2,8 @@
 // what they would cost.
 import { all, get, may, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
-import { ByName, Facts, Field, Head, Loading, Moment, Pill, Trouble, VerdictMix } from "../shared/elements.js";
-import { decimal, integer, metres, percent } from "../shared/formats.js";
+import { ByName, Facts, Field, Head, Loading, Moment, Name, Pill, Trouble, VerdictMix } from "../shared/elements.js";
+import { counted, decimal, integer, metres, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -25,9 +25,10 @@ export default function Health({ map }) {
 }
 
 function Report({ map, data }) {
-  const { answers, never_matched: silent, aliasing, gaps, gap_count: gapCount, retraverse, complete } = data;
+  const { answers, never_matched: silent, aliasing, gaps, gap_count: gapCount, gap_counts: byMeasure, retraverse, complete } = data;
   return html`
     ${!complete && html`<p class="notice">The map is large: a sample of ${integer(aliasing.examined)} of its ${integer(aliasing.of)} places was examined in the time there was.</p>`}
+    ${data.shared_routes.map((one) => html`<${OneRoute} map=${map} route=${one} />`)}
     <div class="columns">
       <section class="panel">
         <h2>Answers</h2>
@@ -43,17 +44,17 @@ function Report({ map, data }) {
       <section class="panel">
         <h2>Match everything</h2>
         <p class="faint">Places that are among the most alike of unusually many others, such as a bare wall.</p>
-        <${Hubs} map=${map} items=${aliasing.hubs} unit="times, expected" />
-        ${aliasing.unsure.length > 0 && html`<h3>Often the best match of what was not recognized</h3><${Hubs} map=${map} items=${aliasing.unsure} unit="times, expected" />`}
+        <${Hubs} map=${map} items=${aliasing.hubs} count=${aliasing.hub_count} unit="times, expected" />
+        ${aliasing.unsure.length > 0 && html`<h3>Often the best match of what was not recognized</h3><${Hubs} map=${map} items=${aliasing.unsure} count=${aliasing.unsure_count} unit="times, expected" />`}
       </section>
       <section class="panel">
         <h2>Look like other places <span class="faint">${integer(aliasing.alias_count)}</span></h2>
-        <${Aliases} map=${map} items=${aliasing.aliases} />
+        <${Aliases} map=${map} items=${aliasing.aliases} count=${aliasing.alias_count} />
       </section>
     </div>
     <div class="columns">
-      <section class="panel"><h2>Where to drive again</h2><${Stretches} map=${map} items=${retraverse} /></section>
-      <section class="panel"><h2>Gaps <span class="faint">${integer(gapCount)}</span></h2><${Gaps} map=${map} items=${gaps} /></section>
+      <section class="panel"><h2>Where to drive again</h2><${Stretches} map=${map} items=${retraverse} count=${data.retraverse_count} /></section>
+      <section class="panel"><h2>Gaps <span class="faint">${integer(gapCount)}</span></h2><${Gaps} map=${map} items=${gaps} count=${gapCount} byMeasure=${byMeasure} /></section>
     </div>
   `;
 }
@@ -72,12 +73,27 @@ function Drift({ answers }) {
   `;
 }
 
-function PlaceLinks({ map, ids, most = 8 }) {
+/** Traverses that show the same, one frame after the other, are no look-alikes: they are to be aligned. */
+function OneRoute({ map, route: { sequence, other, frames } }) {
+  return html`
+    <section class="notice spread" aria-label="One route">
+      <p><strong>${sequence}</strong> and <strong>${other}</strong> seem to be one route: ${integer(frames)} of their frames look like the other's, in the same order. As long as they are not aligned, answers there are ambiguous.</p>
+      <a class="button" href=${href("maps", map, "traverses", { query: sequence, reference: other })}>Compare and align them</a>
+    </section>
+  `;
+}
+
+/** How many more there are than are shown. */
+function More({ shown, count }) {
+  return count > shown && html`<p class="faint small">and ${integer(count - shown)} more</p>`;
+}
+
+function PlaceLinks({ map, ids, count, most = 8 }) {
   return html`
     <ul class="thumbs narrow">
-      ${ids.slice(0, most).map((id) => html`<li class="thumb" key=${id}><a href=${href("maps", map, "places", id)}><${Thumbnail} map=${map} place=${id} /><span class="name small">${id}</span></a></li>`)}
+      ${ids.slice(0, most).map((id) => html`<li class="thumb" key=${id}><a href=${href("maps", map, "places", id)}><${Thumbnail} map=${map} place=${id} /><span class="name small"><${Name} text=${id} /></span></a></li>`)}
     </ul>
-    ${ids.length > most && html`<p class="faint small">and ${integer(ids.length - most)} more</p>`}
+    <${More} shown=${Math.min(most, ids.length)} count=${count} />
   `;
 }
 
@@ -85,38 +101,42 @@ function Silent({ map, silent, places }) {
   if (!silent) return html`<p class="faint">The map has not been queried yet.</p>`;
   return html`
     <p>${integer(silent.count)} of ${integer(places)} places were never the best match; ${integer(Math.round(silent.by_chance))} would be by chance.</p>
-    <${PlaceLinks} map=${map} ids=${silent.places} />
+    ${silent.enough
+      ? html`<${PlaceLinks} map=${map} ids=${silent.places} count=${silent.count} />`
+      : html`<p class="faint">That says nothing yet: after ${counted(silent.queries, "query", "queries")}, of ${integer(silent.wanted)} that it takes.</p>`}
   `;
 }
 
-function Hubs({ map, items, unit }) {
+function Hubs({ map, items, count, unit }) {
   if (items.length === 0) return html`<p>None.</p>`;
   return html`
     <ul class="thumbs narrow">
       ${items.slice(0, 8).map((one) => html`
-        <li class="thumb" key=${one.place}><a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="name small">${one.place}</span></a>
+        <li class="thumb" key=${one.place}><a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="name small"><${Name} text=${one.place} /></span></a>
         <span class="faint small">${integer(one.count)} ${unit} ${decimal(one.expected, 1)}</span></li>
       `)}
     </ul>
+    <${More} shown=${Math.min(8, items.length)} count=${count} />
   `;
 }
 
-function Aliases({ map, items }) {
+function Aliases({ map, items, count }) {
   if (items.length === 0) return html`<p>None.</p>`;
   return html`
     <ul class="aliases">
       ${items.slice(0, 6).map((one) => html`
         <li class="alias">
-          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small">${one.place}</span></a>
-          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small">${one.other}</span></a>
+          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small"><${Name} text=${one.place} among=${[one.place, one.other]} /></span></a>
+          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small"><${Name} text=${one.other} among=${[one.place, one.other]} /></span></a>
           <span class="small">${decimal(one.score)} <span class="faint">own ${decimal(one.own)}</span></span>
         </li>
       `)}
     </ul>
+    <${More} shown=${Math.min(6, items.length)} count=${count} />
   `;
 }
 
-function Stretches({ map, items }) {
+function Stretches({ map, items, count }) {
   if (items.length === 0) return html`<p>Nowhere: no stretch is weak.</p>`;
   return html`
     <div class="table" tabindex="0" role="region" aria-label="Stretches">
@@ -135,14 +155,16 @@ function Stretches({ map, items }) {
         </tbody>
       </table>
     </div>
+    <${More} shown=${Math.min(20, items.length)} count=${count} />
   `;
 }
 
 const MEASURES = { distance: metres, time: (value) => `${decimal(value, 1)} s`, similarity: (value) => decimal(value) };
 
-function Gaps({ map, items }) {
+function Gaps({ map, items, count, byMeasure }) {
   if (items.length === 0) return html`<p>None.</p>`;
   return html`
+    <p class="faint">${integer(byMeasure.distance)} in metres, which the plan draws; ${integer(byMeasure.time)} in seconds; ${integer(byMeasure.similarity)} where frames look unlike.</p>
     <div class="table" tabindex="0" role="region" aria-label="Gaps">
       <table>
         <thead><tr><th>Between</th><th>Measure</th><th class="number">Step</th><th class="number">Usual</th><th class="number">Times</th></tr></thead>
@@ -159,6 +181,7 @@ function Gaps({ map, items }) {
         </tbody>
       </table>
     </div>
+    <${More} shown=${Math.min(20, items.length)} count=${count} />
   `;
 }
 
@@ -246,10 +269,12 @@ function Merge({ map }) {
           report.conflicts.length > 0 && ["Conflicts", html`<ul>${report.conflicts.map((one) => html`<li>${one}</li>`)}</ul>`],
           report.overlap && ["Overlap", html`<${Result} value=${report.overlap} />`],
         ]} />
+        ${report.warnings.map((one) => html`<p class="notice">${one}</p>`)}
         ${report.coming > 0 && order.dry_run && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Copy ${integer(report.coming)} places</button></div>`}
       `}
       ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
         <p>${integer(report.coming)} places of ${order.from} come into ${map}.</p>
+        ${report.warnings.map((one) => html`<p class="notice">${one}</p>`)}
       <//>`}
     </section>
   `;

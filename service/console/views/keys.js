@@ -91,7 +91,7 @@ function Create({ first, close, changed }) {
     const { name, role, maps, expires } = fields;
     const body = { name, role, maps, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
     newKey.value = await (await send("POST", "/keys", { query, json: body })).json();
-    if (first) useKey(newKey.value.key).catch(complain);
+    if (first) useKey(newKey.value.key, { known: true }).catch(complain); // without it the next request would be refused
     changed();
   });
   return html`

@@ -1,7 +1,7 @@
 // The queries of a map as they are answered: verdict, probability, who asked, and why.
 import { epoch, follow, get, key, may } from "../shared/api.js";
-import { Bar, Dialog, ExactMoment, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
-import { decimal, integer, metres, percent, poseText } from "../shared/formats.js";
+import { Bar, Dialog, ExactMoment, Facts, Field, Head, Name, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
+import { clock, decimal, exact, integer, metres, percent, poseText } from "../shared/formats.js";
 import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
@@ -114,25 +114,30 @@ function Gap({ missed }) {
 function Line({ map, event, open }) {
   const { verdict, probability, place, best, key, camera, session, picture } = event;
   const shown = place || best;
+  const others = key && [camera, session].filter(Boolean).join(" · ");
   return html`
     <li>
-      <${Moment} at=${event.at} />
+      <time datetime=${event.at} title=${exact(event.at)}>${clock(event.at)}</time>
+      <span class="who">${key ? html`<strong><${Name} text=${key} /></strong>` : html`<span class="faint">${camera || session || "–"}</span>`}${others && html` <span class="small faint">${others}</span>`}</span>
       <${Verdict} verdict=${verdict} />
       <span class="probability"><${Bar} share=${probability ?? 0} tone=${verdict} label=${`Probability ${percent(probability)}`} /> <span class="small">${percent(probability)}</span></span>
       <span class="what">
         ${picture && html`<span class="picture"><img src=${picture} alt="The frame" /></span>`}
-        ${shown && html`<${Thumbnail} map=${map} place=${shown} /><span>${place ? html`<a href=${href("maps", map, "places", place)}>${place}</a>` : html`<span class="faint">best ${best}</span>`}</span>`}
+        ${shown && html`<${Thumbnail} map=${map} place=${shown} /><span>${place ? html`<a href=${href("maps", map, "places", place)}><${Name} text=${place} /></a>` : html`<span class="faint row">best <${Name} text=${best} /></span>`}</span>`}
       </span>
-      <span class="small faint">${[key, camera, session].filter(Boolean).join(" · ") || "–"}</span>
       <span class="number"><button type="button" class="small" aria-label=${`Why ${verdict}`} onClick=${() => open(event)}>Why</button></span>
     </li>
   `;
 }
 
+function asText(question) {
+  return Object.entries(question || {}).map(([name, value]) => `${name} ${value}`).join(", ") || "nothing but the frame";
+}
+
 function Details({ map, event, close }) {
   const { verdict, probability, place, best, pose, score, decision, threshold, reason, picture, explanation } = event;
   const again = () => {
-    handedOver.value = blobOf(picture);
+    handedOver.value = { file: blobOf(picture), question: event.question || {} };
     go("maps", map, "try");
   };
   return html`
@@ -153,13 +158,18 @@ function Details({ map, event, close }) {
           ["Asked by", event.key || "–"],
           event.camera && ["Camera", event.camera],
           event.session && ["Session", `${event.session}${event.frame !== null && event.frame !== undefined ? `, frame ${event.frame}` : ""}`],
+          ["Asked with", event.question === null ? "longer than is told" : asText(event.question)],
           ["Operation", (event.operation || "").replaceAll("_", " ")],
           ["Request", html`<code>${event.request_id}</code>`],
         ]} />
         <${Timings} milliseconds=${event.milliseconds} />
       </div>
       ${explanation && html`<${Picture} path=${explanation.replace(/^.*?\/v1/, "")} alt="The frame beside its best match, with what connects them" />`}
-      ${picture && html`<footer class="row"><button type="button" onClick=${again}>Ask again with this thumbnail, and explain</button></footer>`}
+      ${picture && html`<footer class="row">
+        <button type="button" onClick=${again}>Ask again with this thumbnail, and explain</button>
+        ${event.question === null && html`<span class="faint">without its filters, which are longer than is told</span>`}
+        ${event.session && html`<span class="faint">as a single frame: its session knew the frames before it, too</span>`}
+      </footer>`}
     <//>
   `;
 }

@@ -1,6 +1,7 @@
 // All maps: how large, how searched, how they answer; made, edited, deleted, saved as files and read from them.
 import { all, caller, download, everyMap, get, getTagged, may, patch, post, remove, upload } from "../shared/api.js";
-import { ByName, complain, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
+import { ByName, complain, Dialog, Field, FormDialog, Head, Menu, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
+import { mapNames } from "../shared/chosen_map.js";
 import { bytes, counted, encoderName, integer } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -36,6 +37,7 @@ async function readMaps(signal) {
   const [first, items] = [await get("/maps", { limit: 1000 }, { signal }), []];
   items.push(...first.items);
   if (first.next_cursor) items.push(...(await all("/maps", { cursor: first.next_cursor }, { signal })));
+  mapNames.value = items.map((one) => one.id);
   return { items, quarantined: first.quarantined };
 }
 
@@ -90,9 +92,11 @@ function Row({ map, open, close, changed }) {
       <td class="nowrap"><${Moment} at=${map.updated_at} /></td>
       <td class="actions-cell">
         ${may("admin") && html`
-          <button type="button" class="small" aria-label=${`Edit ${map.id}`} onClick=${fresh}>Edit</button>
-          <button type="button" class="small" aria-label=${`Export ${map.id}`} onClick=${() => open(html`<${Export} map=${map} close=${close} />`)}>Export</button>
-          <button type="button" class="small danger" aria-label=${`Delete ${map.id}`} onClick=${() => open(html`<${Delete} map=${map.id} places=${map.places} close=${close} changed=${changed} />`)}>Delete</button>
+          <${Menu} of=${map.id} items=${[
+            ["Edit", fresh],
+            ["Export", () => open(html`<${Export} map=${map} close=${close} />`)],
+            ["Delete", () => open(html`<${Delete} map=${map.id} places=${map.places} close=${close} changed=${changed} />`), "danger"],
+          ]} />
         `}
       </td>
     </tr>
@@ -116,7 +120,10 @@ function health(map) {
   if (map.calibration.source === "encoder-default") {
     return { word: "not calibrated", tone: "", why: "It uses its encoder's thresholds." };
   }
-  return { word: "good", tone: "good", why: `Calibrated by ${map.calibration.source}.` };
+  const calibrated = `Calibrated by ${map.calibration.source}`;
+  if (total < 20) return { word: "calibrated", tone: "", why: `${calibrated}; too few answers of the last day to say how good they are.` };
+  if (day.recognized / total < 0.5) return { word: "in doubt", tone: "warn", why: `${calibrated}; less than half of the answers of the last day were recognized.` };
+  return { word: "good", tone: "good", why: `${calibrated}; ${Math.round((100 * day.recognized) / total)} % of ${total} answers of the last day were recognized.` };
 }
 
 function Damaged({ damaged, open, close, changed }) {

@@ -1,6 +1,6 @@
 // The places of a map as thumbnails, page by page and filtered; one place, where the address names it.
 import { get, may, post } from "../shared/api.js";
-import { ByName, complain, Field, Head, Moment, Nothing, Pager, Pill } from "../shared/elements.js";
+import { ByName, complain, Field, Head, Moment, Name, Nothing, Pager, Pill } from "../shared/elements.js";
 import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -55,6 +55,7 @@ function List({ map, query }) {
     <${Shown} resource=${page}>
       ${({ items, next_cursor: next }) => html`
         ${items.length === 0 && html`<${Nothing} title="No places">${present === "{}" ? "Nothing was enrolled into this map yet." : "No place fits the filters."}<//>`}
+        ${items.length === 0 && asTexts(filter.where) && html`<${AsTexts} where=${filter.where} />`}
         <ul class="thumbs" aria-label="Places">
           ${items.map((place) => html`<${Tile} key=${place.id} map=${map} place=${place} chosen=${chosen.has(place.id)} toggle=${toggle} />`)}
         </ul>
@@ -114,6 +115,24 @@ function Filters({ map, filter }) {
   `;
 }
 
+/** The same conditions with texts for numbers and truth values; null if there are none of these. */
+function asTexts(where) {
+  const told = Object.entries(where ? JSON.parse(where) : {});
+  if (told.every(([, value]) => typeof value === "string")) return null;
+  return JSON.stringify(Object.fromEntries(told.map(([name, value]) => [name, String(value)])));
+}
+
+/** What was typed without quotation marks is a number, which no text equals: the other reading is offered. */
+function AsTexts({ where }) {
+  const texts = asTexts(where);
+  return html`
+    <p class="row">
+      <span class="faint">A number equals no text.</span>
+      <button type="button" onClick=${() => restate({ where: texts })}>Look for ${shownWhere(texts)}</button>
+    </p>
+  `;
+}
+
 function shownWhere(text) {
   if (!text) return "";
   try {
@@ -150,8 +169,8 @@ function Tile({ map, place, chosen, toggle }) {
       ${may("enrol") && html`<input type="checkbox" aria-label=${`Choose ${place.id}`} checked=${chosen} onChange=${() => toggle(place.id)} />`}
       <a href=${href("maps", map, "places", place.id)} title=${poseText(place.pose)}>
         <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
-        <span class="name">${place.id}</span>
-        <span class="under faint small"><span>${place.sequence || "no traverse"}</span>${place.timestamp && html`<${Moment} at=${place.timestamp} />`}</span>
+        <span class="name"><${Name} text=${place.id} /></span>
+        <span class="under faint small"><span>${place.sequence ? html`<${Name} text=${place.sequence} />` : "no traverse"}</span>${place.timestamp && html`<${Moment} at=${place.timestamp} />`}</span>
       </a>
     </li>
   `;

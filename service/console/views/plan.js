@@ -1,9 +1,9 @@
 // The plan of a map: where its places lie, coloured by traverse, and where robots are now.  Without poses the traverses
 // lie below one another as strips.
 import { epoch, follow, get, may } from "../shared/api.js";
-import { complain, Facts, Head, Loading, Nothing } from "../shared/elements.js";
+import { complain, Facts, Head, Loading, Name, Nothing, Verdict } from "../shared/elements.js";
 import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
-import { counted, exact, integer, metres, poseText } from "../shared/formats.js";
+import { counted, exact, integer, metres, poseText, relative } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { PlanCanvas } from "../shared/plan_canvas.js";
@@ -25,12 +25,12 @@ export default function Plan({ map, query }) {
   `;
 }
 
-function planNote({ places, posed, count, gaps }) {
+function planNote({ places, posed, count, gap_count: gapCount }) {
   const parts = [counted(places, "place")];
   if (count < places) parts.push(`${integer(count)} of them drawn`);
   if (posed === 0) parts.push("no poses: each traverse is a strip");
   else if (posed < count) parts.push(`${integer(count - posed)} without a pose`);
-  if (gaps.length) parts.push(counted(gaps.length, "gap"));
+  if (gapCount) parts.push(counted(gapCount, "gap"));
   return parts.join(" · ");
 }
 
@@ -65,7 +65,7 @@ function Drawing({ map, plan, query }) {
   const shape = `${strips} ${map}`;
   const fitted = useRef(null);
   useEffect(() => {
-    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown"].map((name) => [name, colour(name)]));
+    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown", "faint"].map((name) => [name, colour(name)]));
     drawing.current.mark({ tints });
     drawing.current.show(content, fitted.current !== shape);
     if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);
@@ -109,7 +109,7 @@ function Drawing({ map, plan, query }) {
         </section>
         <section class="panel">
           <h2>Also shown</h2>
-          ${plan.gaps.length > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gaps.length)})</label>`}
+          ${plan.gap_count > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gap_count)})</label>`}
           ${plan.posed > 0 && html`<label class="row"><input type="checkbox" checked=${live} onChange=${() => setLive(!live)} /> Robots and answers, live</label>`}
           ${may("enrol") && html`<${Misleading} map=${map} plan=${plan} found=${misleading} setFound=${setMisleading} />`}
           <${RobotList} robots=${robots} />
@@ -187,7 +187,7 @@ function Legend({ groups, off, setOff }) {
         <label>
           <input type="checkbox" checked=${!off.has(one.name)} onChange=${() => toggle(one.name)} />
           <span class="swatch" style=${{ background: traverseColour(one.name === null ? -1 : number) }}></span>
-          <span class="name" title=${one.name || ""}>${one.name ?? html`<em>no traverse</em>`}</span>
+          <span class="name">${one.name === null ? html`<em>no traverse</em>` : html`<${Name} text=${one.name} />`}</span>
           <span class="faint">${integer(one.places.length)}</span>
         </label>
       `)}
@@ -271,11 +271,29 @@ function useRobots(map, plan, live, drawing) {
   return robots;
 }
 
+const MOST_SILENT = 12;
+
+/** Where robots are now, and apart from them those of which nothing was heard for seconds. */
 function RobotList({ robots }) {
-  if (robots.length === 0) return null;
+  const [heard, silent] = [robots.filter((one) => !one.silent), robots.filter((one) => one.silent)];
   return html`
-    <ul aria-label="Robots">
-      ${robots.map((robot) => html`<li class="spread"><span>${robot.label}</span><span class=${`verdict ${robot.verdict}`}>${robot.verdict}</span></li>`)}
-    </ul>
+    ${heard.length > 0 && html`
+      <ul aria-label="Robots">
+        ${heard.map((one) => html`<li class="robot" key=${one.session}><${RobotName} robot=${one} robots=${robots} /><${Verdict} verdict=${one.verdict} /></li>`)}
+      </ul>
+    `}
+    ${silent.length > 0 && html`
+      <h3>Silent</h3>
+      <ul aria-label="Silent robots" class="faint">
+        ${silent.slice(0, MOST_SILENT).map((one) => html`<li class="robot" key=${one.session}><${RobotName} robot=${one} robots=${robots} /><span class="nowrap">seen ${relative(one.seen)}</span></li>`)}
+      </ul>
+      ${silent.length > MOST_SILENT && html`<p class="faint small">and ${integer(silent.length - MOST_SILENT)} more</p>`}
+    `}
   `;
+}
+
+/** The name of a robot, with the beginning of its session where another one has the same. */
+function RobotName({ robot: { label, session }, robots }) {
+  const twice = robots.filter((one) => one.label === label).length > 1;
+  return html`<span class="who" title=${session}><${Name} text=${label} />${twice && label !== session && html` <code class="small faint nowrap">${session.slice(0, 6)}</code>`}</span>`;
 }

@@ -1,7 +1,7 @@
 // Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
-import { get, getTagged, may, patch, post, save } from "../shared/api.js";
-import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
-import { bytes, counted, decimal, percent } from "../shared/formats.js";
+import { get, getTagged, may, patch, post, remove, save } from "../shared/api.js";
+import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
+import { bytes, counted, decimal, integer, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource } from "../shared/resource.js";
@@ -10,6 +10,7 @@ import { html, useEffect, useRef, useState } from "../shared/view.js";
 
 const PAGE = 30;
 const REGRET = 8000;
+const LOOKS_EVERY = 5000;
 
 export default function Review({ map }) {
   const about = useResource((signal) => getTagged(mapPath(map), {}, signal), [map]);
@@ -41,32 +42,75 @@ export default function Review({ map }) {
   `;
 }
 
+/** The frames of a listing that stay where they are while others come: newer ones wait until they are asked for.
+ *
+ * Returns {items, fresh, adopt}: the frames, how many newer ones wait, and a function that shows them.
+ */
+function usePinned(page, place) {
+  const [pinned, setPinned] = useState({ place: null, items: [] });
+  const told = page.data?.items;
+  const settled = pinned.place === place;
+  useEffect(() => {
+    if (told) setPinned((old) => ({ place, items: old.place === place ? joined(old.items, told) : told }));
+  }, [told, place]);
+  const items = settled ? pinned.items : told || [];
+  const adopt = () => setPinned({ place, items: told });
+  return { items, fresh: (told || []).filter((one) => !(one.id <= (items[0]?.id ?? 0))).length, adopt };
+}
+
+/** Frames as they are now, with older ones that moved up behind them. */
+function joined(items, told) {
+  const now = new Map(told.map((one) => [one.id, one]));
+  const last = items.at(-1)?.id ?? 0;
+  return [...items.map((one) => now.get(one.id) || one), ...told.filter((one) => one.id < last)];
+}
+
 function Frames({ map, labelled, keeps }) {
   const [cursors, setCursors] = useState([""]);
   const cursor = cursors.at(-1);
-  const page = useResource((signal) => get(mapPath(map, "review"), { labelled, limit: PAGE, cursor }, { signal }), [map, labelled, cursor], { every: 15_000 });
+  const page = useResource((signal) => get(mapPath(map, "review"), { labelled, limit: PAGE, cursor }, { signal }), [map, labelled, cursor], { every: LOOKS_EVERY });
+  const pinned = usePinned(page, cursor);
   const [done, setDone] = useState(new Map());
   const [open, setOpen] = useState(null);
   const discards = useDiscards(map, setDone);
-  const items = (page.data?.items || []).filter((one) => done.get(one.id) !== "gone");
+  const items = pinned.items.filter((one) => done.get(one.id) !== "gone");
   const current = items.find((one) => one.id === open) || items[0];
+  const fresh = cursors.length === 1 ? pinned.fresh : 0;
+  const goOn = (frame) => {
+    const next = items[items.indexOf(frame) + 1];
+    setOpen(next ? next.id : null);
+  };
+  const bringBack = (id) => {
+    setDone((old) => new Map([...old].filter(([one]) => one !== id)));
+    setOpen(id);
+  };
   const label = async (frame, body) => {
     const told = await post(mapPath(map, "review", String(frame.id)), body);
-    const next = items[items.indexOf(frame) + 1];
     if (!labelled) setDone((old) => new Map(old).set(frame.id, "gone"));
-    setOpen(next ? next.id : null);
-    say(labelText(told.frame.label));
+    goOn(frame);
+    const undo = async () => {
+      await takeBack(map, frame, told).catch(complain);
+      bringBack(frame.id);
+      page.reload();
+    };
+    say(labelText(told.frame.label), frame.label?.new ? undefined : undo);
     page.reload();
   };
   const discard = (frame) => {
-    const next = items[items.indexOf(frame) + 1];
-    setOpen(next ? next.id : null);
-    discards.put(frame.id);
+    goOn(frame);
+    discards.put(frame.id, () => setOpen(frame.id));
+  };
+  const showFresh = () => {
+    setOpen(page.data.items[0]?.id ?? null);
+    pinned.adopt();
   };
   return html`
     <${Shown} resource=${page}>
       ${({ frames, bytes: size, next_cursor: next }) => html`
-        <p class="faint">${counted(frames, "frame")}, ${bytes(size)}.</p>
+        <div class="row">
+          <p class="faint">${counted(frames, "frame")}, ${bytes(size)}.</p>
+          ${fresh > 0 && html`<button type="button" class="small" onClick=${showFresh}>Show ${fresh === PAGE ? `${PAGE} or more` : integer(fresh)} new</button>`}
+        </div>
         ${items.length === 0
           ? html`<${Nothing} title=${labelled ? "No labels yet" : "Nothing to be looked at"}>${!labelled && keeps && "Frames appear here as they are answered with the chosen verdicts."}<//>`
           : html`
@@ -83,6 +127,18 @@ function Frames({ map, labelled, keeps }) {
   `;
 }
 
+const SAME_MOMENT = 60_000;
+
+/** Undo a label: the one before is given again; a place that came into the map with it goes. */
+async function takeBack(map, frame, { frame: labelled, enrolled }) {
+  const before = frame.label;
+  const body = before?.place ? { place: before.place } : before?.stranger ? { stranger: true } : { clear: true };
+  await post(mapPath(map, "review", String(frame.id)), body);
+  if (enrolled && new Date(labelled.labelled_at) - new Date(enrolled.created_at) < SAME_MOMENT) {
+    await remove(mapPath(map, "places", enrolled.id));
+  }
+}
+
 /** Frames to throw away: they go after a while in which it can be undone, or when the view is left. */
 function useDiscards(map, setDone) {
   const waiting = useRef(new Map());
@@ -92,7 +148,7 @@ function useDiscards(map, setDone) {
     post(mapPath(map, "review", String(id)), { discard: true }).catch(complain);
   };
   useEffect(() => () => [...waiting.current.keys()].forEach(send), []);
-  const put = (id) => {
+  const put = (id, cameBack) => {
     setDone((old) => new Map(old).set(id, "gone"));
     waiting.current.set(id, setTimeout(() => send(id), REGRET));
     say("The frame is thrown away.", () => {
@@ -100,6 +156,7 @@ function useDiscards(map, setDone) {
       clearTimeout(waiting.current.get(id));
       waiting.current.delete(id);
       setDone((old) => new Map([...old].filter(([one]) => one !== id)));
+      cameBack();
       return undefined;
     });
   };
@@ -138,6 +195,9 @@ function Labelling({ map, frame, label, discard }) {
     await label(frame, body).catch(complain);
     setBusy(false);
   };
+  // The next frame takes the place of this one: the second click of a double click is not meant for it.
+  const clicked = (body) => (event) => event.detail < 2 && send(body);
+  useNumbers(busy || dialog !== null, (number) => candidates[number - 1] && send({ place: candidates[number - 1] }));
   return html`
     <section class="panel" aria-label="Frame to be labelled">
       <div class="spread">
@@ -148,21 +208,21 @@ function Labelling({ map, frame, label, discard }) {
         <${Kept} map=${map} frame=${frame} />
         ${against ? html`<${Thumbnail} map=${map} place=${against} />` : html`<span class="picture"><span class="faint">no match</span></span>`}
       </div>
-      <h2>Which place is it?</h2>
+      <div class="spread"><h2>Which place is it?</h2><span class="faint small">The number keys choose a candidate.</span></div>
       <ol class="matches">
-        ${answer.matches.map((one) => html`
+        ${answer.matches.map((one, number) => html`
           <li class=${one.place === against ? "thumb chosen" : "thumb"} key=${one.place}>
             <button type="button" class="cover" aria-pressed=${one.place === against} aria-label=${`Compare with ${one.place}`} onClick=${() => setAgainst(one.place)}><${Thumbnail} map=${map} place=${one.place} /></button>
-            <span class="under small"><a class="name" href=${href("maps", map, "places", one.place)}>${one.place}</a><span>${decimal(one.score)}</span></span>
-            <button type="button" class="small" disabled=${busy} onClick=${() => send({ place: one.place })}>It is ${one.place}</button>
+            <span class="under small"><a class="name" href=${href("maps", map, "places", one.place)}><${Name} text=${one.place} among=${candidates} /></a><span>${decimal(one.score)}</span></span>
+            <button type="button" class="small narrow" disabled=${busy} aria-keyshortcuts=${number + 1} onClick=${clicked({ place: one.place })}><kbd aria-hidden="true">${number + 1}</kbd> It is <${Name} text=${one.place} among=${candidates} /></button>
           </li>
         `)}
       </ol>
       <div class="row">
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Other} close=${() => setDialog(null)} send=${(place) => label(frame, { place })} />`)}>Another place …</button>
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Enrol} frame=${frame} close=${() => setDialog(null)} send=${(fields) => label(frame, { new: fields })} />`)}>Enrol it …</button>
-        <button type="button" disabled=${busy} onClick=${() => send({ stranger: true })}>No place of this map</button>
-        <button type="button" class="danger" disabled=${busy} onClick=${() => discard(frame)}>Throw away</button>
+        <button type="button" disabled=${busy} onClick=${clicked({ stranger: true })}>No place of this map</button>
+        <button type="button" class="danger" disabled=${busy} onClick=${(event) => event.detail < 2 && discard(frame)}>Throw away</button>
       </div>
       <${Facts} rows=${[
         ["Asked", html`<${ExactMoment} at=${frame.at} />`],
@@ -177,6 +237,21 @@ function Labelling({ map, frame, label, discard }) {
       ${dialog}
     </section>
   `;
+}
+
+/** Call a function with the number whose key is pressed, unless somebody writes or a dialog is open. */
+function useNumbers(held, call) {
+  const latest = useRef(null);
+  latest.current = held ? null : call;
+  useEffect(() => {
+    const typed = (event) => {
+      if (event.repeat || event.ctrlKey || event.metaKey || event.altKey || !/^[1-9]$/.test(event.key)) return;
+      if (event.target.closest("input, select, textarea, dialog")) return;
+      latest.current?.(Number(event.key));
+    };
+    addEventListener("keydown", typed);
+    return () => removeEventListener("keydown", typed);
+  }, []);
 }
 
 function Other({ close, send }) {

@@ -1,7 +1,7 @@
 // The traverses of a map, and two of them compared: how alike all their frames look, the path that alignment finds, and
 // the truth where poses give it.
 import { get, may, post, remove, send } from "../shared/api.js";
-import { ByName, Facts, Field, Head, Loading, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
+import { ByName, Facts, Field, FormDialog, Head, Loading, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
 import { decimal, integer, milliseconds } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -73,7 +73,12 @@ function Compare({ map, items, query }) {
       ${names.map((one) => html`<option value=${one}>${one}</option>`)}
     </select>
   `;
-  const align = (dry) => post(mapPath(map, "align"), { sequence: asked, with: [reference], dry_run: dry }).then(setJob, (error) => setJob({ error }));
+  const [dialog, setDialog] = useState(null);
+  const close = () => setDialog(null);
+  const submit = (order) => post(mapPath(map, "align"), { sequence: asked, ...order }).then(setJob, (error) => setJob({ error }));
+  const undo = () => submit({ with: [] });
+  const ask = () => setDialog(html`<${Align} names=${[asked, reference]} close=${close} send=${(poses) => submit({ with: [reference], poses })} />`);
+  const askBack = () => setDialog(html`<${Undo} name=${asked} close=${close} send=${undo} />`);
   return html`
     <section class="stack" aria-label="Comparison">
       <div class="filters">
@@ -81,18 +86,39 @@ function Compare({ map, items, query }) {
         <${Field} label="against">${choice("reference", reference)}<//>
         ${compared.data && html`<${Pill} tone=${compared.data.aligned ? "good" : ""}>${compared.data.aligned ? "aligned" : "not aligned"}<//>`}
         ${may("enrol") && html`
-          <button type="button" onClick=${() => align(true)}>Preview alignment</button>
-          <button type="button" onClick=${() => align(false)}>Align</button>
+          <button type="button" onClick=${() => submit({ with: [reference], dry_run: true })}>Preview alignment</button>
+          <button type="button" onClick=${ask}>Align …</button>
+          ${compared.data?.aligned && html`<button type="button" onClick=${askBack}>Undo the alignment …</button>`}
         `}
       </div>
       ${job?.error && html`<${Trouble} error=${job.error} />`}
-      ${job?.id && html`<section class="panel"><${Alignment} key=${job.id} job=${job} changed=${compared.reload} /></section>`}
+      ${job?.id && html`<section class="panel"><${Alignment} key=${job.id} job=${job} changed=${compared.reload} undo=${undo} /></section>`}
       ${scores.loading && html`<${Loading} what="Comparing all frames" />`}
       ${there && compared.loading && html`<${Loading} what="Looking for a path" />`}
       ${scores.error && html`<${Trouble} error=${scores.error} again=${scores.reload} />`}
       ${compared.error && html`<${Trouble} error=${compared.error} again=${compared.reload} />`}
       ${there && html`<${Comparison} key=${`${asked}/${reference}`} map=${map} data=${{ ...scores.data, ...compared.data }} />`}
+      ${dialog}
     </section>
+  `;
+}
+
+/** Before frames become the same places: what that changes. */
+function Align({ names: [name, other], close, send }) {
+  const [poses, setPoses] = useState(true);
+  return html`
+    <${FormDialog} title=${`Align ${name} with ${other}`} action="Align" close=${close} send=${() => send(poses)}>
+      <p>Frames of both that show the same become one place: for verdicts, sessions, calibration, health and pruning. What an earlier alignment of them stored gives way. It can be undone here.</p>
+      <label class="field check"><input type="checkbox" checked=${poses} onChange=${() => setPoses(!poses)} /><span>Frames without a pose get that of their counterpart</span></label>
+    <//>
+  `;
+}
+
+function Undo({ name, close, send }) {
+  return html`
+    <${FormDialog} title=${`Undo the alignment of ${name}`} action="Undo the alignment" close=${close} send=${send}>
+      <p>Its frames are places of their own again, whichever traverses it was aligned with, and poses that were handed over are taken back.</p>
+    <//>
   `;
 }
 
@@ -115,17 +141,22 @@ async function readScores(map, query, reference, signal) {
   };
 }
 
-function Alignment({ job, changed }) {
+function Alignment({ job, changed, undo }) {
   const [result, setResult] = useState(null);
   const ended = (told) => {
     setResult(told.result);
-    if (told.state === "succeeded" && told.result?.stored) changed();
+    if (told.state !== "succeeded" || !told.result?.stored) return;
+    changed();
+    if (!back) say(`${told.result.sequence} was aligned.`, undo);
   };
+  const back = job.arguments.with?.length === 0;
+  const what = back ? "Undoing the alignment" : job.arguments.dry_run ? "Alignment, a dry run" : "Alignment";
   return html`
-    <${JobProgress} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Alignment, a dry run" : "Alignment"} />
+    <${JobProgress} job=${job} onEnd=${ended} what=${what} />
     ${result && html`<${Facts} rows=${[
-      ["Frames with a counterpart", `${integer(result.paired)} of ${integer(result.frames)}`],
-      ["Poses handed over", integer(result.poses_handed_over)],
+      !back && ["Frames with a counterpart", `${integer(result.paired)} of ${integer(result.frames)}`],
+      !back && ["Poses handed over", integer(result.poses_handed_over)],
+      result.poses_taken_back > 0 && ["Poses taken back", integer(result.poses_taken_back)],
       ["Stored", result.stored ? "yes" : "no, a dry run"],
     ]} />`}
   `;
@@ -163,6 +194,7 @@ function Comparison({ map, data }) {
             ["Scores", `${decimal(data.scale.low)} to ${decimal(data.scale.high)}`],
             ["Stretches found", integer(data.stretches.length)],
             data.truth && ["On the truth", truthText(data)],
+            data.milliseconds && !data.truth && ["Truth", "none: their frames have no poses of their own"],
             data.milliseconds && ["Took", milliseconds(data.milliseconds.total)],
           ]} />
         </section>

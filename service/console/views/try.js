@@ -11,7 +11,7 @@ import { html, useEffect, useRef, useState } from "../shared/view.js";
 const MOST = 100;
 
 export default function Try({ map }) {
-  const [options, setOptions] = useState({ k: 5, verify: "auto", camera: "", sequences: "" });
+  const [options, setOptions] = useState({ k: 5, verify: "auto", camera: "", sequences: "", given: {} });
   const [asked, setAsked] = useState([]);
   const [shown, setShown] = useState(null);
   const number = useRef(0);
@@ -29,7 +29,11 @@ export default function Try({ map }) {
   useEffect(() => () => forget(new Set()), []);
   useEffect(() => {
     if (handedOver.value) {
-      ask([handedOver.value]);
+      const { file, question } = handedOver.value;
+      const { k = 5, verify = "auto", camera = "", ...others } = question;
+      present.current = { k, verify, camera, sequences: "", given: others };
+      setOptions(present.current);
+      ask([file]);
       handedOver.value = null;
     }
   }, []);
@@ -57,6 +61,7 @@ export default function Try({ map }) {
     <div class="columns try">
       <section class="panel" aria-label="Frames"><${Source} ask=${ask} /></section>
       <section class="panel" aria-label="Options">
+        <${Again} given=${options.given} drop=${() => setOptions({ ...options, given: {} })} />
         <${Options} map=${map} options=${options} change=${(changes) => setOptions({ ...options, ...changes })} />
         <${AsCode} map=${map} options=${options} frame=${current?.frame} name=${current?.name} />
       </section>
@@ -68,9 +73,8 @@ export default function Try({ map }) {
   `;
 }
 
-async function query(map, frame, { k, verify, camera, sequences }) {
-  const told = sequences ? JSON.stringify([sequences]) : "";
-  const parameters = { k, verify, camera, sequences: told, explain: true };
+async function query(map, frame, options) {
+  const parameters = given(options);
   const headers = { "Content-Type": frame.type };
   return (await send("POST", mapPath(map, "query"), { query: parameters, body: frame.blob, headers })).json();
 }
@@ -79,19 +83,24 @@ function Source({ ask }) {
   const [over, setOver] = useState(false);
   const [webcam, setWebcam] = useState(false);
   const input = useRef(null);
-  const dropped = (event) => {
-    event.preventDefault();
-    setOver(false);
-    ask([...event.dataTransfer.files]);
-  };
-  const dragged = (event) => {
-    event.preventDefault();
-    setOver(true);
-  };
+  const latest = useRef(ask);
+  latest.current = ask;
+  useEffect(() => {
+    const controller = new AbortController();
+    const on = (kind, call) => addEventListener(kind, call, { signal: controller.signal });
+    on("dragover", (event) => event.dataTransfer?.types.includes("Files") && setOver(true));
+    on("dragleave", (event) => event.relatedTarget === null && setOver(false));
+    on("drop", (event) => {
+      setOver(false);
+      const files = [...(event.dataTransfer?.files || [])];
+      if (files.length > 0 && !event.target.closest?.("input")) latest.current(files);
+    });
+    return () => controller.abort();
+  }, []);
   if (webcam) return html`<${Webcam} ask=${ask} close=${() => setWebcam(false)} />`;
   return html`
-    <div class=${over ? "drop over" : "drop"} onDragOver=${dragged} onDragLeave=${() => setOver(false)} onDrop=${dropped}>
-      <p><strong>Drop pictures here</strong></p>
+    <div class=${over ? "drop over" : "drop"}>
+      <p><strong>Drop pictures here</strong> <span class="faint">or beside</span></p>
       <div class="row">
         <button type="button" class="primary" onClick=${() => input.current.click()}>Choose pictures</button>
         <button type="button" onClick=${() => setWebcam(true)}>Use the webcam</button>
@@ -157,6 +166,18 @@ function Webcam({ ask, close }) {
   `;
 }
 
+/** The filters of a question that is asked again; they hold until they are dropped. */
+function Again({ given: others, drop }) {
+  const names = Object.keys(others);
+  if (names.length === 0) return null;
+  return html`
+    <div class="notice spread" role="group" aria-label="Filters of the question">
+      <span>As it was asked: ${names.map((name, one) => html`${one > 0 && ", "}<code>${name} = ${String(others[name])}</code>`)}</span>
+      <button type="button" class="small" onClick=${drop}>Drop them</button>
+    </div>
+  `;
+}
+
 function Options({ map, options, change }) {
   const cameras = useResource((signal) => get(mapPath(map, "cameras"), {}, { signal }), [map]);
   const sequences = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
@@ -199,8 +220,9 @@ function quoted(text) {
   return `'${text.replaceAll("'", "'\\''")}'`;
 }
 
-function given({ k, verify, camera, sequences }) {
-  const parameters = { k: String(k), explain: "true" };
+/** The parameters of a query: those of another one that is asked again, and what was chosen here. */
+function given({ k, verify, camera, sequences, given: others }) {
+  const parameters = { ...Object.fromEntries(Object.entries(others).map(([name, value]) => [name, String(value)])), k: String(k), explain: "true" };
   if (verify !== "auto") parameters.verify = verify;
   if (camera) parameters.camera = camera;
   if (sequences) parameters.sequences = JSON.stringify([sequences]);
@@ -218,8 +240,9 @@ function curl(map, options, frame, name) {
 
 function python(map, options, name) {
   const { explain, k, sequences, ...others } = given(options);
-  const named = [`k=${k}`, "explain=True", ...Object.entries(others).map(([one, value]) => `${one}=${JSON.stringify(value)}`)];
-  if (sequences) named.push(`sequences=${JSON.stringify(JSON.parse(sequences))}`);
+  const literal = (value) => (/^-?\d+(\.\d+)?$/.test(value) ? value : JSON.stringify(value));
+  const named = [`k=${k}`, "explain=True", ...Object.entries(others).map(([one, value]) => `${one}=${literal(value)}`)];
+  if (sequences) named.push(`sequences=${sequences.startsWith("[") ? sequences : JSON.stringify(sequences.split(","))}`);
   const credentials = key.value ? ', key=os.environ["PLACEREC_KEY"]' : "";
   return [
     ...(key.value ? ["import os", ""] : []),

@@ -58,6 +58,11 @@ class Operator:
         self.page.locator(f"main .view{path} h1").wait_for()
         expect(self.page.locator("main .loading")).to_have_count(0)
 
+    def manage(self, map_id: str, action: str) -> None:
+        """Choose an action, such as ``Edit``, from the menu of a map in the list."""
+        self.page.get_by_role("button", name=f"Actions for {map_id}", exact=True).click()
+        self.page.get_by_role("button", name=f"{action} {map_id}", exact=True).click()
+
     def foresee(self, *texts: str) -> None:
         """Complaints that contain one of these are part of the test."""
         self.foreseen += texts
@@ -88,7 +93,8 @@ def browser() -> Iterator[Browser]:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
     expect.set_options(timeout=PATIENCE)
     with sync_playwright() as playwright:
-        options = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+        options = ["--host-resolver-rules=MAP console.test 127.0.0.1"]
+        options += ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
         running = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
         yield running
         running.close()

@@ -16,6 +16,7 @@ from tests.service.console.conftest import Operator, Visit
 from tests.service.console.world import LAB, frame
 from tests.service.map_jobs import wait_until
 from tests.service.server import Server
+from tests.service.wire import eventually
 
 
 @pytest.mark.thorough
@@ -135,6 +136,88 @@ def test_a_key_is_requested_and_a_wrong_one_refused(visit: Visit, keyed: Server,
     page.get_by_role("button", name="Change key").click()
     page.get_by_role("button", name="Forget the key").click()
     page.get_by_text("The service asks for a key.").wait_for()
+
+
+def test_a_mistyped_key_leaves_the_present_one(admin: Operator) -> None:
+    admin.foresee("401")
+    page = admin.go("maps")
+    page.get_by_role("button", name="Change key").click()
+    dialog = page.get_by_role("dialog")
+    wrong = "placerec_000000000000_" + "x" * 43
+    dialog.get_by_label("Key").fill(wrong)
+    dialog.get_by_role("button", name="Use the key").click()
+    dialog.get_by_role("alert").get_by_text("The key is not valid").wait_for()
+    expect(dialog.get_by_label("Key")).to_have_value(wrong)
+    page.keyboard.press("Escape")
+    expect(page.locator(".identity")).to_contain_text("admin-key")
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("heading", name="Jobs").wait_for()
+
+
+def test_a_second_tab_has_the_key_until_it_is_forgotten(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
+    operator = visit(None)
+    operator.foresee("401")
+    page = operator.page
+    page.goto(f"{operator.root}/console#/maps")
+    page.get_by_label("Key").fill(keys["query"])
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("link", name=LAB, exact=True).wait_for()
+    stored = "JSON.stringify([Object.entries(localStorage), document.cookie])"
+    assert keys["query"] not in page.evaluate(stored)
+    second = page.context.new_page()
+    try:
+        second.goto(f"{operator.root}/console#/maps")
+        second.get_by_role("link", name=LAB, exact=True).wait_for()
+        second.get_by_role("button", name="Change key").click()
+        second.get_by_role("button", name="Forget the key").click()
+        for tab in (second, page):
+            tab.get_by_text("The service asks for a key.").wait_for()
+        second.reload()
+        second.get_by_text("The service asks for a key.").wait_for()
+    finally:
+        second.close()
+
+
+def test_to_open_the_console_without_a_key_is_no_refusal(visit: Visit, keyed: Server, folder: Path) -> None:
+    def refusals() -> int:
+        return (folder / "audit.jsonl").read_text().count('"refused"')
+
+    before = refusals()
+    operator = visit(None)
+    operator.foresee("401")
+    operator.page.goto(f"{operator.root}/console#/maps/{LAB}/plan")
+    operator.page.get_by_text("The service asks for a key.").wait_for()
+    refused = keyed.client.get("/v1/maps", headers={"Authorization": ""})  # which is one, and comes later
+    assert refused.status_code == 401
+    assert eventually(lambda: refusals() > before)
+    assert refusals() == before + 1
+
+
+@pytest.mark.thorough
+def test_a_new_key_is_whole_stays_and_is_copied_over_plain_http(visit: Visit, keyed: Server) -> None:
+    operator = visit("admin", size="phone")
+    operator.root = f"http://console.test:{keyed.port}"  # where a browser gives pages no clipboard
+    operator.foresee("Cross-Origin-Opener-Policy header has been ignored")
+    page = operator.go("keys")
+    assert page.evaluate("navigator.clipboard") is None
+    page.get_by_role("button", name="Create a key").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Name").fill("whole")
+    dialog.get_by_role("button", name="Create").click()
+    shown = page.get_by_label("The key", exact=True)
+    secret = shown.inner_text()
+    assert shown.evaluate("one => one.scrollWidth <= one.clientWidth")
+    for _ in range(3):
+        page.keyboard.press("Escape")
+    expect(shown).to_have_text(secret)
+    dialog.get_by_role("button", name="Copy the key").click()
+    dialog.get_by_role("button", name="Copied").wait_for()
+    dialog.get_by_role("button", name="Done").click()
+    page.get_by_role("button", name="Create a key").click()
+    dialog.get_by_label("Name").press("Control+V")
+    expect(dialog.get_by_label("Name")).to_have_value(secret[:64])
+    page.keyboard.press("Escape")
+    keyed.client.delete(f"/v1/keys/{secret.split('_')[1]}").raise_for_status()
 
 
 def test_what_can_be_no_key_is_not_sent(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:

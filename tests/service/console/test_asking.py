@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shlex
 import subprocess
 from pathlib import Path
+from urllib.parse import parse_qsl, urlsplit
 
 import cv2
 import pytest
@@ -60,6 +62,36 @@ def test_several_pictures_are_queried_one_after_the_other_and_a_bad_one_fails_al
     told = {"known.jpg": "recognized", "foreign.jpg": "ambiguous|unknown", "known.bmp": "recognized"}
     for name, text in (told | {"text.jpg": "Not a picture"}).items():
         expect(rows.filter(has_text=name)).to_contain_text(re.compile(text))
+
+
+DROP = """([selector, base64, name]) => {
+  const bytes = Uint8Array.from(atob(base64), (one) => one.charCodeAt(0));
+  const data = new DataTransfer();
+  data.items.add(new File([bytes], name, { type: "image/jpeg" }));
+  const event = (kind) => new DragEvent(kind, { dataTransfer: data, bubbles: true, cancelable: true });
+  const target = document.querySelector(selector);
+  return ["dragover", "drop"].map((kind) => target.dispatchEvent(event(kind)));
+}"""
+
+
+def test_a_picture_that_is_dropped_beside_the_box_is_asked_and_never_shown_instead(
+    admin: Operator, pictures: Path
+) -> None:
+    file = base64.b64encode((pictures / "known.jpg").read_bytes()).decode()
+    page = admin.go("maps")
+    assert page.evaluate(DROP, ["main", file, "known.jpg"]) == [False, False], "the browser would leave the page"
+    page = admin.go(f"maps/{LAB}/try")
+    assert page.evaluate(DROP, ["h1", file, "known.jpg"]) == [False, False]
+    page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
+
+
+def test_the_stages_of_an_answer_add_up(admin: Operator, pictures: Path) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
+    page.get_by_role("region", name="Answer").wait_for()
+    written = page.locator(".stages .number").all_inner_texts()
+    *stages, total = [float(text.removesuffix(" ms")) for text in written]
+    assert len(stages) > 2 and sum(stages) == pytest.approx(total, abs=0.5 * len(written))
 
 
 def test_the_pictures_of_frames_that_are_cleared_are_given_up(admin: Operator, pictures: Path) -> None:
@@ -119,13 +151,35 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
     lines.first.get_by_text("recognized").wait_for()
     expect(lines.first).to_contain_text(re.compile(r"(mon|tues)day-04"))
-    expect(lines.first).to_contain_text("admin-key")
+    expect(lines.first).to_contain_text(re.compile(r"^\s*\d\d:\d\d:\d\d\s*admin-key"))
     lines.first.get_by_role("img", name="The frame").wait_for()
     lines.first.get_by_role("button", name="Why").click()
     dialog = page.get_by_role("dialog")
     dialog.get_by_text("Decision value").wait_for()
     dialog.get_by_role("button", name=re.compile("Ask again")).click()
     page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
+
+
+def test_a_question_is_asked_again_with_its_filters(admin: Operator, keyed: Server) -> None:
+    page = admin.go(f"maps/{LAB}/live")
+    page.get_by_label("frames as thumbnails").check()
+    page.get_by_text("listening").wait_for()
+    filters = {"sequences": "tuesday", "where": '{"floor": 2}', "x": "0", "y": "0", "radius": "500"}
+    told = keyed.client.post(
+        f"/v1/maps/{LAB}/query", params=filters, content=frame_again(4), headers={"Content-Type": "image/jpeg"}
+    )
+    assert told.status_code == 200
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    lines.first.get_by_role("button", name="Why").click()
+    with page.expect_request(lambda request: request.method == "POST") as asked:
+        page.get_by_role("dialog").get_by_role("button", name=re.compile("Ask again")).click()
+    sent = dict(parse_qsl(urlsplit(asked.value.url).query))
+    assert filters.items() <= {name: value.removesuffix(".0") for name, value in sent.items()}.items()
+    page.get_by_role("group", name="Filters of the question").get_by_text("sequences = tuesday").wait_for()
+    matches = page.get_by_role("region", name="Matches").get_by_role("listitem")
+    expect(matches).to_contain_text(["tuesday-04"] + ["tuesday"] * 4)
+    page.get_by_role("button", name="Drop them").click()
+    expect(page.get_by_label("The same request", exact=True)).not_to_contain_text("sequences")
 
 
 @pytest.mark.thorough
@@ -171,6 +225,37 @@ def test_a_robot_is_drawn_where_its_session_is(admin: Operator, keyed: Server) -
         path = f"/v1/maps/{LAB}/sessions/{session}/frames"
         assert keyed.client.post(path, content=frame, headers={"Content-Type": "image/jpeg"}).status_code == 200
     robots = page.get_by_role("list", name="Robots")
-    robots.get_by_text(session).wait_for()
+    robots.get_by_text("admin-key").wait_for()  # robots are known by their keys
+    expect(robots.get_by_title(session)).to_have_count(1)
     keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")
     robots.wait_for(state="detached")
+
+
+@pytest.mark.thorough
+def test_a_robot_that_is_silent_is_not_shown_as_recognized(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
+    session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]
+    for number in (2, 3, 4):
+        frame = encoded(seen_again(scene(number), seed=90 + number))
+        path = f"/v1/maps/{LAB}/sessions/{session}/frames"
+        assert keyed.client.post(path, content=frame, headers={"Content-Type": "image/jpeg"}).status_code == 200
+    begun_by = []
+    for role in ("enrol", "query"):
+        headers = {"Authorization": f"Bearer {keys[role]}"}
+        (told,) = keyed.client.get(f"/v1/maps/{LAB}/sessions", headers=headers).json()["items"]
+        begun_by.append(told["key"])
+    assert begun_by == ["admin-key", None]
+    operator = visit("admin")
+    page = operator.page
+    page.clock.install()
+    operator.go(f"maps/{LAB}/plan")
+    page.get_by_role("list", name="Robots", exact=True).get_by_text("recognized").wait_for()
+    page.clock.fast_forward("09:30")
+    silent = page.get_by_role("list", name="Silent robots").get_by_role("listitem")
+    expect(silent).to_have_count(1)
+    expect(silent).to_contain_text(re.compile("admin-key.*seen 9 min ago"))
+    expect(silent).not_to_contain_text("recognized")
+    expect(page.get_by_role("list", name="Robots", exact=True)).to_have_count(0)
+    operator.go("jobs")
+    operator.go(f"maps/{LAB}/plan")  # it is silent for who comes later, too
+    expect(silent).to_contain_text(re.compile("admin-key.*seen 9 min ago"))
+    keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")

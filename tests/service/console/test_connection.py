@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import threading
 import time
@@ -155,6 +156,49 @@ def test_live_answers_go_on_after_the_last_one_that_was_heard(
     cable.mend()
     expect(lines.first).to_contain_text("Answers may be missing here")
     expect(lines).to_have_count(4)
+
+
+@pytest.mark.thorough
+def test_a_service_that_hangs_is_noticed_within_ten_seconds(visit: Visit, slow: tuple[Server, str]) -> None:
+    server, key = slow
+    operator = visit(None, server=server)
+    operator.page.add_init_script(given_key(key))
+    operator.foresee("429")
+    page = operator.page
+    page.clock.install()
+    operator.go("maps/lab/live")
+    page.get_by_text("listening").wait_for()
+    lost = page.get_by_text("The connection to the service is lost.")
+    server.process.send_signal(signal.SIGSTOP)  # its connections stay open, and nothing comes
+    try:
+        page.clock.fast_forward(10_000)
+        lost.wait_for()
+        page.get_by_text("connecting").wait_for()
+    finally:
+        server.process.send_signal(signal.SIGCONT)
+    lost.wait_for(state="detached")
+    page.get_by_text("listening").wait_for()
+
+
+@pytest.mark.thorough
+def test_a_view_that_was_not_visited_waits_for_the_service(
+    visit: Visit, slow: tuple[Server, str], cable: Cable
+) -> None:
+    _, key = slow
+    operator = visit(None)
+    operator.root = f"http://127.0.0.1:{cable.port}"
+    operator.page.add_init_script(given_key(key))
+    operator.foresee("ERR_", "429", "Failed to fetch dynamically imported module")
+    page = operator.go("maps")
+    page.evaluate("window.notReloaded = true")
+    cable.cut()
+    page.get_by_role("link", name="Service", exact=True).click()
+    page.get_by_text("The connection to the service is lost.").wait_for()
+    page.get_by_text("It is shown as soon as the service can be reached.").wait_for()
+    expect(page.get_by_role("button", name="Reload the page")).to_have_count(0)
+    cable.mend()
+    page.get_by_text("Encoder's queue").wait_for()
+    assert page.evaluate("window.notReloaded")
 
 
 def test_a_page_of_another_version_asks_to_be_reloaded(visit: Visit) -> None:

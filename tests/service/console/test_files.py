@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import posixpath
 import re
 import tomllib
 from pathlib import Path
@@ -91,6 +92,26 @@ def test_all_of_it_is_small() -> None:
     found = console_files()
     assert sum(len(file.compressed) for file in found.others.values()) + len(found.page.compressed) < 300_000
     assert all(gzip.decompress(file.compressed) == file.content for file in found.others.values())
+
+
+MOST_OF_A_VIEW = 120_000
+"""Compressed bytes that the first view may take."""
+
+
+@pytest.mark.parametrize("view", sorted(path.name for path in (FOLDER / "views").iterdir()))
+def test_a_first_view_is_small(view: str) -> None:
+    found = console_files()
+    named = re.findall(r'(?:src|href)="console/[0-9a-f]+/([^"]*)"', found.page.content.decode())
+    wanted, loaded = [*named, "frame.js", f"views/{view}"], set[str]()
+    while wanted:
+        path = wanted.pop()
+        if path not in loaded:
+            loaded.add(path)
+            imported = re.findall(r'(?:from|^import)\s*"(\.[^"]+)"', found.others[path].content.decode(), re.MULTILINE)
+            wanted += [posixpath.normpath(posixpath.join(posixpath.dirname(path), name)) for name in imported]
+    assert len(loaded) > 15
+    size = len(found.page.compressed) + sum(len(found.others[path].compressed) for path in loaded)
+    assert size <= MOST_OF_A_VIEW
 
 
 def test_the_name_of_the_folder_changes_with_any_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -52,14 +52,14 @@ def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> 
     made = keyed.client.get("/v1/maps/made-here").json()
     assert (made["description"], made["same_place_radius"]) == ("by night", 2.5)
 
-    page.get_by_role("button", name="Edit made-here").click()
+    admin.manage("made-here", "Edit")
     page.get_by_role("dialog").get_by_label("Kept of each frame").select_option("none")
     page.get_by_role("button", name="Save").click()
     page.get_by_role("dialog").wait_for(state="detached")
     edited = keyed.client.get("/v1/maps/made-here").json()
     assert (edited["keep"], edited["description"], edited["revision"]) == ("none", "by night", made["revision"] + 1)
 
-    page.get_by_role("button", name="Delete made-here").click()
+    admin.manage("made-here", "Delete")
     button = page.get_by_role("dialog").get_by_role("button", name="Delete the map")
     expect(button).to_be_disabled()
     page.get_by_role("dialog").get_by_role("textbox").fill("made-her")
@@ -70,10 +70,41 @@ def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> 
     assert keyed.client.get("/v1/maps/made-here").status_code == 404
 
 
+def test_a_map_that_is_gone_is_no_longer_chosen(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("passing")
+    page = admin.go("maps/passing/plan")
+    choice = page.locator(".map-choice select")
+    expect(choice).to_have_value("passing")
+    page.get_by_role("link", name="Maps", exact=True).click()
+    page.get_by_role("link", name="Places", exact=True).wait_for()
+    admin.manage("passing", "Delete")
+    page.get_by_role("dialog").get_by_role("textbox").fill("passing")
+    page.get_by_role("dialog").get_by_role("button", name="Delete the map").click()
+    expect(choice).to_have_value("")
+    expect(choice.get_by_role("option", name="passing")).to_have_count(0)
+    expect(page.get_by_role("link", name="Places", exact=True)).to_have_count(0)
+
+
+@pytest.mark.parametrize("size", ["phone", "laptop"])
+def test_a_long_description_leaves_the_actions_in_view(visit: Visit, keyed: Server, size: str) -> None:
+    name = f"described-{size}"
+    keyed.create_map(name, description="by day and by night, " * 60)
+    operator = visit("admin", size=size)
+    page = operator.go("maps")
+    button = page.get_by_role("button", name=f"Actions for {name}")
+    box = button.bounding_box()
+    assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= page.evaluate("innerWidth")
+    button.click()
+    expect(page.get_by_role("button", name=f"Delete {name}")).to_be_in_viewport(ratio=0.95)
+    page.get_by_role("button", name=f"Delete {name}").click()
+    page.get_by_role("dialog", name=f"Delete {name}").wait_for()
+    keyed.client.delete(f"/v1/maps/{name}")
+
+
 @pytest.mark.thorough
 def test_an_edit_over_another_change_is_refused_and_explained(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go("maps")
-    page.get_by_role("button", name=f"Edit {spare}").click()
+    admin.manage(spare, "Edit")
     page.get_by_role("dialog").get_by_label("Description").fill("mine")
     keyed.client.patch(f"/v1/maps/{spare}", json={"description": "theirs"})
     admin.foresee("412")
@@ -87,7 +118,7 @@ def test_an_edit_over_another_change_is_refused_and_explained(admin: Operator, k
 @pytest.mark.thorough
 def test_a_map_is_exported_and_imported_again(admin: Operator, keyed: Server, spare: str, tmp_path: Path) -> None:
     page = admin.go("maps")
-    page.get_by_role("button", name=f"Export {spare}").click()
+    admin.manage(spare, "Export")
     with page.expect_download() as saved:
         page.get_by_role("dialog").get_by_role("button", name="Export").click()
     file = tmp_path / saved.value.suggested_filename
@@ -134,6 +165,20 @@ def test_places_are_filtered(admin: Operator) -> None:
     page.get_by_label("Taken from (UTC)").fill("2026-11-17T10:00:06")
     page.wait_for_url("**after=**")
     expect(tiles).to_have_count(PLACES - 6)
+
+
+def test_a_number_is_looked_for_as_a_text_where_it_is_one(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("written")
+    for number, floor in enumerate((2, "2")):
+        keyed.enrol("written", f"p{number}", frame(number), metadata={"floor": floor, "house": f"h{number}"})
+    page = admin.go("maps/written/places")
+    tiles = page.get_by_role("list", name="Places").get_by_role("listitem")
+    page.get_by_label("Metadata").fill("floor = 2, house = h1")
+    page.get_by_label("Metadata").press("Enter")
+    page.get_by_text("No place fits the filters.").wait_for()
+    page.get_by_role("button", name='Look for floor = "2", house = h1').click()
+    expect(tiles).to_contain_text(["p1"])
+    expect(page.get_by_label("Metadata")).to_have_value('floor = "2", house = h1')
 
 
 @pytest.mark.thorough

@@ -52,7 +52,7 @@ def hostile(keyed: Server) -> Iterator[str]:
 def test_descriptions(admin: Operator, hostile: str) -> None:
     page = admin.go("maps")
     check_plain(admin)
-    page.get_by_role("button", name=f"Edit {hostile}").click()
+    admin.manage(hostile, "Edit")
     expect(page.get_by_role("dialog").get_by_label("Description")).to_have_value(MARKUP)
 
 
@@ -289,3 +289,24 @@ def test_names_of_sessions_on_the_plan(admin: Operator) -> None:
     page = admin.go(f"maps/{LAB}/plan")
     expect(page.get_by_role("list", name="Robots")).to_contain_text(MARKUP)
     check_plain(admin)
+
+
+def test_texts_turn_nothing_around(admin: Operator, keyed: Server, tmp_path: Path) -> None:
+    """U+202E has what follows read from right to left: by it a text looks like another one. No name may have it."""
+    keyed.create_map("turned", description="\u202ethgin yb")
+    keyed.enrol("turned", "p0", frame(0), metadata={"door": "\u2066b"})
+    (tmp_path / "\u202egpj.1").write_bytes(frame(1))
+    (tmp_path / "2.jpg").write_bytes(frame(2))
+    for view, text in (("maps", "\\u202ethgin yb"), ("maps/turned/places/p0", "\\u2066b")):
+        page = admin.go(view)
+        page.get_by_text(text).first.wait_for(state="attached")
+        assert not re.search("[\u202e\u2066]", page.locator("body").inner_text())
+    page = admin.go("maps/turned/try")
+    page.get_by_label("Pictures").set_input_files([tmp_path / "2.jpg", tmp_path / "\u202egpj.1"])
+    page.get_by_role("button", name="\\u202egpj.1").wait_for()
+    page.get_by_role("region", name="Answer").wait_for()
+    page = admin.go("maps/turned/places/p0")
+    page.get_by_role("button", name="Edit").click()
+    written = page.get_by_role("dialog").get_by_label("Metadata")
+    expect(written).to_have_value(re.compile("\u2066b"))  # what is edited stays what it is
+    keyed.client.delete("/v1/maps/turned")

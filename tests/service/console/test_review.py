@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.service.console import world
-from tests.service.console.conftest import Operator, Visit
+from tests.service.console.conftest import OUT_OF_PANEL, Operator, Visit
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server
 from tests.service.wire import eventually
@@ -89,6 +89,96 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     page.get_by_text("Labelled: no place of this map.").first.wait_for()
     again = keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"]
     assert sum(one["place"] is None for one in again) == 1
+
+
+def test_frames_that_come_wait_until_they_are_wanted(admin: Operator, keyed: Server, doubtful: str) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
+    expect(queue).to_have_count(3)
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    request = panel.locator("code").inner_text()
+    for number in (2, 3):
+        keyed.query(doubtful, world.frame_again(number))
+    wait_for_kept(keyed, doubtful, 5)
+    more = page.get_by_role("button", name="Show 2 new")
+    more.wait_for()
+    expect(queue).to_have_count(3)
+    expect(panel.locator("code")).to_have_text(request)
+    panel.get_by_role("button", name="No place of this map").click()
+    page.get_by_text("Labelled: no place of this map.").wait_for()
+    labelled = keyed.client.get(f"/v1/maps/{doubtful}/review?labelled=true").json()["items"]
+    assert [one["answer"]["request_id"] for one in labelled] == [request], "what was shown was labelled"
+    more.click()
+    expect(queue).to_have_count(4)
+    expect(panel.locator("code")).not_to_have_text(request)
+
+
+def test_a_label_is_given_by_a_number_and_taken_back(admin: Operator, keyed: Server, doubtful: str) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    request = panel.locator("code")
+    first = request.inner_text()
+    second = panel.get_by_role("link").nth(1).inner_text()
+    page.keyboard.press("2")
+    page.get_by_text(f"Labelled as {second}.").wait_for()
+    expect(request).not_to_have_text(first)
+
+    def labels() -> list[str | None]:
+        told = keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"]
+        return [one["place"] for one in told]
+
+    assert labels() == [second]
+    page.get_by_role("button", name="Undo").click()
+    expect(request).to_have_text(first)
+    assert labels() == []
+
+    panel.get_by_role("button", name="Enrol it").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Id").fill("p9")
+    page.keyboard.press("1")  # into the field: nothing is labelled
+    expect(dialog.get_by_label("Id")).to_have_value("p91")
+    dialog.get_by_role("button", name="Enrol").click()
+    page.get_by_text("Enrolled as p91.").wait_for()
+    assert "p91" in keyed.places(doubtful)
+    page.get_by_role("button", name="Undo").click()
+    expect(request).to_have_text(first)
+    assert labels() == [] and "p91" not in keyed.places(doubtful)
+
+
+def test_a_second_click_does_not_label_the_next_frame(admin: Operator, keyed: Server, doubtful: str) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    panel.get_by_role("button", name="No place of this map").dblclick()
+    page.get_by_text("Labelled: no place of this map.").wait_for()
+    expect(page.get_by_role("list", name="Frames").get_by_role("listitem")).to_have_count(2)
+    assert len(keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"]) == 1
+
+
+@pytest.mark.parametrize("size", ["phone", "laptop"])
+def test_long_ids_show_their_ends_and_stay_in_their_cards(visit: Visit, keyed: Server, size: str) -> None:
+    name = f"long-{size}"
+    keyed.create_map(name, review=KEPT)
+    long = "north-wing-second-floor-camera-front-left"
+    for number in range(5):
+        place = f"{long}-{'even' if number % 2 == 0 else 'odd'}-{number // 2:06d}"
+        keyed.enrol(name, place, world.frame(number), sequence="walk", **world.pose_of(number))
+    keyed.query(name, world.frame_again(1))
+    wait_for_kept(keyed, name, 1)
+    page = visit("admin", size=size).go(f"maps/{name}/review")
+    cards = page.locator(".matches > li")
+    expect(cards).to_have_count(5)
+    ends = cards.evaluate_all("""cards => cards.map((card) => {
+      const box = card.getBoundingClientRect();
+      const inside = (one) => one.right <= box.right + 0.5 && one.left >= box.left - 0.5;
+      const ends = [...card.querySelectorAll(".end")];
+      const boxes = [...card.children, ...ends].map((one) => one.getBoundingClientRect());
+      const whole = ends.every((end) => end.scrollWidth <= end.clientWidth);
+      return [ends.map((end) => end.textContent), boxes.every(inside) && whole];
+    })""")
+    distinct = [f"{kind}-{number:06d}" for kind, count in (("even", 3), ("odd", 2)) for number in range(count)]
+    assert sorted(texts for texts, _ in ends) == [[end] * 2 for end in distinct], "what they have not in common"
+    assert all(inside for _, inside in ends)
+    assert page.evaluate(OUT_OF_PANEL) == []
 
 
 @pytest.mark.thorough
@@ -182,7 +272,7 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     dialog.get_by_role("button", name="Delete the places").click()
     prune.get_by_text("Gone").wait_for()
     page = admin.go("maps")
-    page.get_by_role("button", name="Export day").click()
+    admin.manage("day", "Export")
     with page.expect_download() as saved:
         dialog.get_by_role("button", name="Export").click()
     assert Path(saved.value.path()).stat().st_size > 10_000

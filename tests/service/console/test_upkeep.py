@@ -43,6 +43,9 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
     calibrate("Calibrate")
     page.get_by_text("sequence:tuesday").wait_for()
+    listed = admin.go("maps").get_by_role("row").filter(has=page.get_by_role("link", name=yard, exact=True))
+    listed.get_by_text("calibrated", exact=True).wait_for()  # which does not make it good
+    admin.go(f"maps/{yard}/calibration")
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "sequence:tuesday"
 
     page.get_by_role("button", name="Calibrate", exact=True).click()  # which now replaces one of the map's own
@@ -58,6 +61,44 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     dialog.get_by_role("button", name="Give up its own").click()
     page.get_by_text("encoder-default").wait_for()
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
+
+
+def test_a_dry_run_says_what_it_would_store_and_is_stored_by_a_button(admin: Operator, keyed: Server) -> None:
+    world.copy(keyed, "dry")
+    path = "/v1/maps/dry"
+    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.8}}
+    assert keyed.client.post(f"{path}/calibrate", json=order | {"dry_run": True}).status_code == 200
+    page = admin.go("maps/dry/calibration")
+    table = page.get_by_role("table", name="Effect of the change")
+    row = table.get_by_role("row", name=re.compile("^unknown"))
+    first = keyed.client.get(f"{path}/calibration").json()
+    expect(row.get_by_role("cell").nth(1)).to_have_text(str(first["now"]["verdicts"]["unknown"]))
+
+    page.get_by_role("button", name="Calibrate", exact=True).click()  # another dry run, which leaves the map's ETag
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Ask").select_option("map")
+    dialog.get_by_label("Share").fill("0.5")
+    dialog.get_by_role("button", name="Try it").click()
+    page.get_by_text("The dry run is done.").wait_for()
+    state = keyed.client.get(f"{path}/calibration").json()
+    now, proposed = (state[name]["verdicts"]["recognized"] for name in ("now", "proposed"))
+    found = state["measured"]["report"]["calibration"]
+    unknown = state["now"]["verdicts"]["unknown"]
+    assert unknown != first["now"]["verdicts"]["unknown"] and state["revision"] == first["revision"]
+    expect(row.get_by_role("cell").nth(1)).to_have_text(str(unknown))
+    told = page.get_by_role("region", name="Dry run")
+    written = f"{state['calibration']['threshold']:.3f} → {found['threshold']:.3f}".replace("-", "−")
+    expect(told).to_contain_text(written)
+    expect(told).to_contain_text(f"recognized {now} → {proposed} of the")
+    assert keyed.client.get(path).json()["calibration"]["source"] == "encoder-default"
+
+    told.get_by_role("button", name="Store it").click()
+    dialog.get_by_role("button", name="Store the calibration").click()
+    told.wait_for(state="detached")
+    assert keyed.client.get(path).json()["calibration"] == found
+    page.get_by_role("status").get_by_role("button", name="Undo").click()
+    page.get_by_text("encoder-default").wait_for()
+    assert keyed.client.get(path).json()["calibration"]["source"] == "encoder-default"
 
 
 @pytest.mark.thorough
@@ -129,10 +170,42 @@ def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yar
     pair.get_by_role("link", name="tuesday-03").wait_for()
     page.get_by_role("button", name="Preview alignment").click()
     page.get_by_text("no, a dry run").wait_for()
-    page.get_by_role("button", name="Align", exact=True).click()
+    aligned = f"/v1/maps/{yard}/similarity?query=tuesday&reference=monday"
+    page.get_by_role("button", name="Align …", exact=True).click()
+    assert not keyed.client.get(aligned).json()["aligned"], "it asks first"
+    page.get_by_role("dialog").get_by_role("button", name="Align").click()
     page.get_by_text("aligned", exact=True).wait_for()
     page.get_by_label("as aligned").check()
-    assert keyed.client.get(f"/v1/maps/{yard}/similarity?query=tuesday&reference=monday").json()["aligned"]
+    assert keyed.client.get(aligned).json()["aligned"]
+    page.get_by_role("button", name="Undo the alignment …").click()
+    page.get_by_role("dialog").get_by_role("button", name="Undo the alignment").click()
+    page.get_by_text("not aligned").wait_for()
+    assert not keyed.client.get(aligned).json()["aligned"]
+
+
+@pytest.mark.thorough
+def test_an_alignment_does_not_prove_itself(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("handed")
+    for number in range(world.PLACES):
+        for name, data, pose in (
+            ("monday", world.frame(number), world.pose_of(number)),
+            ("tuesday", world.frame_again(number), {}),
+        ):
+            keyed.enrol("handed", f"{name}-{number:02d}", data, sequence=name, **pose)
+    page = admin.go("maps/handed/traverses")
+    page.get_by_text("none: their frames have no poses of their own").wait_for()
+    page.get_by_role("button", name="Align …", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Align").click()
+    page.get_by_text("tuesday was aligned.").wait_for()
+    place = "/v1/maps/handed/places/tuesday-03"
+    assert keyed.client.get(place).json()["pose_of"] == "monday-03"
+    page.get_by_text("aligned", exact=True).wait_for()
+    admin.settle()
+    page.get_by_text("none: their frames have no poses of their own").wait_for()
+    expect(page.get_by_text("within 3 frames")).to_have_count(0)
+    page.get_by_role("status").get_by_role("button", name="Undo").click()
+    page.get_by_text("not aligned").wait_for()
+    assert keyed.client.get(place).json()["pose_of"] is None
 
 
 def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> None:
@@ -170,6 +243,28 @@ def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> 
 
 
 @pytest.mark.thorough
+def test_health_advises_to_align_a_second_drive_and_counts_what_it_leaves_out(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("street")
+    for number in range(world.PLACES):
+        for name, data in (("monday", world.frame(number)), ("tuesday", world.frame_again(number))):
+            keyed.enrol("street", f"{name}-{number:02d}", data, sequence=name)
+    keyed.query("street", world.frame_again(0))
+    page = admin.go("maps/street/health")
+    told = page.get_by_role("region", name="One route")
+    expect(told).to_contain_text("tuesday and monday seem to be one route")
+    page.get_by_text("That says nothing yet: after 1 query, of 72 that it takes.").wait_for()
+    for _ in range(71):
+        keyed.query("street", world.frame_again(0))
+    page.get_by_role("button", name="Examine again").click()
+    silent = page.locator("section").filter(has=page.get_by_role("heading", name="Never matched"))
+    count = keyed.client.get("/v1/maps/street/health").json()["never_matched"]["count"]
+    assert count > 20  # more than the report lists
+    silent.get_by_text(f"and {count - 8} more").wait_for()
+    told.get_by_role("link", name="Compare and align them").click()
+    page.wait_for_url("**/traverses?query=tuesday&reference=monday")
+
+
+@pytest.mark.thorough
 def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -> None:
     for name, numbers in (("target", (0, 1)), ("source", (2, 3))):
         keyed.create_map(name)
@@ -184,3 +279,17 @@ def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -
     page.get_by_role("dialog").get_by_role("button", name="Copy the places").click()
     merge.get_by_text("Came").wait_for()
     assert keyed.places("target").keys() == {"target-0", "target-1", "source-2", "source-3"}
+
+
+def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin: Operator, keyed: Server) -> None:
+    for name, pose in (("metric", {"x": 1, "y": 2}), ("geographic", {"latitude": 48.1, "longitude": 11.5})):
+        keyed.create_map(name)
+        assert keyed.enrol(name, f"{name}-0", world.frame(len(name)), sequence=name, **pose).status_code == 201
+    page = admin.go("maps/metric/health")
+    merge = page.get_by_role("region", name="Merge")
+    merge.get_by_label("From").select_option("geographic")
+    merge.get_by_role("button", name="Preview the merge").click()
+    warning = "The poses of geographic are geographic, those of metric metric"
+    merge.get_by_text(warning).wait_for()
+    merge.get_by_role("button", name="Copy 1 places").click()
+    page.get_by_role("dialog").get_by_text(warning).wait_for()

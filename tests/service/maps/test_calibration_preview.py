@@ -76,6 +76,24 @@ def test_a_threshold_is_previewed_and_applied(server: Server, previewed: str) ->
     server.client.patch(path, json={"calibration": None})
 
 
+@pytest.mark.thorough
+def test_what_a_dry_run_found_is_stored_unless_it_was_measured_again(server: Server, previewed: str) -> None:
+    path = f"/v1/maps/{previewed}"
+    report = server.client.post(f"{path}/calibrate", json=ORDER | {"dry_run": True}).json()
+    first = state_of(server, previewed)
+    server.client.post(f"{path}/calibrate", json=ORDER | {"dry_run": True})
+    again = state_of(server, previewed)
+    assert again["proposed"]["threshold"] == report["calibration"]["threshold"]
+    stale = {"calibration": {"measured_at": first["measured"]["at"]}}
+    assert_problem(server.client.patch(path, json=stale), 412, "revision-mismatch")
+    both = {"calibration": {"measured_at": again["measured"]["at"], "threshold": 0.1}}
+    assert_problem(server.client.patch(path, json=both), 422, "invalid-request")
+    stored = server.client.patch(path, json={"calibration": {"measured_at": again["measured"]["at"]}})
+    assert stored.status_code == 200 and stored.json()["calibration"] == report["calibration"]
+    assert state_of(server, previewed)["now"] == again["proposed"]
+    server.client.patch(path, json={"calibration": None})
+
+
 def test_what_does_not_fit_is_refused(server: Server, previewed: str) -> None:
     for parameters in ({"threshold": "nan"}, {"threshold": "x"}, {"margin": "-1"}, {"margin": "inf"}, {"k": "1"}):
         response = server.client.get(f"/v1/maps/{previewed}/calibration", params=parameters)

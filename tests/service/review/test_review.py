@@ -148,6 +148,9 @@ def test_frames_are_labelled_enrolled_and_thrown_away(reviewed: Server, lab: str
     assert made["enrolled"]["pose"]["x"] == 50 and reviewed.places(lab)["fresh"]["metadata"] == {"by": "hand"}
     assert label(reviewed, lab, ids[1], new={"id": "fresh", "x": 50.0, "y": 1.0})["enrolled"]["id"] == "fresh"
     assert label(reviewed, lab, ids[2], stranger=True)["frame"]["label"]["stranger"]
+    assert label(reviewed, lab, ids[3], place="p1")["frame"]["label"]["place"] == "p1"
+    cleared = label(reviewed, lab, ids[3], clear=True)["frame"]
+    assert (cleared["label"], cleared["labelled_at"], cleared["labelled_by"]) == (None, None, None)
     assert label(reviewed, lab, ids[3], discard=True) == {
         "id": ids[3], "discarded": True, "frame": None, "enrolled": None,
     }  # fmt: skip
@@ -194,7 +197,8 @@ def test_bad_labels_are_refused_and_change_nothing(reviewed: Server, lab: str) -
     (frame,) = kept(reviewed, lab, 1)
     there = f"/v1/maps/{lab}/review/{frame['id']}"
     post = reviewed.client.post
-    for bad in ({}, {"place": "p1", "stranger": True}, {"stranger": False}, {"place": None}, {"discard": 1}, {"x": 1}):
+    two = ({"place": "p1", "stranger": True}, {"clear": True, "stranger": True})
+    for bad in ({}, *two, {"stranger": False}, {"place": None}, {"discard": 1}, {"x": 1}):
         assert_problem(post(there, json=bad), 422, "invalid-request")
     assert_problem(post(there, json={"place": "nowhere"}), 404, "unknown-place")
     assert_problem(post(there, json={"place": "../x"}), 422, "invalid-identifier")

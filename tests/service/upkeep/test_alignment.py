@@ -302,6 +302,8 @@ def test_aligning_over_http(server: Server) -> None:
     there = places(server, "aligned")
     assert there["t4"]["pose_of"] == "m6" and there["t4"]["pose"] == there["m6"]["pose"]
     assert there["m6"]["pose_of"] is None
+    about = server.client.get("/v1/maps/aligned/similarity?query=tuesday&reference=monday").json()
+    assert about["aligned"] and about["truth"] is None, "an alignment does not prove itself"
 
 
 @pytest.mark.thorough
@@ -321,12 +323,15 @@ def test_enrolling_with_alignment(server: Server) -> None:
     assert wednesday["problem"]["type"].endswith("too-few-frames")
     assert places(server, "joined")["t4"]["pose_of"] == "m4"
 
+    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.7}}
+    handed = server.client.post("/v1/maps/joined/calibrate", json=order | {"dry_run": True}).json()
+    assert any("an alignment alone" in warning for warning in handed["warnings"])
     again = finished(server, asked(server, "joined", "align", sequence="tuesday", poses=False))
     assert again["result"]["poses_taken_back"] == tuesday["paired"]
-    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.7}}
     calibrated = server.client.post("/v1/maps/joined/calibrate", json=order)
     assert calibrated.status_code == 200, calibrated.text
     assert calibrated.json()["measurement"]["known"] == tuesday["paired"], "counterparts stand in for poses"
+    assert calibrated.json()["measurement"] == handed["measurement"], "poses handed over add nothing to them"
 
 
 def test_what_cannot_be_aligned(server: Server) -> None:

@@ -38,7 +38,7 @@ IDLE_SECONDS = 30.0
 """How long a connection stays open without a request; the service's limit is longer."""
 
 SILENCE_SECONDS = 30.0
-"""After how long a stream without a byte counts as lost; the service sends a comment every ten seconds."""
+"""After how long a stream without a byte counts as lost; the service sends a comment every three seconds."""
 
 LEAST_SECONDS, MOST_SECONDS = 0.001, 3600.0
 """Bounds of X-Request-Timeout."""

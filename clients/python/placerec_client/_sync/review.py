@@ -38,6 +38,6 @@ class Review:
     def label(
         self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]
     ) -> models.Labelled:
-        """Say what a frame shows: a ``place``, a ``new`` place, a ``stranger``; or ``discard`` it."""
+        """Say what a frame shows: a ``place``, a ``new`` one, a ``stranger``; ``clear`` that, or ``discard`` it."""
         path = path_of(frame, below=self._path)
         return self._connection.ask(models.Labelled, "POST", path, json=options, deadline=deadline)
