@@ -31,6 +31,7 @@ from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
 from service.errors.faults import Fault, ForeignPage, KeyRefused, MapForbidden, RoleTooLow
 from service.errors.problems import KINDS, problem_response
+from service.fairness import CALLER
 from service.settings import PREFIX, Settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
@@ -217,6 +218,8 @@ class Access:
             return
         asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
         ASKER.set(asker)  # also for requests that change nothing: they may start jobs
+        CALLER.set(asker.caller)
+        state["caller"] = asker.caller
         if endpoint is not None and endpoint.rule.changes:
             await self._change(scope, receive, send, asker, path)
         elif endpoint is not None and endpoint.rule.shows:

@@ -27,6 +27,7 @@ from service.access.audit import ASKER, asker_of_fields, note_job, now_asking
 from service.errors.faults import JobLost, UnknownJob
 from service.errors.problems import problem_of
 from service.events.events import Events
+from service.fairness import CALLER
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
 from service.jobs.file import open_file
 from service.jobs.job import Job, JobState
@@ -340,7 +341,9 @@ class Jobs:
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
         context = JobContext(self, job)
-        ASKER.set(asker_of_fields(job.asker))  # it works on behalf of its caller
+        asker = asker_of_fields(job.asker)
+        ASKER.set(asker)  # it works on behalf of its caller
+        CALLER.set(asker.caller)
         try:
             result = dict((self._works[job.id] if job.id in self._works else self._kinds[job.kind])(context))
             if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:

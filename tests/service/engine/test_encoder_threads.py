@@ -223,6 +223,7 @@ def test_the_pixels_decoded_at_one_time_are_bounded(watched: Watched, monkeypatc
 
     frames = [watched.frame(seed) for seed in range(7)]
     frames.append(watched.frame(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
+    monkeypatch.setattr(encoder_threads, "FEW_PIXELS", 0)
     go = watched.hold()
     monkeypatch.setattr(encoder_threads, "MOST_PIXELS", 2 * 320 * 240 - 1)
     monkeypatch.setattr(watched.threads, "_encode", counted)
@@ -315,7 +316,7 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
     with pytest.raises(fault):
         await collected(queue, [jpeg(0)] * (queue.encoders.ahead + 5), deadline)
     left = waiting(queue)
-    assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk)
+    assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk.clear())
     free.set()
     await queue.encode(encoder.identity, jpeg(1), RequestDeadline(time.monotonic() + 60, stays))
 
