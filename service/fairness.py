@@ -9,9 +9,10 @@ alone; when it is full, the caller that holds most of it gives way to one that h
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
@@ -39,6 +40,10 @@ class FairQueue(Generic[Item]):
     def __len__(self) -> int:
         return self._count
 
+    def __iter__(self) -> Iterator[Item]:
+        """The items, those of one caller after those of another."""
+        return chain.from_iterable(self._waiting.values())
+
     @property
     def callers(self) -> int:
         """The number of callers that have items."""
@@ -50,10 +55,15 @@ class FairQueue(Generic[Item]):
         if (queue := self._waiting.get(caller)) is not None:
             queue.append(item)
             return
+        self._enter(caller)
         self._waiting[caller] = deque([item])
-        self._served[caller] = max(self._level, self._served.get(caller, 0.0))
+
+    def _enter(self, caller: str) -> float:
+        """Let a caller begin at the common level, unless it was served more already."""
         if len(self._served) > MOST_REMEMBERED:
             self._forget()
+        served = self._served[caller] = max(self._level, self._served.get(caller, 0.0))
+        return served
 
     def _forget(self) -> None:
         """Forget callers that would begin at the common level anyway."""
@@ -85,13 +95,17 @@ class FairQueue(Generic[Item]):
         self._level = max(self._level, self._served[caller])
         return item
 
+    def pass_by(self, caller: str) -> None:
+        """Note a turn of a caller that need not wait, as if it had waited and been next."""
+        self._level = self._enter(caller)
+
     def charge(self, caller: str, milliseconds: float) -> None:
         """Count work that is, or will be, done for a caller; a correction may be negative."""
         self._served[caller] = self._served.get(caller, self._level) + milliseconds
 
     def clear(self) -> list[Item]:
         """Remove all items, and return them."""
-        items = [item for queue in self._waiting.values() for item in queue]
+        items = [*self]
         self._waiting.clear()
         self._count = 0
         return items

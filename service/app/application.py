@@ -250,7 +250,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
             runtime.publish(app.state)
             runtime.start()
             try:
-                with gauges(runtime, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                with gauges(runtime, app.state.upload_memory):
                     yield
             finally:
                 await runtime.close()

@@ -48,6 +48,7 @@ class SentFrame:
     identity: of the encoder.
     keypoints, features: outputs wanted besides descriptors.
     seconds: until its deadline, from the moment at which it was sent; clocks of two machines need not agree.
+    caller: the caller whose turn it takes.
     """
 
     identity: str
@@ -57,6 +58,7 @@ class SentFrame:
     bulk: bool
     keypoints: bool
     features: bool
+    caller: str
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,9 @@ class EncoderReplica:
                 queued.append(error)
             else:
                 until = arrived + frame.seconds
+                wanted = {"keypoints": frame.keypoints, "features": frame.features}
                 queued.append(
-                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, frame.keypoints, frame.features)
+                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, caller=frame.caller, **wanted)
                 )
         waiting = [frame for frame in queued if isinstance(frame, QueuedFrame)]
         self._threads.put(waiting)
