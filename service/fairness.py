@@ -21,7 +21,7 @@ CALLER: ContextVar[str] = ContextVar("caller", default="owner")
 """The caller of the present work; threads and tasks that a request starts inherit it."""
 
 MOST_REMEMBERED = 1024
-"""Callers whose service is remembered although the others have caught up with them."""
+"""Callers that do not wait, and whose service is remembered."""
 
 
 class FairQueue(Generic[Item]):
@@ -66,9 +66,10 @@ class FairQueue(Generic[Item]):
         return served
 
     def _forget(self) -> None:
-        """Forget callers that would begin at the common level anyway."""
-        known = self._served.items()
-        self._served = {name: served for name, served in known if served > self._level or name in self._waiting}
+        """Forget the callers that owe least, those who wait excepted."""
+        idle = sorted((served, name) for name, served in self._served.items() if name not in self._waiting)
+        for _, name in idle[: -MOST_REMEMBERED // 2]:
+            del self._served[name]
 
     def _next(self) -> str:
         waiting = self._waiting
@@ -196,4 +197,4 @@ class SharedRoom:
         if not sizes:
             return [], 0
         share, most = max(sizes.items(), key=lambda one: one[1])
-        return [one for one in self._holdings if (one.caller, one.share) == (caller, share)], most
+        return [one for one in self._holdings if (one.caller, one.share) == (caller, share) and one.size], most

@@ -97,7 +97,7 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
     if wait and not job.ended:
         until = time.monotonic() + wait
         with jobs.watchers.watching(job_id) as changed:
-            while not (job := await in_thread(jobs.get, job_id)).ended and not jobs.stopping:
+            while not (job := await in_thread(jobs.get, job_id)).ended and not (jobs.stopping or changed.over):
                 if not await set_within(changed, until - time.monotonic()):
                     break
     return JobView.of(await in_thread(jobs.get, job_id))
@@ -159,7 +159,8 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
-    """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
+    """The events after ``last``, until the job ends, the service stops, the caller's key is revoked, or the place is left
+    to another caller."""
     with jobs.watchers.watching(job_id) as changed:
         yield OPENING
         while True:
@@ -170,7 +171,7 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
             if job.version != last:
                 last = job.version
                 yield _event(job)
-            if job.ended or jobs.stopping:
+            if job.ended or jobs.stopping or changed.over:
                 return
             if not await set_within(changed, HEARTBEAT_SECONDS):
                 yield HEARTBEAT

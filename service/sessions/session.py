@@ -39,6 +39,7 @@ class Session:
     recorded: the revision of the record, as it was last seen.
     restored: whether the session was restored after a restart.
     streaming: whether a WebSocket streams into the session.
+    begun_by: the caller and the request that began it, as its record has them.
     waiting: how many frames are being processed or wait for that.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
@@ -62,6 +63,7 @@ class Session:
     recorded: int = 0
     restored: bool = False
     streaming: bool = False
+    begun_by: str | None = None
     waiting: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -76,6 +78,7 @@ class Session:
         options = NewSession.model_validate_json(record.options)
         session = cls(record.id, record.map, record.map_created_at, options, record.expires_after, record.created)
         session.read_fields(record)
+        session.begun_by = record.begun_by
         session.idle_since = time.monotonic() - max(0.0, record.idle)
         return session
 
@@ -99,6 +102,7 @@ class Session:
             lost=self.lost,
             frames=self.frames,
             revision=self.revision,
+            begun_by=self.begun_by,
             state=None if self.run is None else to_bytes(self.run.state()),
             answer=self.answer,
         )

@@ -16,6 +16,7 @@ import pytest
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, UnknownMap
 from core.ledger.sqlite import SqliteLedger
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
+from service.fairness import CALLER
 from service.jobs.context import JobContext
 from service.jobs.file import FILE
 from service.jobs.jobs import Jobs
@@ -214,10 +215,28 @@ async def test_watchers_are_bounded(running: Running, tmp_path: Path) -> None:
         with jobs.watchers.watching(job.id) as changed:
             with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
                 pass
+            token = CALLER.set("robot")
+            with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
+                pass
+            assert not changed.over, "nobody has more than one"
+            CALLER.reset(token)
             gate.open.set()
             await changed.wait()
         with jobs.watchers.watching(job.id):
             pass
+
+
+@pytest.mark.anyio
+async def test_the_caller_with_most_watchers_gives_way_to_another(running: Running, tmp_path: Path) -> None:
+    gate = Gate()
+    with running(tmp_path, most_watchers=2) as jobs:
+        job = jobs.submit("gate", None, gate)
+        with jobs.watchers.watching(job.id) as first, jobs.watchers.watching(job.id) as second:
+            token = CALLER.set("robot")
+            with jobs.watchers.watching(job.id) as other:
+                assert second.over and second.is_set() and not first.over and not other.over
+            CALLER.reset(token)
+        gate.open.set()
 
 
 def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
