@@ -8,6 +8,8 @@ alone; when it is full, the caller that holds most of it gives way to one that h
 
 from __future__ import annotations
 
+import math
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextvars import ContextVar
@@ -198,3 +200,27 @@ class SharedRoom:
             return [], 0
         share, most = max(sizes.items(), key=lambda one: one[1])
         return [one for one in self._holdings if (one.caller, one.share) == (caller, share) and one.size], most
+
+
+REFUSALS_A_SECOND = 50
+"""Refusals of one caller that are answered at once in a second."""
+
+REFUSAL_SECONDS = 2.0
+"""How long each further one waits: about as long as its Retry-After asks the caller to wait."""
+
+
+class RefusalPace:
+    """The pace at which callers are told to come again: one that comes again at once would keep the service busy."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._began = clock, -math.inf
+        self._refused: Counter[str] = Counter()
+
+    def pause(self, caller: str) -> float:
+        """Count a refusal: the seconds for which its answer has to wait."""
+        now = self._clock()
+        if now - self._began >= 1:
+            self._began = now
+            self._refused.clear()
+        self._refused[caller] += 1
+        return REFUSAL_SECONDS if self._refused[caller] > REFUSALS_A_SECOND else 0.0

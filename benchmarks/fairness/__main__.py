@@ -36,7 +36,7 @@ from service.access.keys import Keys
 RATE = 8.0
 """Frames a second of the robot."""
 
-PLACES = 200
+PLACES = 64
 COLUMNS = ["attack", "answered", "refused", "p50 alone", "p50", "p99", "bar"]
 
 
@@ -112,10 +112,8 @@ def measure(name: str, seconds: float, frames: list[bytes], places: list[bytes])
     with tempfile.TemporaryDirectory() as folder:
         data_dir = Path(folder) / "data"
         keys = Keys.of(data_dir)
-        admin, robot, greedy = (
-            keys.create(who, role)[1]
-            for who, role in (("admin", "admin"), ("robot", "query"), ("greedy", "query"))  # fmt: skip
-        )
+        _, admin = keys.create("admin", "admin")
+        (_, robot), (_, greedy) = (keys.create(name, "query") for name in ("robot", "greedy"))
         with service(data_dir, log=Path(folder) / "log") as process:
             url = str(process.client.base_url).rstrip("/")
             process.client.headers["Authorization"] = f"Bearer {admin}"

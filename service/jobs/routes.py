@@ -159,8 +159,8 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
-    """The events after ``last``, until the job ends, the service stops, the caller's key is revoked, or the place is left
-    to another caller."""
+    """The events after ``last``, until the job ends, the service stops, the caller's key is revoked, or another caller
+    needs the place."""
     with jobs.watchers.watching(job_id) as changed:
         yield OPENING
         while True:

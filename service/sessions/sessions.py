@@ -340,7 +340,6 @@ def _ended(session_id: str, reason: str) -> SessionExpired:
     return SessionExpired(f"The session {session_id[:80]} is over. {reason} Begin a new one.")
 
 
-
 def sizes_of(sessions: Sequence[Session]) -> dict[Session, int]:
     """The bytes that each session holds; those of a graph are divided among the sessions over it."""
     runs = {one: one.run for one in sessions if one.run is not None}

@@ -7,9 +7,9 @@ frame.  Moments are seconds since 1970 UTC by the database's clock.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 

@@ -7,7 +7,15 @@ from itertools import pairwise
 
 import pytest
 
-from service.fairness import MOST_REMEMBERED, FairQueue, Holding, SharedRoom
+from service.fairness import (
+    MOST_REMEMBERED,
+    REFUSAL_SECONDS,
+    REFUSALS_A_SECOND,
+    FairQueue,
+    Holding,
+    RefusalPace,
+    SharedRoom,
+)
 
 
 def served(queue: FairQueue[str], costs: dict[str, float], turns: int) -> list[str]:
@@ -160,3 +168,12 @@ def test_work_that_has_begun_is_not_undone() -> None:
         assert room.take(Holding(lambda: False, caller="greedy"))
     assert room.take(Holding(lambda: False, caller="robot")) and room.held == 3
     assert not room.has_room(caller="greedy")
+
+
+def test_many_refusals_of_one_caller_in_a_second_wait() -> None:
+    now = 100.0
+    pace = RefusalPace(lambda: now)
+    assert [pace.pause("greedy") for _ in range(REFUSALS_A_SECOND)] == [0.0] * REFUSALS_A_SECOND
+    assert pace.pause("greedy") == REFUSAL_SECONDS and pace.pause("robot") == 0.0
+    now += 1
+    assert pace.pause("greedy") == 0.0
