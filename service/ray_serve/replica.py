@@ -104,9 +104,17 @@ class EncoderReplica:
                 queued.append(error)
             else:
                 until = arrived + frame.seconds
-                wanted = {"keypoints": frame.keypoints, "features": frame.features}
                 queued.append(
-                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, caller=frame.caller, **wanted)
+                    QueuedFrame(
+                        encoder,
+                        frame.data,
+                        frame.mask,
+                        until,
+                        frame.bulk,
+                        frame.keypoints,
+                        frame.features,
+                        caller=frame.caller,
+                    )
                 )
         waiting = [frame for frame in queued if isinstance(frame, QueuedFrame)]
         self._threads.put(waiting)
