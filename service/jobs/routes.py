@@ -27,7 +27,7 @@ from service.http.event_stream import (
     set_within,
     stream_response,
 )
-from service.http.routing import FromState, PrincipalDep, single_values
+from service.http.routing import FromState, PrincipalDep, StrictRoute, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
 from service.jobs.job import Job, JobState
@@ -36,7 +36,7 @@ from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
 from service.worker_threads import in_thread
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
 LONGEST_WAIT = 60.0
 """The longest time, in seconds, that a read of a job waits for its end."""
