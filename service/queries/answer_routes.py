@@ -22,7 +22,9 @@ from service.queries.recent_answers import MOST_OF_MAP
 from service.queries.schemas import EstimatedPose
 from service.queries.statistics import map_key
 
-router = APIRouter(prefix="/v1/maps/{map}", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)])
+router = APIRouter(
+    prefix="/v1/maps/{map}", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)]
+)
 
 ANSWER_EXAMPLE: dict[str, Any] = {
     "at": "2026-11-22T18:02:31.977000Z",

@@ -51,7 +51,9 @@ router = APIRouter(
         errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
     ),
 )
-explanations = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)])
+explanations = APIRouter(
+    prefix="/v1/maps/{map}/explanations", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)]
+)
 QueryOptions = Annotated[QueryParameters, Query()]
 PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 
