@@ -248,7 +248,7 @@ class Jobs:
                 was replaced by another map of the same id.
 
         Raises:
-            JobQueueFull: too many jobs are waiting.
+            JobQueueFull: too many jobs are waiting, and the caller has its share of them.
             StorageFull, StorageFailure: the job was not accepted.
         """
         job = Job(
@@ -275,9 +275,10 @@ class Jobs:
         return job
 
     def check_room(self) -> None:
-        """Raise JobQueueFull if no further job may wait; a route calls it before it reads a long body."""
+        """Raise JobQueueFull if no further job of the caller may wait; a route calls it before it reads a long body, in a
+        thread, for it may block."""
         if self.counts()["queued"] >= self._longest_queue:
-            raise self._table.queue_full()
+            self._table.check_room(ASKER.get().caller)
 
     def counts(self) -> Counter[JobState]:
         """How many of the jobs that are remembered are in each state; never waits."""

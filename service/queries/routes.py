@@ -52,7 +52,10 @@ router = APIRouter(
     ),
 )
 explanations = APIRouter(
-    prefix="/v1/maps/{map}/explanations", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)]
+    prefix="/v1/maps/{map}/explanations",
+    tags=["queries"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
 )
 QueryOptions = Annotated[QueryParameters, Query()]
 PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
