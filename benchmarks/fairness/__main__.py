@@ -40,7 +40,7 @@ PLACES = 64
 COLUMNS = ["attack", "answered", "refused", "p50 alone", "p50", "p99", "bar"]
 
 
-class Robot:
+class TimedRobot:
     """A robot with a key of its own.
 
     Args:
@@ -122,7 +122,7 @@ def measure(name: str, seconds: float, frames: list[bytes], places: list[bytes])
                 process.client.put(
                     f"/v1/maps/{MAP}/places/p{number}", content=frame, headers={"Content-Type": "image/jpeg"}
                 ).raise_for_status()
-            asker = Robot(url, robot, frames)
+            asker = TimedRobot(url, robot, frames)
             asyncio.run(asker.work(3, ""))  # a warm-up
             alone, _ = asyncio.run(asker.work(seconds / 2, ""))
             largest = _largest(process.client)

@@ -46,7 +46,7 @@ class RequestDeadline:
         return self.at - time.monotonic()
 
 
-class Place:
+class QueuePlace:
     """The place of one request in the queue; it can be taken away while none of its frames is being encoded."""
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Place:
             raise _queue_full()
 
 
-_PLACE: ContextVar[Place | None] = ContextVar("place", default=None)
+_PLACE: ContextVar[QueuePlace | None] = ContextVar("place", default=None)
 """The place of the present request; jobs have none."""
 
 
@@ -143,7 +143,7 @@ class EncoderQueue:
         Raises:
             QueueFull: no place is free; raised within the context if the place is lost to another caller.
         """
-        place = Place()
+        place = QueuePlace()
         entered = _PLACE.set(place)
         try:
             self.check_room()
@@ -319,13 +319,13 @@ async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> Exc
         gone.cancel()
 
 
-def _place() -> Place:
+def _place() -> QueuePlace:
     """The place of the present request, or one of no queue, which is never taken away.
 
     Raises:
         QueueFull: it was taken away.
     """
-    place = _PLACE.get() or Place()
+    place = _PLACE.get() or QueuePlace()
     place.check()
     return place
 

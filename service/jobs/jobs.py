@@ -275,8 +275,10 @@ class Jobs:
         return job
 
     def check_room(self) -> None:
-        """Raise JobQueueFull if no further job of the caller may wait; a route calls it before it reads a long body, in a
-        thread, for it may block."""
+        """Raise JobQueueFull if no further job of the caller may wait; may block.
+
+        A route calls it before it reads a long body.
+        """
         if self.counts()["queued"] >= self._longest_queue:
             self._table.check_room(ASKER.get().caller)
 

@@ -112,8 +112,8 @@ class Staging:
 
     Args:
         directory: the data directory.
-        capacity: the most bytes that all forms together may have, unless callers come that have less than an equal share
-            of them.
+        capacity: the most bytes that all forms together may have; when they have as many, further ones are taken of
+            callers that have less than an equal share of them.
         reserve: bytes of the disk that forms leave free.
     """
 
