@@ -1,4 +1,4 @@
-"""What one key does to take all of a service, in a process of its own, until its input is closed.
+"""Attacks by which one key takes all of a service, in a process of its own, until its input is closed.
 
     python -m benchmarks.fairness.attacks URL KEY queries
 
@@ -12,6 +12,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from benchmarks.frames import camera_frames
 
 MAP = "lab"
 QUERY = f"/v1/maps/{MAP}/query"
+FORM = "multipart/form-data; boundary=attack"
 LARGE_SIDE = 6324
 """Pixels of a side of the largest frame that is permitted by default."""
 
@@ -106,10 +108,28 @@ class Attack:
         await asyncio.gather(*(self._repeat(follow) for _ in range(64)), self._soon())
 
     async def uploads(self) -> None:
-        """8 forms of 120 MB at a time."""
+        """8 forms of 120 MB at a time, and 16 of which a third is sent and then a byte a second."""
         body = _form(camera_frames(16)[0])
-        upload = self._post(f"{QUERY}:batch", body, "multipart/form-data; boundary=attack")
-        await asyncio.gather(*(self._repeat(upload) for _ in range(8)), self._soon())
+        upload = self._post(f"{QUERY}:batch", body, FORM)
+        slow = (self._repeat(lambda _: self._trickle(body)) for _ in range(16))
+        await asyncio.gather(*(self._repeat(upload) for _ in range(8)), *slow, self._soon())
+
+    async def _trickle(self, body: bytes) -> int:
+        """Send a third of a form, then as little as is waited for; the status of the answer."""
+        parts = urlsplit(self._url)
+        reader, writer = await asyncio.open_connection(parts.hostname, parts.port)
+        try:
+            head = f"POST {QUERY}:batch HTTP/1.1\r\nHost: localhost\r\n{self._headers}Content-Type: {FORM}\r\n"
+            writer.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[: len(body) // 3])
+            answer = asyncio.ensure_future(reader.readline())
+            sent = len(body) // 3
+            while not answer.done():
+                await asyncio.wait({answer}, timeout=1)
+                writer.write(body[sent : sent + 1])
+                sent += 1
+            return int((await answer).split()[1])
+        finally:
+            writer.close()
 
     async def _soon(self) -> None:
         """Count as begun after a while: these requests are answered late."""

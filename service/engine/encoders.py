@@ -32,7 +32,7 @@ BULK_SHARE = 4
 """One frame in this many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
 
 ENCODING_MILLISECONDS, MEGAPIXEL_MILLISECONDS = 20.0, 10.0
-"""What a frame, and each million of its pixels, is expected to take; what it took is counted when it is done."""
+"""The expected time of a frame, and of each million of its pixels; the real time is counted when it is done."""
 
 
 @dataclass(frozen=True)

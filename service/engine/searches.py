@@ -35,7 +35,7 @@ MOST_AHEAD = 4000
 """The most places of a map that is searched in the encoder's thread; such a search takes a few milliseconds."""
 
 EXPECTED_MILLISECONDS = 10.0
-"""What one query of a search is expected to take; what the search took is counted when it is done."""
+"""The expected time of one query of a search; the real time is counted when it is done."""
 
 
 @dataclass(frozen=True)

@@ -307,10 +307,10 @@ def test_large_frames_are_more_turns_than_small_ones(watched: Watched) -> None:
     for frame in [*large, *small]:
         frames.add(frame)
     order = []
-    while (frame := frames.first()) is not None:
+    while (following := frames.first()) is not None:
         frames.remove_first()
-        frames.count_turn(frame)
-        order.append(frame)
+        frames.count_turn(following)
+        order.append(following)
     first, second = order.index(large[0]), order.index(large[1])
     assert first == 0 and 6 <= second <= 8, "140 ms are expected for twelve million pixels, and 21 for a small frame"
 
