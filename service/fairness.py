@@ -152,9 +152,10 @@ class SharedRoom:
 
     def take(self, holding: Holding, size: int = 1) -> bool:
         """Let a holding grow by ``size``; False if there is no room, and then nothing has changed."""
+        given = None
         while self.held + size > self.capacity:
             greediest = self._greediest(holding.caller, holding.share, size)
-            if not greediest:
+            if not greediest and given is None:
                 return False
             given = next((one for one in reversed(greediest) if one is not holding and one.give_way()), None)
             if given is None:

@@ -127,7 +127,9 @@ class Attack:
                 await asyncio.wait({answer}, timeout=1)
                 writer.write(body[sent : sent + 1])
                 sent += 1
-            return int((await answer).split()[1])
+            if not (line := await answer):
+                raise EOFError("the service hung up")
+            return int(line.split()[1])
         finally:
             writer.close()
 

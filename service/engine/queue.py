@@ -297,7 +297,7 @@ class EncoderQueue:
                         self._metrics.observe_stages(future.result().milliseconds)
                 yield [(i, _outcome(future)) for future, i, _ in done]
         finally:
-            gone.cancel()
+            _forget(gone)
             for future, (_, frame) in open_.items():
                 frame.result.cancel()
                 future.cancel()
@@ -316,7 +316,7 @@ async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> Exc
             return None
         return _gone(gone)
     finally:
-        gone.cancel()
+        _forget(gone)
 
 
 def _place() -> QueuePlace:
@@ -341,6 +341,12 @@ def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:
     if isinstance(error, Exception):
         return error
     raise error
+
+
+def _forget(watching: asyncio.Future[None]) -> None:
+    """End the watching of a connection, whose error is of no interest any more."""
+    if not watching.cancel() and not watching.cancelled():
+        watching.exception()
 
 
 def _gone(watching: asyncio.Future[None]) -> Exception:
