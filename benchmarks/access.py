@@ -23,6 +23,7 @@ from benchmarks.report import report
 from service.access.gate import Access, endpoints_of
 from service.access.keys import Keys
 from service.app.application import create_app
+from service.fairness import RefusalPace
 from service.settings import Settings
 
 REQUESTS = 5000
@@ -89,7 +90,7 @@ async def measure(folder: Path) -> dict[str, float]:
             _, token = Keys.of(data_dir).create("robot", "query", None if path == last[1] else ["lab", "yard"])
             headers.append((b"authorization", f"Bearer {token}".encode()))
         app = create_app(Settings(host="127.0.0.1", data_dir=data_dir, rate_per_key=1e6, rate_burst=1_000_000))
-        layer = Access(_nothing, app.state.gate, endpoints_of(app.routes), app.state.metrics)
+        layer = Access(_nothing, app.state.gate, endpoints_of(app.routes), app.state.metrics, RefusalPace())
         with app.state.gate.keyring:
             found[name] = await _time(layer, method, path, headers) - await _time(_nothing, method, path, headers)
     return found

@@ -70,6 +70,7 @@ PARTS = {
     "filters": Part("benchmarks.maps.filters"),
     "transfer": Part("benchmarks.transfer"),
     "siege": Part("benchmarks.slow_connections"),
+    "fairness": Part("benchmarks.fairness"),
     "load": Part("benchmarks.endurance"),
     "crashes": Part("tests.durability", "storage --kills 200"),
     "power": Part("tests.durability", "power --runs 4 --disks 60"),

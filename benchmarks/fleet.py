@@ -95,10 +95,15 @@ class Seen:
 
 
 class PersistentConnection:
-    """One persistent connection, opened again when the other end has closed it between two requests."""
+    """One persistent connection, opened again when the other end has closed it between two requests.
 
-    def __init__(self, url: str) -> None:
+    Args:
+        headers: lines of every request, each with its end of line.
+    """
+
+    def __init__(self, url: str, headers: str = "") -> None:
         parts = urlsplit(url)
+        self._headers = headers
         self._host, self._port = str(parts.hostname), parts.port or 80
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
@@ -111,7 +116,7 @@ class PersistentConnection:
             OSError, EOFError: the service hung up on a request under way.
         """
         head = f"{method} {path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\nContent-Length: {len(body)}\r\n"
-        head += f"Content-Type: {kind}\r\n\r\n" if body else "\r\n"
+        head += self._headers + (f"Content-Type: {kind}\r\n\r\n" if body else "\r\n")
         if self._streams is None or self._streams[0].at_eof():
             self.close()
             self._streams = await asyncio.open_connection(self._host, self._port)

@@ -1,15 +1,83 @@
-"""Blocking work, mostly of maps, in threads beside the event loop."""
+"""Blocking work, mostly of maps, in threads beside the event loop, for which callers wait in turns."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from typing import ParamSpec, TypeVar
 
 from anyio import CancelScope, CapacityLimiter, to_thread
+from anyio.lowlevel import RunVar
+
+from service.fairness import CALLER, FairQueue
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+
+
+class ThreadTurns:
+    """The turns of callers at the threads of the pool.  It is used from one event loop.
+
+    Args:
+        most: how many pieces of work run at a time.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._free = most
+        self._waiting = FairQueue[asyncio.Future[None]]()
+
+    @property
+    def waiting(self) -> int:
+        """How many pieces of work wait for their turn."""
+        return len(self._waiting)
+
+    @asynccontextmanager
+    async def turn(self, caller: str) -> AsyncIterator[None]:
+        """Wait for a turn, and hold it."""
+        if self._free > 0:
+            self._free -= 1
+            self._waiting.pass_by(caller)
+        else:
+            await self._wait(caller)
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._waiting.charge(caller, 1e3 * (time.perf_counter() - began))
+            self._pass_on()
+
+    async def _wait(self, caller: str) -> None:
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.add(caller, turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self._pass_on()
+            raise
+
+    def _pass_on(self) -> None:
+        while len(self._waiting):
+            turn = self._waiting.pop()
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._free += 1
+
+
+_TURNS: RunVar[ThreadTurns] = RunVar("thread turns")
+
+
+def thread_turns() -> ThreadTurns:
+    """The turns of the running event loop, as many at a time as its pool has threads."""
+    try:
+        return _TURNS.get()
+    except LookupError:
+        turns = ThreadTurns(int(to_thread.current_default_thread_limiter().total_tokens))
+        _TURNS.set(turns)
+        return turns
 
 
 async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
@@ -18,7 +86,7 @@ async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **
     A task that is cancelled does not wait for it: it continues at once, and the work ends by itself.  So use this only
     for work that shares nothing with what its caller does afterwards, and :func:`to_its_end` otherwise.
     """
-    return await to_thread.run_sync(lambda: work(*args, **kwargs))
+    return await _run(lambda: work(*args, **kwargs), None)
 
 
 async def to_its_end(
@@ -56,4 +124,7 @@ async def to_its_end(
 
 
 async def _run(work: Callable[[], Result], limiter: CapacityLimiter | None) -> Result:
-    return await to_thread.run_sync(work, limiter=limiter)
+    if limiter is not None:
+        return await to_thread.run_sync(work, limiter=limiter)
+    async with thread_turns().turn(CALLER.get()):
+        return await to_thread.run_sync(work)

@@ -14,6 +14,7 @@ from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from service.access.rates import network_of
 from service.access.roles import Principal
 
 LOGGER = "placerec.audit"
@@ -39,6 +40,11 @@ class Asker:
     request_id: str | None = None
     trace_id: str | None = None
     client: str | None = None
+
+    @property
+    def caller(self) -> str:
+        """The name under which its work is counted: the key's id or, without a key, the address."""
+        return self.key or network_of(self.client)
 
 
 ASKER: ContextVar[Asker] = ContextVar("asker", default=Asker("owner"))  # noqa: B039 - frozen

@@ -29,8 +29,9 @@ from service.access.audit import ASKER, Asker, Disclosures, Refusals, asker_of, 
 from service.access.keyring import Keyring
 from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
-from service.errors.faults import Fault, ForeignPage, KeyNeeded, KeyRefused, MapForbidden, RoleTooLow
+from service.errors.faults import Fault, ForeignPage, KeyNeeded, KeyRefused, MapForbidden, RateExceeded, RoleTooLow
 from service.errors.problems import KINDS, problem_response
+from service.fairness import CALLER, RefusalPace
 from service.settings import PREFIX, Settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
@@ -193,11 +194,16 @@ class Gate:
 class Access:
     """ASGI middleware that lets requests in or refuses them; it comes before the layers that read bodies.
 
-    It sets ``principal`` in the request's state.
+    It sets ``principal`` and, once they are let in, ``caller`` in the request's state.
+
+    Args:
+        pace: at which callers are told to come again.
     """
 
-    def __init__(self, app: ASGIApp, gate: Gate, endpoints: list[Endpoint], metrics: Metrics) -> None:
-        self.app, self.gate, self.metrics = app, gate, metrics
+    def __init__(
+        self, app: ASGIApp, gate: Gate, endpoints: list[Endpoint], metrics: Metrics, pace: RefusalPace
+    ) -> None:
+        self.app, self.gate, self.metrics, self._pace = app, gate, metrics, pace
         self._endpoints: dict[str, list[Endpoint]] = {}
         for endpoint in endpoints:
             self._endpoints.setdefault(endpoint.method, []).append(endpoint)
@@ -220,6 +226,8 @@ class Access:
             return
         asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
         ASKER.set(asker)  # also for requests that change nothing: they may start jobs
+        CALLER.set(asker.caller)
+        state["caller"] = asker.caller
         if endpoint is not None and endpoint.rule.changes:
             await self._change(scope, receive, send, asker, path)
         elif endpoint is not None and endpoint.rule.shows:
@@ -315,6 +323,8 @@ class Access:
         asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
         if not (isinstance(error, KeyNeeded) and asker.operation == WHO_AM_I):
             self._refusals.note(asker, path, kind.status, kind.slug)
+        if isinstance(error, RateExceeded) and (pause := self._pace.pause(asker.caller)):
+            await asyncio.sleep(pause)
         if scope["type"] == "websocket":
             self.metrics.problems.labels(kind.slug).inc()
             answer = problem_response(Request({**scope, "type": "http", "method": "GET"}), error)

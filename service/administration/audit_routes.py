@@ -16,7 +16,7 @@ from service.administration.audit_lines import AuditLine, Position
 from service.administration.audit_trail import AuditTrail, Source
 from service.errors.faults import InvalidRequest
 from service.errors.problems import problem_documentation
-from service.http.routing import FromState, single_values
+from service.http.routing import FromState, StrictRoute, single_values
 from service.http.schemas import Cursor, PageParameters
 
 MOST_READ = 8 * 1024 * 1024
@@ -40,7 +40,7 @@ AUDIT_EXAMPLE: dict[str, Any] = {
     "change": "created",
 }
 
-router = APIRouter(prefix="/v1/audit", tags=["audit"], dependencies=[Depends(single_values)])
+router = APIRouter(prefix="/v1/audit", tags=["audit"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
 
 class AuditEntry(BaseModel):

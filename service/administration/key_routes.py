@@ -47,7 +47,7 @@ LISTING: Listing = ["keys"]
 BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType, errors.InvalidIdentifier)
 
 router = APIRouter(prefix="/v1/keys", tags=["keys"], route_class=StrictRoute, dependencies=[Depends(single_values)])
-own = APIRouter(prefix="/v1/key", tags=["keys"], dependencies=[Depends(single_values)])
+own = APIRouter(prefix="/v1/key", tags=["keys"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
 GateDep = Annotated[Gate, Depends(FromState("gate"))]
 StoreDep = Annotated[Keys, Depends(FromState("key_store"))]

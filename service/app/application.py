@@ -31,6 +31,7 @@ from service.console import routes as console
 from service.errors.faults import KeysUnreadable
 from service.errors.problems import install_problems, problem_response
 from service.events.schemas import EnrolmentEvent, JobEvent, Listening, MapEvent, Missed, QueryEvent, SessionEvent
+from service.fairness import RefusalPace
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
@@ -251,7 +252,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
             runtime.publish(app.state)
             runtime.start()
             try:
-                with gauges(runtime, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                with gauges(runtime, app.state.upload_memory):
                     yield
             finally:
                 await runtime.close()
@@ -269,7 +270,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         generate_unique_id_function=_operation_id,
         lifespan=lifespan,
     )
-    install_problems(app)
+    pace = RefusalPace()
+    install_problems(app, pace)
     app.add_exception_handler(405, _method_not_allowed)
     app.router.routes.extend(_routes())
     app.router.default = _not_found
@@ -277,7 +279,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     app.state.gate, app.state.key_store = gate, store
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
-    app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics)
+    app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics, pace=pace)
     app.add_middleware(Telemetry, metrics=metrics)
     if chosen.root_path:
         app.add_middleware(RootPath, root_path=chosen.root_path)  # the outermost middleware is added last

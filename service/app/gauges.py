@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import get_args
 
-from anyio import CapacityLimiter
+from anyio import CapacityLimiter, to_thread
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -18,6 +18,7 @@ from core.maps.status import Tier
 from service.app.runtime import Runtime
 from service.http.bodies import UploadMemory
 from service.jobs.job import JobState
+from service.worker_threads import ThreadTurns, thread_turns
 
 
 class RuntimeCollector(Collector):
@@ -26,15 +27,17 @@ class RuntimeCollector(Collector):
     Args:
         uploads: the memory that request bodies occupy.
         threads: the limiter of the threads for storage.
+        turns: the turns of callers at these threads.
     """
 
-    def __init__(self, runtime: Runtime, uploads: UploadMemory, threads: CapacityLimiter) -> None:
-        self._runtime, self._uploads, self._threads = runtime, uploads, threads
+    def __init__(self, runtime: Runtime, uploads: UploadMemory, threads: CapacityLimiter, turns: ThreadTurns) -> None:
+        self._runtime, self._uploads, self._threads, self._turns = runtime, uploads, threads, turns
 
     def collect(self) -> Iterable[Metric]:
         runtime = self._runtime
         yield _gauge("placerec_upload_bytes", "Bytes of request bodies held in memory.", self._uploads.held)
-        busy, waiting = self._threads.borrowed_tokens, self._threads.statistics().tasks_waiting
+        busy = self._threads.borrowed_tokens
+        waiting = self._threads.statistics().tasks_waiting + self._turns.waiting
         yield _gauge(
             "placerec_storage_threads", "Threads that may search, read or write maps.", self._threads.total_tokens
         )
@@ -88,9 +91,10 @@ class RuntimeCollector(Collector):
 
 
 @contextmanager
-def gauges(runtime: Runtime, uploads: UploadMemory, threads: CapacityLimiter) -> Iterator[None]:
-    """Add these gauges to the metrics while the block runs."""
-    collector = RuntimeCollector(runtime, uploads, threads)
+def gauges(runtime: Runtime, uploads: UploadMemory) -> Iterator[None]:
+    """Add these gauges to the metrics while the block runs, on the event loop whose threads they count."""
+    threads = to_thread.current_default_thread_limiter()
+    collector = RuntimeCollector(runtime, uploads, threads, thread_turns())
     runtime.engine.metrics.registry.register(collector)
     try:
         yield

@@ -23,7 +23,7 @@ from service.http.bodies import UploadMemory
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.settings import Settings
 from service.telemetry import latencies
-from service.worker_threads import in_thread
+from service.worker_threads import in_thread, thread_turns
 
 RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
 UploadsDep = Annotated[UploadMemory, Depends(FromState("upload_memory"))]
@@ -195,7 +195,7 @@ async def read_service(
         queue=QueueState(waiting=engine.queue.waiting, limit=settings.queue_length),
         storage=ThreadsState(
             busy=limiter.borrowed_tokens,
-            waiting=limiter.statistics().tasks_waiting,
+            waiting=limiter.statistics().tasks_waiting + thread_turns().waiting,
             threads=int(limiter.total_tokens),
         ),
         requests=_requests(runtime),

@@ -26,6 +26,9 @@ from service.errors.faults import DeadlineExceeded
 MOST_PIXELS = 40_000_000
 """The most pixels that are decoded at one time, unless a single frame has more: it bounds the memory."""
 
+FEW_PIXELS = 2_000_000
+"""Frames of so many pixels are not counted among those, so that they need not wait for the end of a large one."""
+
 AHEAD = 8 * max(2, cores())
 """Frames of one bulk request that wait at a time."""
 
@@ -75,7 +78,7 @@ class EncoderThreads:
             thread.join()
 
     def put(self, frames: Iterable[QueuedFrame]) -> None:
-        """Add frames to the queue; bulk frames stay in their order, and so do the others."""
+        """Add frames to the queue; those of one caller and kind stay in their order."""
         with self._changed:
             for frame in frames:
                 if frame.pixels > self._limits.max_pixels:  # its header may lie; decoding refuses it at once
@@ -95,10 +98,12 @@ class EncoderThreads:
             if wanted != threads:  # a thread that begins others has all cores, for they inherit its own
                 keep_to(number if one_each and wanted == 1 else None)
                 use_threads(threads := wanted)
+            began = time.perf_counter()
             self._encode(frame)
             with self._changed:
+                self._waiting.settle(frame, 1e3 * (time.perf_counter() - began))
                 self._at_work -= 1
-                self._pixels -= frame.pixels
+                self._pixels -= _counted(frame)
                 if self._waiting:  # which may have waited for these pixels
                     self._changed.notify_all()
 
@@ -107,16 +112,20 @@ class EncoderThreads:
         with self._changed:
             while not self._closed:
                 frame = self._waiting.first()
-                if frame is not None and (not self._at_work or self._pixels + frame.pixels <= MOST_PIXELS):
+                if frame is not None and self._has_room_for(frame):
                     self._waiting.remove_first()
                     if frame.result.set_running_or_notify_cancel():
                         self._waiting.count_turn(frame)
                         self._at_work += 1
-                        self._pixels += frame.pixels
+                        self._pixels += _counted(frame)
                         return frame, self._at_work == 1 and not self._waiting
                 else:
                     self._changed.wait()
             return None
+
+    def _has_room_for(self, frame: QueuedFrame) -> bool:
+        more = _counted(frame)
+        return not more or not self._at_work or self._pixels + more <= MOST_PIXELS
 
     def _encode(self, frame: QueuedFrame) -> None:
         """Set the result, or the error, of a frame."""
@@ -145,3 +154,8 @@ class EncoderThreads:
             with suppress(Exception):  # Searches repeats the search and reports the error
                 encoded = replace(encoded, search_result=frame.after_encoding(encoded))
         frame.result.set_result(encoded)
+
+
+def _counted(frame: QueuedFrame) -> int:
+    """The pixels of a frame that count among those that are decoded at one time."""
+    return frame.pixels if frame.pixels > FEW_PIXELS else 0

@@ -6,7 +6,6 @@ A frame waits in :class:`WaitingFrames` and becomes an :class:`Encoded`; :class:
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
@@ -26,10 +25,14 @@ from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Query, Question
 from service.errors.faults import DeadlineExceeded
+from service.fairness import CALLER, FairQueue
 from service.telemetry.metrics import Metrics
 
 BULK_SHARE = 4
 """One frame in this many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
+
+ENCODING_MILLISECONDS, MEGAPIXEL_MILLISECONDS = 20.0, 10.0
+"""The expected time of a frame, and of each million of its pixels; the real time is counted when it is done."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class QueuedFrame:
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
     result: the encoded frame, or the error that prevented its encoding.
+    caller: the caller whose turn it takes.
     attempts: how often its encoding was begun and lost, because the process that had it ended.
     queued: the ``time.perf_counter`` at which the frame began to wait.
     pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
@@ -112,6 +116,7 @@ class QueuedFrame:
     features: bool = False
     after_encoding: AfterEncoding | None = None
     attempts: int = 0
+    caller: str = field(default_factory=CALLER.get)
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
     pixels: int = field(init=False, default=0)
@@ -121,43 +126,55 @@ class QueuedFrame:
             header = read_header(self.data)
             self.pixels = header.width * header.height
 
+    @property
+    def expected(self) -> float:
+        """Milliseconds that it is expected to keep an encoder busy."""
+        return ENCODING_MILLISECONDS + MEGAPIXEL_MILLISECONDS * self.pixels / 1e6
+
 
 class WaitingFrames:
-    """Frames in the order of their turns: robots' first, but a share is reserved for bulk frames.  Not thread-safe."""
+    """Frames in the order of their turns.  Not thread-safe.
+
+    Robots' frames go first, but a share is reserved for bulk frames.  Of either kind, the frame of the caller that was
+    served least goes first.
+    """
 
     def __init__(self) -> None:
-        self._robots: deque[QueuedFrame] = deque()
-        self._bulk: deque[QueuedFrame] = deque()
+        self._robots, self._bulk = FairQueue[QueuedFrame](), FairQueue[QueuedFrame]()
         self._passed_over = 0  # robots' frames that were taken while bulk frames waited
 
     def __len__(self) -> int:
         return len(self._robots) + len(self._bulk)
 
     def add(self, frame: QueuedFrame) -> None:
-        """Add a frame; bulk frames stay in their order, and so do the others."""
-        (self._bulk if frame.bulk else self._robots).append(frame)
+        """Add a frame behind those of its caller and kind."""
+        self._queue_of(frame).add(frame.caller, frame)
 
     def first(self) -> QueuedFrame | None:
         """The frame whose turn it is; None if none waits."""
-        queue = self._queue()
-        return queue[0] if queue else None
+        return self._queue().first()
 
     def remove_first(self) -> None:
         """Remove the frame whose turn it is."""
-        self._queue().popleft()
+        self._queue().pop()
 
     def count_turn(self, frame: QueuedFrame) -> None:
         """Note that a frame, which was removed, is being encoded."""
         self._passed_over = 0 if frame.bulk else self._passed_over + bool(self._bulk)
+        self._queue_of(frame).charge(frame.caller, frame.expected)
+
+    def settle(self, frame: QueuedFrame, milliseconds: float) -> None:
+        """Note how long a frame, whose turn was counted, kept an encoder busy."""
+        self._queue_of(frame).charge(frame.caller, milliseconds - frame.expected)
 
     def clear(self) -> list[QueuedFrame]:
         """Remove all frames, and return them."""
-        frames = [*self._robots, *self._bulk]
-        self._robots.clear()
-        self._bulk.clear()
-        return frames
+        return [*self._robots.clear(), *self._bulk.clear()]
 
-    def _queue(self) -> deque[QueuedFrame]:
+    def _queue_of(self, frame: QueuedFrame) -> FairQueue[QueuedFrame]:
+        return self._bulk if frame.bulk else self._robots
+
+    def _queue(self) -> FairQueue[QueuedFrame]:
         """The queue whose turn it is."""
         bulk_next = not self._robots or (self._bulk and self._passed_over >= BULK_SHARE - 1)
         return self._bulk if bulk_next else self._robots

@@ -7,6 +7,7 @@ import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from core.threads import share_cores
 from service.engine.encoder_threads import EncoderThreads
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders, QueuedFrame, deadline_exceeded
 from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
+from service.fairness import Holding, SharedRoom
 from service.telemetry.metrics import Metrics
 
 __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadline"]
@@ -42,6 +44,47 @@ class RequestDeadline:
     def seconds_left(self) -> float:
         """Seconds until the deadline; negative after it."""
         return self.at - time.monotonic()
+
+
+class QueuePlace:
+    """The place of one request in the queue; it can be taken away while none of its frames is being encoded."""
+
+    def __init__(self) -> None:
+        self.frames: list[QueuedFrame] = []
+        """The request's frames that wait or are being encoded."""
+        self._taken_away = False
+        self._holdings: list[tuple[SharedRoom, Holding]] = []
+
+    def enter(self, room: SharedRoom) -> bool:
+        """Take a place in a room until ``leave``; False if there is none."""
+        holding = Holding(self.give_way)
+        self._holdings.append((room, holding))
+        return room.take(holding)
+
+    def leave(self) -> None:
+        """Leave all rooms."""
+        for room, holding in self._holdings:
+            room.release(holding)
+
+    def give_way(self) -> bool:
+        """Withdraw the frames, and refuse the request; returns False if an encoder is at work on them."""
+        waiting = [frame for frame in self.frames if not frame.result.done()]
+        if self._taken_away or (self.frames and not waiting) or (waiting and not waiting[0].result.cancel()):
+            return False
+        self._taken_away = True
+        for frame in waiting:
+            frame.result.cancel()
+        self.leave()
+        return True
+
+    def check(self) -> None:
+        """Raise QueueFull if the place was taken away."""
+        if self._taken_away:
+            raise _queue_full()
+
+
+_PLACE: ContextVar[QueuePlace | None] = ContextVar("place", default=None)
+"""The place of the present request; jobs have none."""
 
 
 class EncoderQueue:
@@ -66,7 +109,7 @@ class EncoderQueue:
         make_encoders: MakeEncoders | None = None,
     ) -> None:
         self._catalogue, self._metrics = catalogue, metrics
-        self._queue_length, self._waiting, self._bulk = queue_length, 0, 0
+        self._room, self._bulk_room = SharedRoom(queue_length), SharedRoom(max(1, queue_length // 2))
         self._loaded: dict[str, Encoder] = {}
         share_cores(threads or torch.get_num_threads())
         self.encoders = EncoderThreads(limits) if make_encoders is None else make_encoders(limits, metrics)
@@ -78,39 +121,44 @@ class EncoderQueue:
         self.encoders.close()
 
     def check_room(self) -> None:
-        """Raise QueueFull if there is no free place; a route calls it before it reads a body."""
-        if self._waiting >= self._queue_length:
-            raise QueueFull("Too many requests are waiting for the encoder; send this one again in a moment.")
+        """Raise QueueFull if the caller would get no place; a route calls it before it reads a body."""
+        if not self._room.has_room():
+            raise _queue_full()
 
     @property
     def waiting(self) -> int:
         """The number of requests that have a place in the queue now."""
-        return self._waiting
+        return self._room.held
 
     @contextmanager
     def place(self, frames: int = 1) -> Iterator[None]:
         """Hold a place in the queue for one request, whose frames are encoded within the context.
+
+        If the queue is full, the caller that has most places loses its latest one to a caller that has fewer.
 
         Args:
             frames: the number of frames of the request.  Requests of several frames take longer, so they may have only
                 half of the places, and there is always room for requests of a single frame.
 
         Raises:
-            QueueFull: no place is free.
+            QueueFull: no place is free; raised within the context if the place is lost to another caller.
         """
-        self.check_room()
-        bulk = int(frames > 1)
-        if bulk and self._bulk >= max(1, self._queue_length // 2):
-            raise QueueFull(
-                "Too many requests of several frames are waiting for the encoder; send this one again in a moment."
-            )
-        self._waiting, self._bulk = self._waiting + 1, self._bulk + bulk
-        self._metrics.queue.set(self._waiting)
+        place = QueuePlace()
+        entered = _PLACE.set(place)
         try:
+            self.check_room()
+            if frames > 1 and not place.enter(self._bulk_room):
+                raise QueueFull(
+                    "Too many requests of several frames are waiting for the encoder; send this one again in a moment."
+                )
+            if not place.enter(self._room):
+                raise _queue_full()
+            self._metrics.queue.set(self._room.held)
             yield
         finally:
-            self._waiting, self._bulk = self._waiting - 1, self._bulk - bulk
-            self._metrics.queue.set(self._waiting)
+            _PLACE.reset(entered)
+            place.leave()
+            self._metrics.queue.set(self._room.held)
 
     async def load(self, identity: str) -> Encoder:
         """The encoder of an identity; it is loaded, and checked against its golden values, when it is first used.
@@ -165,6 +213,7 @@ class EncoderQueue:
 
         Raises:
             DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
+            QueueFull: its place was lost to another caller; the frame was not encoded.
             InvalidImage: the frame cannot be decoded.
             EncoderNotInstalled, InvalidModel: see ``load``.
         """
@@ -172,10 +221,13 @@ class EncoderQueue:
         frame = QueuedFrame(
             encoder, data, mask, deadline.at, keypoints=keypoints, features=features, after_encoding=after_encoding
         )
+        place = _place()
+        place.frames = [frame]
         self.encoders.put([frame])
         result = asyncio.wrap_future(frame.result)
         try:
             ended = await _ended(result, deadline)
+            place.check()
             # A frame whose encoding has begun is finished: dropping it would save nothing.
             if ended is not None and frame.result.cancel():
                 raise ended
@@ -214,10 +266,11 @@ class EncoderQueue:
         encoder = await self._load_in_time(identity, deadline)
         hidden = [None] * len(frames) if masks is None else masks
         open_: dict[asyncio.Future[Encoded], tuple[int, QueuedFrame]] = {}
-        begun, bulk, ahead = 0, len(frames) > 1, self.encoders.ahead
+        begun, bulk, ahead, place = 0, len(frames) > 1, self.encoders.ahead, _place()
         gone = asyncio.ensure_future(deadline.hung_up())
         try:
             while begun < len(frames) or open_:
+                place.check()
                 following = range(begun, min(len(frames), begun + ahead - len(open_)))
                 queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk, keypoints) for i in following]
                 self.encoders.put(queued)
@@ -225,13 +278,15 @@ class EncoderQueue:
                     asyncio.wrap_future(frame.result): (i, frame) for i, frame in zip(following, queued, strict=True)
                 }
                 begun = following.stop
+                place.frames = [frame for _, frame in open_.values()]
                 waited: set[asyncio.Future[Any]] = {*open_, gone}
                 await asyncio.wait(
                     waited, timeout=max(0.0, deadline.seconds_left()), return_when=asyncio.FIRST_COMPLETED
                 )
+                place.check()
                 done = [(future, *open_.pop(future)) for future in [*open_] if future.done()]
                 if not done and (begun < len(frames) or any(frame.result.cancel() for _, frame in open_.values())):
-                    raise _gone() if gone.done() else deadline_exceeded()
+                    raise _gone(gone)
                 if not done:  # the encoding of all remaining frames was begun before the deadline
                     await asyncio.wait(open_)
                     continue
@@ -242,13 +297,13 @@ class EncoderQueue:
                         self._metrics.observe_stages(future.result().milliseconds)
                 yield [(i, _outcome(future)) for future, i, _ in done]
         finally:
-            gone.cancel()
+            _forget(gone)
             for future, (_, frame) in open_.items():
                 frame.result.cancel()
                 future.cancel()
 
 
-async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> ClientGone | DeadlineExceeded | None:
+async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> Exception | None:
     """Wait for a future; the reason why its request ended before it was done, or None."""
     await asyncio.wait({awaited}, timeout=min(UNWATCHED, deadline.seconds_left()))
     if awaited.done():
@@ -259,9 +314,24 @@ async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> Cli
         await asyncio.wait(waited, timeout=max(0.0, deadline.seconds_left()), return_when=asyncio.FIRST_COMPLETED)
         if awaited.done():
             return None
-        return _gone() if gone.done() else deadline_exceeded()
+        return _gone(gone)
     finally:
-        gone.cancel()
+        _forget(gone)
+
+
+def _place() -> QueuePlace:
+    """The place of the present request, or one of no queue, which is never taken away.
+
+    Raises:
+        QueueFull: it was taken away.
+    """
+    place = _PLACE.get() or QueuePlace()
+    place.check()
+    return place
+
+
+def _queue_full() -> QueueFull:
+    return QueueFull("Too many requests are waiting for the encoder; send this one again in a moment.")
 
 
 def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:
@@ -273,5 +343,15 @@ def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:
     raise error
 
 
-def _gone() -> ClientGone:
-    return ClientGone("The client hung up before its frame was encoded.")
+def _forget(watching: asyncio.Future[None]) -> None:
+    """End the watching of a connection, whose error is of no interest any more."""
+    if not watching.cancel() and not watching.cancelled():
+        watching.exception()
+
+
+def _gone(watching: asyncio.Future[None]) -> Exception:
+    """Why a request ends, whose connection was watched until its deadline or until the client hung up."""
+    if not watching.done():
+        return deadline_exceeded()
+    error = watching.exception()
+    return error if isinstance(error, Exception) else ClientGone("The client hung up before its frame was encoded.")

@@ -10,12 +10,11 @@ The search itself is :func:`core.recognition.recognition.locate`.  For speed it 
 from __future__ import annotations
 
 import asyncio
-from collections import defaultdict, deque
+import time
+from collections import defaultdict
 from collections.abc import Sequence
 from contextvars import Context
-from dataclasses import dataclass
-
-from anyio import to_thread
+from dataclasses import dataclass, field
 
 from core.maps import Map
 from core.method.encoder import Encoder
@@ -23,6 +22,8 @@ from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, answer_to_blank, locate
 from core.threads import cores
 from service.engine.encoders import Encoded
+from service.fairness import CALLER, FairQueue
+from service.worker_threads import in_thread
 
 MOST_TOGETHER = 8
 """The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""
@@ -32,6 +33,9 @@ CORES_A_SEARCH = 4
 
 MOST_AHEAD = 4000
 """The most places of a map that is searched in the encoder's thread; such a search takes a few milliseconds."""
+
+EXPECTED_MILLISECONDS = 10.0
+"""The expected time of one query of a search; the real time is counted when it is done."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +80,18 @@ class _SearchKey:
 class _Waiting:
     queries: Sequence[Query]
     answer: asyncio.Future[list[Answer]]
+    caller: str = field(default_factory=CALLER.get)
 
 
 class Searches:
     """Searches maps for encoded queries; it is used only from the event loop.
 
-    Whenever a thread is free for a map it takes the queries that wait, so a single query never waits for others.
+    Whenever a thread is free for a map it takes the queries that wait, so a single query never waits for others.  If
+    more wait than one search takes, those of the callers that were served least go first.
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[_SearchKey, deque[_Waiting]] = {}
+        self._waiting: dict[_SearchKey, FairQueue[_Waiting]] = {}
         self._running: defaultdict[_SearchKey, int] = defaultdict(int)
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_once = max(1, cores() // CORES_A_SEARCH)
@@ -125,14 +131,16 @@ class Searches:
         """
         question = queries[0].question
         if question.selection is not None:
-            return await to_thread.run_sync(locate, map_, encoder, queries)
+            return await in_thread(locate, map_, encoder, queries)
         loop = asyncio.get_running_loop()
         key = _SearchKey(map_, encoder)
         parts = [
             _Waiting(queries[start : start + MOST_TOGETHER], loop.create_future())
             for start in range(0, len(queries), MOST_TOGETHER)
         ]
-        self._waiting.setdefault(key, deque()).extend(parts)
+        waiting = self._waiting.setdefault(key, FairQueue())
+        for part in parts:
+            waiting.add(part.caller, part)
         if self._running[key] < self._at_once:
             self._running[key] += 1
             # Starting a little later lets frames that were encoded at the same time join the search.
@@ -160,21 +168,24 @@ class Searches:
 
     def _take(self, key: _SearchKey) -> list[_Waiting]:
         """The queries of the next search: an equal share for each thread that the map may use."""
-        waiting = self._waiting.get(key, deque())
+        waiting = self._waiting.get(key, FairQueue[_Waiting]())
         most = min(MOST_TOGETHER, -(-sum(len(one.queries) for one in waiting) // self._at_once))
         taken: list[_Waiting] = []
         count = 0
-        while waiting and (not taken or count + len(waiting[0].queries) <= most):
-            one = waiting.popleft()
+        while (first := waiting.first()) is not None and (not taken or count + len(first.queries) <= most):
+            one = waiting.pop()
             if not one.answer.done():  # else its request was cancelled
                 taken.append(one)
                 count += len(one.queries)
+                waiting.charge(one.caller, EXPECTED_MILLISECONDS * len(one.queries))
         return taken
 
     async def _answer(self, key: _SearchKey, together: Sequence[_Waiting]) -> None:
         queries = [query for one in together for query in one.queries]
+        began = time.perf_counter()
         try:
-            answers = await to_thread.run_sync(locate, key.map_, key.encoder, queries)
+            CALLER.set(together[0].caller)  # whose turn it is
+            answers = await in_thread(locate, key.map_, key.encoder, queries)
         except Exception as error:
             if len(together) > 1:  # search for each alone, so that only the faulty ones fail
                 for one in together:
@@ -182,8 +193,10 @@ class Searches:
             elif not together[0].answer.done():
                 together[0].answer.set_exception(error)
             return
+        surplus = 1e3 * (time.perf_counter() - began) / len(queries) - EXPECTED_MILLISECONDS
         remaining = iter(answers)
         for one in together:
             answer = [next(remaining) for _ in one.queries]
+            self._waiting[key].charge(one.caller, surplus * len(one.queries))
             if not one.answer.done():
                 one.answer.set_result(answer)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import http
 import logging
 import random
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from urllib.parse import quote
 
@@ -20,6 +22,7 @@ from starlette.responses import JSONResponse, Response
 from core import errors
 from core.disk.files import disk_errors
 from service.errors import faults
+from service.fairness import CALLER, RefusalPace
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:placerec:problem:"
@@ -326,18 +329,25 @@ def problem_response(request: Request, error: Exception) -> Response:
     return JSONResponse(body, problem.status, headers, media_type=MEDIA_TYPE)
 
 
-async def _answer(request: Request, error: Exception) -> Response:
+async def _answer(pace: RefusalPace, request: Request, error: Exception) -> Response:
     if isinstance(error, RequestValidationError):
         error = invalid_request(error.errors())
     elif isinstance(error, HTTPException) and isinstance(error.__cause__, faults.Fault):
         error = error.__cause__  # the framework raised a plain 400 from it while it read the body
+    busy = isinstance(error, RETRY_LATER) and not isinstance(error, faults.Stopping)
+    if busy and (pause := pace.pause(CALLER.get())):
+        await asyncio.sleep(pause)
     return problem_response(request, error)
 
 
-def install_problems(app: FastAPI) -> None:
-    """Answer every error class of the table, and the framework's own errors, with its problem object."""
+def install_problems(app: FastAPI, pace: RefusalPace) -> None:
+    """Answer every error class of the table, and the framework's own errors, with its problem object.
+
+    Args:
+        pace: at which callers are told to come again.
+    """
     for cls in (errors.PlacerecError, faults.Fault, HTTPException, RequestValidationError):
-        app.add_exception_handler(cls, _answer)
+        app.add_exception_handler(cls, partial(_answer, pace))
 
 
 def problem_documentation(*kinds: type[Exception]) -> dict[int | str, dict[str, Any]]:

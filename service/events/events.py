@@ -21,6 +21,7 @@ from service.errors.faults import TooManyListeners
 from service.events.feed import Feed, FeedEvent, Listener
 from service.events.relay import EventRelay
 from service.events.schemas import PRIVATE, Event, QueryEvent
+from service.fairness import Holding, SharedRoom
 
 LINGER_SECONDS = 120.0
 """How long the events of a map are stored after its last listener has left."""
@@ -51,15 +52,19 @@ class Events:
         clock: Callable[[], float] = time.monotonic,
         relay: EventRelay | None = None,
     ) -> None:
-        self._most_listeners, self._clock, self._relay = most_listeners, clock, relay
+        self._room, self._clock, self._relay = SharedRoom(most_listeners), clock, relay
         self._feeds: dict[str, Feed] = {}
         self._lock = threading.Lock()
         self._drawing = self._drawing_bytes = 0
         self._artist: ThreadPoolExecutor | None = None
-        self.listeners = 0
         self.stopping = False
         if relay is not None:
             relay.serve(self)
+
+    @property
+    def listeners(self) -> int:
+        """The number of clients that listen."""
+        return self._room.held
 
     @property
     def _elsewhere(self) -> Mapping[str, bool]:
@@ -169,6 +174,8 @@ class Events:
     def listening(self, map_id: str, resumed: str | None = None, pictures: bool = False) -> Iterator[Listener]:
         """A listener of a map; use this on an event loop.
 
+        If too many listen, the latest listener of the caller that has most of them has to go.
+
         Args:
             resumed: the id of the last event that the listener has seen.
             pictures: whether it wants pictures of the frames of queries.
@@ -177,12 +184,13 @@ class Events:
             TooManyListeners: too many clients listen already.
         """
         with self._lock:
-            if self.listeners >= self._most_listeners:
+            if not self._room.has_room(share=map_id):
                 raise TooManyListeners("Too many clients listen to events already; try again later.")
-            self.listeners += 1
             feed = self._feeds.setdefault(map_id, Feed(self._lock))
             feed.left_at = None
             listener = Listener(feed, resumed, pictures)
+            holding = Holding(listener.give_way, map_id)
+            self._room.take(holding)
             feed.listeners.append(listener)
             self._drop_left()
         self._say_listeners_changed()
@@ -190,7 +198,7 @@ class Events:
             yield listener
         finally:
             with self._lock:
-                self.listeners -= 1
+                self._room.release(holding)
                 feed.listeners.remove(listener)
                 if not feed.listeners:
                     feed.left_at = self._clock()
@@ -205,7 +213,7 @@ class Events:
         now = self._clock()
         left = sorted((feed.left_at, map_id) for map_id, feed in self._feeds.items() if feed.left_at is not None)
         for index, (moment, map_id) in enumerate(left):
-            if now - moment >= LINGER_SECONDS or len(left) - index > self._most_listeners:
+            if now - moment >= LINGER_SECONDS or len(left) - index > self._room.capacity:
                 del self._feeds[map_id]
 
     def end(self, map_id: str) -> None:

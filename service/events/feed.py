@@ -135,6 +135,14 @@ class Listener:
         self._seen = feed.number if found is None else found
         self._loop = asyncio.get_running_loop()
         self.changed = asyncio.Event()
+        self.over = False
+        """Whether the listener has to go."""
+
+    def give_way(self) -> bool:
+        """Let the listener go, so that another caller can listen."""
+        self.over = True
+        self.wake()
+        return True
 
     @property
     def ended(self) -> bool:

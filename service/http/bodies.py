@@ -13,35 +13,37 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
+from service.fairness import Holding, SharedRoom
 from service.settings import Settings
 
 PIECE_BYTES = 1 << 20
 """Size of the pieces in which a body is written to disk as it arrives."""
 
 
-class UploadMemory:
-    """Counts the bytes of bodies that all requests together hold in memory."""
+class UploadMemory(SharedRoom):
+    """Counts the bytes of bodies that all requests together hold in memory, and by caller.
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity, self.held = capacity, 0
+    When the memory is full, the caller that holds most of it loses its latest upload to one that holds less.
+    """
 
-    def take(self, size: int) -> None:
+    def hold(self, holding: Holding, size: int) -> None:
         """Count ``size`` bytes more.
 
         Raises:
-            MemoryFull: they would exceed the capacity; none is counted.
+            MemoryFull: there is no room for them; none is counted.
         """
-        self.check(size)
-        self.held += size
+        if not self.take(holding, size):
+            raise memory_full()
 
-    def check(self, size: int) -> None:
-        """Raise MemoryFull unless ``size`` bytes have room now."""
-        if self.held + size > self.capacity:
-            raise MemoryFull("Too many uploads are under way. Send the request again in a moment.")
+    def check(self, holding: Holding, size: int) -> None:
+        """Raise MemoryFull unless there is room for ``size`` bytes more now."""
+        if not self.has_room(size, holding.share, holding.caller):
+            raise memory_full()
 
-    def release(self, size: int) -> None:
-        """Count ``size`` bytes fewer."""
-        self.held -= size
+
+def memory_full() -> MemoryFull:
+    """The error of a body for which there is no room, or not any more."""
+    return MemoryFull("Too many uploads are under way. Send the request again in a moment.")
 
 
 class Intake:
@@ -68,9 +70,10 @@ class Intake:
     ) -> None:
         self.limit, self.deadline, self.idle = limit, deadline, idle
         self.size, self.complete = 0, False
-        self.held = 0
-        """Bytes of this body that count as held in memory."""
-        self._is_held = True
+        self.holding = Holding(self._give_way)
+        """The bytes of this body that are held in memory."""
+        self._is_held, self._given_way = True, False
+        self._receiving: asyncio.Timeout | None = None
         self._receive, self._memory = receive, memory
         lengths = [value for name, value in scope["headers"] if name == b"content-length"]
         self._announced = int(lengths[0]) if lengths and lengths[0].isdigit() else 0
@@ -80,19 +83,18 @@ class Intake:
 
         Raises:
             BodyTooLarge: the body is longer than the limit, or its Content-Length is.
-            MemoryFull: the uploads under way leave no room for the body.
+            MemoryFull: the uploads under way leave no room for the body, or not any more.
             DeadlineExceeded: the body did not arrive in time.
             ClientGone: the connection was closed before the end of the body.
         """
         if self.complete:
-            return await self._receive()
+            return await self._next(None)
         self._check(self._announced)
         if self._is_held:
-            self._memory.check(max(0, self._announced - self.size))
+            self._memory.check(self.holding, max(0, self._announced - self.size))
         left = self.deadline - time.monotonic()
         try:
-            async with asyncio.timeout(min(left, self.idle)):
-                message = await self._receive()
+            message = await self._next(min(left, self.idle))
         except TimeoutError:
             if self.idle < left:
                 raise DeadlineExceeded(f"No byte of the body arrived for {self.idle:g} seconds.") from None
@@ -101,12 +103,32 @@ class Intake:
             raise ClientGone("The connection was closed before the end of the body.")
         arrived = len(message.get("body", b""))
         self._check(self.size + arrived)
-        if self._is_held:
-            self._memory.take(arrived)
-            self.held += arrived
+        if self._is_held and arrived:
+            self._memory.hold(self.holding, arrived)
         self.size += arrived
         self.complete = not message.get("more_body", False)
         return message
+
+    async def _next(self, seconds: float | None) -> Message:
+        """The next message of the server; raises TimeoutError, or MemoryFull as soon as the body has given way."""
+        if self._given_way:
+            raise memory_full()
+        try:
+            async with asyncio.timeout(seconds) as self._receiving:
+                return await self._receive()
+        except TimeoutError:
+            if self._given_way:
+                raise memory_full() from None
+            raise
+        finally:
+            self._receiving = None
+
+    def _give_way(self) -> bool:
+        """Refuse the rest of the body, and the request where it still waits for the encoder."""
+        self._given_way = True
+        if self._receiving is not None and not self._receiving.expired():
+            self._receiving.reschedule(asyncio.get_running_loop().time())
+        return True
 
     def pass_on(self, limit: int, seconds: float) -> None:
         """Allow a longer body, which the route writes to disk as it arrives and does not hold in memory.
@@ -118,7 +140,11 @@ class Intake:
         self.limit, self.deadline, self._is_held = limit, time.monotonic() + seconds, False
 
     async def hung_up(self) -> None:
-        """Return when the client has closed the connection; call it once the body was read."""
+        """Return when the client has closed the connection; call it once the body was read.
+
+        Raises:
+            MemoryFull: the memory that the body holds is left to another caller.
+        """
         while (await self())["type"] == "http.request":
             pass
 
@@ -146,7 +172,7 @@ class BodyLimit:
             await self.app(scope, intake, send)
         finally:
             state["bytes_in"] = intake.size
-            self.memory.release(intake.held)
+            self.memory.release(intake.holding)
 
 
 async def in_pieces(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:

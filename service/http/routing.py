@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable, Coroutine, Mapping
+from functools import wraps
 from typing import Annotated, Any, Protocol, Self, TypeVar
 
 from fastapi import Depends, Header, Path, Query, Request
@@ -20,6 +22,7 @@ from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of, json_size, parse_json
 from service.http.schemas import PageParameters
 from service.http.uploads import instead_of, media_type, read_frame
+from service.worker_threads import in_thread
 
 JSON_TYPES = ("application/json", "application/merge-patch+json")
 
@@ -173,8 +176,25 @@ class StrictRequest(Request):
         return value
 
 
+def _in_turn(endpoint: Callable[..., Any]) -> Callable[..., Coroutine[Any, Any, Any]]:
+    """A function that blocks, as one that is run in a thread when it is its caller's turn."""
+
+    @wraps(endpoint)
+    async def run(**arguments: Any) -> Any:
+        return await in_thread(endpoint, **arguments)
+
+    return run
+
+
 class StrictRoute(APIRoute):
-    """A route that refuses JSON bodies with infinite numbers or lone surrogates."""
+    """A route that refuses JSON bodies with infinite numbers or lone surrogates.
+
+    A function that blocks is run in a thread when it is its caller's turn; the framework knows no turns.
+    """
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **more: Any) -> None:
+        blocks = not inspect.iscoroutinefunction(endpoint)
+        super().__init__(path, _in_turn(endpoint) if blocks else endpoint, **more)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()

@@ -17,7 +17,10 @@ from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
 from service.errors.faults import Fault, HeadTooLarge, MalformedHead, MemoryFull
+from service.fairness import Holding
 from service.http.connections import Connection, Connections
+
+UNKNOWN = "unknown"
 
 INVALID_DATA, POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1007, 1008, 1013, 1012
 
@@ -68,6 +71,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._arriving = 0  # bytes of the unfinished message
         self._held = deque[int]()  # bytes of the message at work and of each one that waits
         self._write_timer: asyncio.TimerHandle | None = None
+        self._holding: Holding | None = None
 
     def came_from(self, origin: Connection) -> None:
         """Take over the entry of the connection that requested the upgrade in the register."""
@@ -82,7 +86,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
             self._connections.leave(self._origin, self)
         if self._write_timer is not None:
             self._write_timer.cancel()
-        self._connections.memory.release(self._arriving + sum(self._held))
+        self._connections.memory.release(self._room())
         self._arriving = 0
         self._held.clear()
         super().connection_lost(exc)
@@ -98,7 +102,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
                 self.transport.abort()
             return
         try:
-            self._connections.memory.take(len(data))
+            self._connections.memory.hold(self._room(), len(data))
         except MemoryFull:
             self._fail(TRY_AGAIN_LATER, "memory-full")
             return
@@ -106,8 +110,19 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         super().data_received(data)
         # Bytes of no message, such as those of a ping, are held no longer.
         left = len(self.conn.reader.buffer) + sum(map(len, self.frames))
-        self._connections.memory.release(self._arriving - left)
+        self._connections.memory.release(self._room(), self._arriving - left)
         self._arriving = left
+
+    def _room(self) -> Holding:
+        """The bytes of its messages that are held in memory, which are its caller's as soon as that is known."""
+        if self._holding is None:
+            caller = self.scope.get("state", {}).get("caller", UNKNOWN) if self.handshake_initiated else UNKNOWN
+            self._holding = Holding(self._give_way, caller=caller)
+        return self._holding
+
+    def _give_way(self) -> bool:
+        self._fail(TRY_AGAIN_LATER, "memory-full")
+        return True
 
     def handle_cont(self, event: Frame) -> None:
         if len(self.frames) >= self._settings.max_stream_fragments:
@@ -140,7 +155,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
 
     async def receive(self) -> Any:
         if self._at_work and self._held:
-            self._connections.memory.release(self._held.popleft())
+            self._connections.memory.release(self._room(), self._held.popleft())
         self._at_work = False
         if self._stopping and self.handshake_complete:
             self._say_restarting()

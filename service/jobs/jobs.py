@@ -27,6 +27,7 @@ from service.access.audit import ASKER, asker_of_fields, note_job, now_asking
 from service.errors.faults import JobLost, UnknownJob
 from service.errors.problems import problem_of
 from service.events.events import Events
+from service.fairness import CALLER
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
 from service.jobs.file import open_file
 from service.jobs.job import Job, JobState
@@ -247,7 +248,7 @@ class Jobs:
                 was replaced by another map of the same id.
 
         Raises:
-            JobQueueFull: too many jobs are waiting.
+            JobQueueFull: too many jobs are waiting, and the caller has its share of them.
             StorageFull, StorageFailure: the job was not accepted.
         """
         job = Job(
@@ -274,9 +275,12 @@ class Jobs:
         return job
 
     def check_room(self) -> None:
-        """Raise JobQueueFull if no further job may wait; a route calls it before it reads a long body."""
+        """Raise JobQueueFull if no further job of the caller may wait; may block.
+
+        A route calls it before it reads a long body.
+        """
         if self.counts()["queued"] >= self._longest_queue:
-            raise self._table.queue_full()
+            self._table.check_room(ASKER.get().caller)
 
     def counts(self) -> Counter[JobState]:
         """How many of the jobs that are remembered are in each state; never waits."""
@@ -340,7 +344,9 @@ class Jobs:
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
         context = JobContext(self, job)
-        ASKER.set(asker_of_fields(job.asker))  # it works on behalf of its caller
+        asker = asker_of_fields(job.asker)
+        ASKER.set(asker)  # it works on behalf of its caller
+        CALLER.set(asker.caller)
         try:
             result = dict((self._works[job.id] if job.id in self._works else self._kinds[job.kind])(context))
             if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:

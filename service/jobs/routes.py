@@ -27,7 +27,7 @@ from service.http.event_stream import (
     set_within,
     stream_response,
 )
-from service.http.routing import FromState, PrincipalDep, single_values
+from service.http.routing import FromState, PrincipalDep, StrictRoute, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
 from service.jobs.job import Job, JobState
@@ -36,7 +36,7 @@ from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
 from service.worker_threads import in_thread
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
 LONGEST_WAIT = 60.0
 """The longest time, in seconds, that a read of a job waits for its end."""
@@ -97,7 +97,7 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
     if wait and not job.ended:
         until = time.monotonic() + wait
         with jobs.watchers.watching(job_id) as changed:
-            while not (job := await in_thread(jobs.get, job_id)).ended and not jobs.stopping:
+            while not (job := await in_thread(jobs.get, job_id)).ended and not (jobs.stopping or changed.over):
                 if not await set_within(changed, until - time.monotonic()):
                     break
     return JobView.of(await in_thread(jobs.get, job_id))
@@ -159,7 +159,8 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
-    """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
+    """The events after ``last``, until the job ends, the service stops, the caller's key is revoked, or another caller
+    needs the place."""
     with jobs.watchers.watching(job_id) as changed:
         yield OPENING
         while True:
@@ -170,7 +171,7 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
             if job.version != last:
                 last = job.version
                 yield _event(job)
-            if job.ended or jobs.stopping:
+            if job.ended or jobs.stopping or changed.over:
                 return
             if not await set_within(changed, HEARTBEAT_SECONDS):
                 yield HEARTBEAT

@@ -24,6 +24,7 @@ ALL = Statement(select(*READ).order_by(_jobs.number))
 GET = Statement(select(*READ).where(_jobs.id == bindparam("id")))
 COUNTS = Statement(select(_jobs.state, func.count()).group_by(_jobs.state))
 QUEUED = Statement(select(func.count()).where(_jobs.state == "queued"))
+WAITING_ASKERS = Statement(select(_jobs.asker).where(_jobs.state == "queued"))
 HELD = Statement(
     select(_jobs.id, _jobs.attempt, _jobs.cancelling).where(_jobs.owner == _service, _jobs.state == "running")
 )

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from core.ledger import Ledger, LedgerConnection, Lock, Statement
+from service.access.audit import asker_of_fields
 from service.errors.faults import JobEnded, JobQueueFull
 from service.jobs import statements
 from service.jobs.job import Job, JobState
@@ -80,15 +81,26 @@ class JobTable:
     def add(self, job: Job) -> Job:
         """Add a job to the queue; the job with its number.
 
+        A full queue takes further jobs of a caller that has less than an equal share of it.
+
         Raises:
             JobQueueFull: the largest number of jobs wait.
         """
         with self._order:
             with self._ledger.transaction("add a job", Lock.JOBS) as connection:
                 if connection.execute(statements.QUEUED)[0][0] >= self._longest_queue:
-                    raise self.queue_full()
+                    self._check_share(asker_of_fields(job.asker).caller, connection.execute(statements.WAITING_ASKERS))
                 ((number,),) = connection.execute(statements.ADD, **values_of(job))
             return self._learned(replace(job, number=number))
+
+    def check_room(self, caller: str) -> None:
+        """Raise JobQueueFull if a caller could not add a job to a full queue."""
+        self._check_share(caller, self._ledger.execute("read the jobs", statements.WAITING_ASKERS))
+
+    def _check_share(self, caller: str, rows: Sequence[Sequence[Any]]) -> None:
+        waiting = Counter(_caller_of(asker) for (asker,) in rows)
+        if waiting[caller] >= self._longest_queue // len({*waiting, caller}):
+            raise self.queue_full()
 
     def queue_full(self) -> JobQueueFull:
         """The error that no further job may wait."""
@@ -224,6 +236,14 @@ class JobTable:
         if self._known is not None:
             for job_id in ids:
                 self._known.pop(job_id, None)
+
+
+def _caller_of(asker: str) -> str:
+    """The caller of a job by its column ``asker``, which may be damaged."""
+    try:
+        return asker_of_fields(json.loads(asker)).caller
+    except (ValueError, TypeError, AttributeError):
+        return ""
 
 
 def _now() -> float:

@@ -11,10 +11,23 @@ from service.access.audit import asker_of_fields
 from service.errors.faults import TooManyWatchers
 from service.events.events import Events
 from service.events.schemas import JobEvent
+from service.fairness import Holding, SharedRoom
 from service.jobs.job import Job
 
 TELLING_SECONDS = 1.0
 """The shortest time between two events of a job's progress."""
+
+
+class JobChanged(asyncio.Event):
+    """Is set when a job has changed, or when its watcher has to go; ``over`` says that."""
+
+    over = False
+
+    def give_way(self) -> bool:
+        """Let the watcher go, so that another caller can follow jobs."""
+        self.over = True
+        self.set()
+        return True
 
 
 class Watchers:
@@ -26,28 +39,32 @@ class Watchers:
     """
 
     def __init__(self, most: int, events: Events | None) -> None:
-        self._most, self._events = most, events
+        self._room, self._events = SharedRoom(most), events
         self._published: dict[str, tuple[str, float]] = {}  # of running jobs: the state published last, and when
-        self._watching: list[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = []
+        self._watching: list[tuple[str, asyncio.AbstractEventLoop, JobChanged]] = []
 
     def __len__(self) -> int:
-        return len(self._watching)
+        return self._room.held
 
     @contextmanager
-    def watching(self, job_id: str) -> Iterator[asyncio.Event]:
+    def watching(self, job_id: str) -> Iterator[JobChanged]:
         """An event of the running loop that is set whenever the job changes, or when the service stops.
+
+        If too many follow jobs, the latest of the caller that has most of them has to go.
 
         Raises:
             TooManyWatchers: too many clients follow jobs already.
         """
-        if len(self) >= self._most:
+        watcher = (job_id, asyncio.get_running_loop(), JobChanged())
+        holding = Holding(watcher[2].give_way)
+        if not self._room.take(holding):
             raise TooManyWatchers("Too many clients follow jobs already; read the job instead, or try again later.")
-        watcher = (job_id, asyncio.get_running_loop(), asyncio.Event())
         self._watching.append(watcher)
         try:
             yield watcher[2]
         finally:
             self._watching.remove(watcher)
+            self._room.release(holding)
 
     def wake(self, job_id: str | None) -> None:
         """Wake the clients that follow a job; all clients for None."""

@@ -108,7 +108,7 @@ async def follow_map(
     A client that connects again with `Last-Event-ID` goes on where it was; the latest events are stored for two minutes
     after the last listener of the map has left. A listener that reads too slowly, or comes too late, learns how many
     events it has missed. A key of the role `query` does not see the callers. The stream ends when the map is deleted,
-    when the key is no longer valid for it, and when the service stops.
+    when the key is no longer valid for it, when the service stops, and when another caller needs its place.
     """
     map_ = await engine.map(map_id)
     stream = MapStream(engine, map_, options, lambda: request.app.state.gate.identify(request.scope))
@@ -148,10 +148,11 @@ class MapStream:
             raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; {what} {needed}.")
 
     async def texts(self, resumed: str | None) -> AsyncGenerator[str]:
-        """The text of the stream, until the map is deleted, the caller's key is refused or the service stops."""
+        """The text of the stream, until the map is deleted, the caller's key is refused, the service stops, or another
+        caller needs the place."""
         with self._engine.events.listening(self._map.record.id, resumed, self._pictures) as listener:
             yield OPENING + event_text(listener.position, "listening", self._head.model_dump_json(ensure_ascii=True))
-            while not self._engine.events.stopping:
+            while not (self._engine.events.stopping or listener.over):
                 principal = self._listening_now()
                 if principal is None:
                     return

@@ -185,7 +185,7 @@ async def import_map(
     if kind not in MEDIA_TYPES:
         raise UnsupportedMediaType(f"Send a map as {' or '.join(MEDIA_TYPES)}, not as {kind[:80] or 'nothing'}.")
     if options.background:
-        jobs.check_room()
+        await in_thread(jobs.check_room)
     settings = engine.settings
     if options.id is not None:
         principal.require(options.id)

@@ -26,7 +26,7 @@ from service.jobs.jobs import Jobs
 from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
 from service.places.enrolment import Enrolled, FrameToEnrol, enrol
 from service.places.staging import StagedForm, StagedPart, Staging
-from service.worker_threads import to_its_end
+from service.worker_threads import in_thread, to_its_end
 
 KIND = "enrol"
 
@@ -61,7 +61,7 @@ async def receive(
         DeadlineExceeded, ClientGone: the form did not arrive completely.
         StorageFull, StorageFailure: the form could not be stored; nothing of it is left.
     """
-    jobs.check_room()
+    await in_thread(jobs.check_room)
     if (kind := media_type(request)) != FORM:
         raise UnsupportedMediaType(f"Send the frames in a {FORM}, not as {kind[:80] or 'a body without a media type'}.")
     settings, length = engine.settings, request.headers.get("content-length", "")

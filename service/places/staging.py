@@ -11,6 +11,7 @@ import hashlib
 import json
 import shutil
 import threading
+from collections import Counter
 from collections.abc import AsyncIterator, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -20,6 +21,7 @@ from pathlib import Path
 from core.disk.files import disk_errors, write_at, write_file
 from core.errors import StorageFailure, StorageFull
 from service.errors.faults import StagingFull
+from service.fairness import CALLER
 from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
 from service.http.multipart import FormPart, FormReader
@@ -110,7 +112,8 @@ class Staging:
 
     Args:
         directory: the data directory.
-        capacity: the most bytes that all forms together may have.
+        capacity: the most bytes that all forms together may have; when they have as many, further ones are taken of
+            callers that have less than an equal share of them.
         reserve: bytes of the disk that forms leave free.
     """
 
@@ -119,6 +122,8 @@ class Staging:
         self._lock = threading.Lock()
         self._sizes: dict[str, int] = {}
         """The bytes of each form; of a form that is still arriving, the announced bytes."""
+        self._callers: dict[str, str] = {}
+        """The caller that sent each form; one from before a restart counts as anyone's."""
         self._coming: dict[str, int] = {}
         """The bytes that have not arrived yet of each form that is arriving."""
 
@@ -141,6 +146,7 @@ class Staging:
                 shutil.rmtree(self._folder / name)
         with self._lock:
             self._sizes.pop(name, None)
+            self._callers.pop(name, None)
 
     def clean(self, waited_for: Collection[str]) -> None:
         """Remove the forms that a crash left behind; call it before any form arrives.
@@ -163,9 +169,14 @@ class Staging:
 
     def _claim(self, name: str, size: int) -> None:
         with self._lock:
-            if sum(self._sizes.values()) + size > self.capacity:
+            caller, held = CALLER.get(), Counter[str]()
+            for form, its_size in self._sizes.items():
+                held[self._callers.get(form, caller)] += its_size
+            share = self.capacity // len({*held, caller})
+            if held.total() + size > self.capacity and held[caller] + size > share:
                 raise StagingFull("Too many frames are waiting to be enrolled already; send these again later.")
             self._sizes[name] = self._coming[name] = size
+            self._callers[name] = caller
 
     def _expect_room(self) -> None:
         """Check that the disk has room for all bytes that are still to arrive, and for the reserve."""
@@ -209,7 +220,7 @@ class Staging:
                 size = await to_its_end(lambda: _complete(arrival, writer.staged))
         except BaseException:
             with self._lock:
-                del self._sizes[name], self._coming[name]
+                del self._sizes[name], self._coming[name], self._callers[name]
             raise
         with self._lock:
             del self._coming[name]

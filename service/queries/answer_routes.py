@@ -13,7 +13,7 @@ from core.judgement.verdict import Verdict
 from core.places import Timestamp
 from service.access.roles import Principal
 from service.errors.problems import problem_documentation
-from service.http.routing import EngineDep, MapId, PlaceId, PrincipalDep, single_values
+from service.http.routing import EngineDep, MapId, PlaceId, PrincipalDep, StrictRoute, single_values
 from service.http.schemas import Parameters
 from service.queries.answers import StatisticsDep
 from service.queries.counts import HourCount
@@ -22,7 +22,9 @@ from service.queries.recent_answers import MOST_OF_MAP
 from service.queries.schemas import EstimatedPose
 from service.queries.statistics import map_key
 
-router = APIRouter(prefix="/v1/maps/{map}", tags=["queries"], dependencies=[Depends(single_values)])
+router = APIRouter(
+    prefix="/v1/maps/{map}", tags=["queries"], route_class=StrictRoute, dependencies=[Depends(single_values)]
+)
 
 ANSWER_EXAMPLE: dict[str, Any] = {
     "at": "2026-11-22T18:02:31.977000Z",

@@ -24,6 +24,7 @@ from service.http.routing import (
     EngineDep,
     FromState,
     MapId,
+    StrictRoute,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -50,7 +51,12 @@ router = APIRouter(
         errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
     ),
 )
-explanations = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
+explanations = APIRouter(
+    prefix="/v1/maps/{map}/explanations",
+    tags=["queries"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
 QueryOptions = Annotated[QueryParameters, Query()]
 PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 

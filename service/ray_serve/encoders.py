@@ -314,6 +314,7 @@ class RayEncoders:
             return
         data, limits = frame.data, self._limits
         computed = {name: spent for name, spent in made.milliseconds.items() if name != "wait"}
+        self._waiting.settle(frame, sum(computed.values()))
         wait = max(0.0, 1e3 * (time.perf_counter() - frame.queued) - sum(computed.values()))
         frame.result.set_result(
             Encoded(
@@ -396,6 +397,7 @@ def _sent(frame: QueuedFrame, now: float) -> SentFrame:
         frame.bulk,
         frame.keypoints,
         frame.features,
+        frame.caller,
     )
 
 

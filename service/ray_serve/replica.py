@@ -48,6 +48,7 @@ class SentFrame:
     identity: of the encoder.
     keypoints, features: outputs wanted besides descriptors.
     seconds: until its deadline, from the moment at which it was sent; clocks of two machines need not agree.
+    caller: the caller whose turn it takes.
     """
 
     identity: str
@@ -57,6 +58,7 @@ class SentFrame:
     bulk: bool
     keypoints: bool
     features: bool
+    caller: str
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,16 @@ class EncoderReplica:
             else:
                 until = arrived + frame.seconds
                 queued.append(
-                    QueuedFrame(encoder, frame.data, frame.mask, until, frame.bulk, frame.keypoints, frame.features)
+                    QueuedFrame(
+                        encoder,
+                        frame.data,
+                        frame.mask,
+                        until,
+                        frame.bulk,
+                        frame.keypoints,
+                        frame.features,
+                        caller=frame.caller,
+                    )
                 )
         waiting = [frame for frame in queued if isinstance(frame, QueuedFrame)]
         self._threads.put(waiting)

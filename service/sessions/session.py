@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -15,7 +14,7 @@ from core.maps.selection import Conditions, Selection
 from service.errors.faults import QueueFull
 from service.learning.run_notes import RunNotes
 from service.sessions.schemas import NewSession
-from service.sessions.table import SessionRecord
+from service.sessions.table import SessionRecord, key_of
 
 WAITING = 8
 """The most frames of one session that may wait for their turn."""
@@ -40,9 +39,9 @@ class Session:
     revision: of the record that the belief was saved as.
     recorded: the revision of the record, as it was last seen.
     restored: whether the session was restored after a restart.
-    key: the name of the key that began the session; None without one.
     streaming: whether a WebSocket streams into the session.
     notes: what the map learns from, of the frames that this service has processed; None: it learns nothing.
+    begun_by: the caller and the request that began it, as its record has them.
     waiting: how many frames are being processed or wait for that.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
@@ -65,9 +64,9 @@ class Session:
     revision: int = 0
     recorded: int = 0
     restored: bool = False
-    key: str | None = None
     streaming: bool = False
     notes: RunNotes | None = None
+    begun_by: str | None = None
     waiting: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -82,7 +81,7 @@ class Session:
         options = NewSession.model_validate_json(record.options)
         session = cls(record.id, record.map, record.map_created_at, options, record.expires_after, record.created)
         session.read_fields(record)
-        session.key = _key_of(record.begun_by)
+        session.begun_by = record.begun_by
         session.idle_since = time.monotonic() - max(0.0, record.idle)
         return session
 
@@ -106,6 +105,7 @@ class Session:
             lost=self.lost,
             frames=self.frames,
             revision=self.revision,
+            begun_by=self.begun_by,
             state=None if self.run is None else to_bytes(self.run.state()),
             answer=self.answer,
         )
@@ -114,6 +114,11 @@ class Session:
         """Note the revision of the record, and when the last frame came."""
         self.used, self.recorded = head.used, max(self.recorded, head.revision)
         self.idle_since = max(self.idle_since, time.monotonic() - max(0.0, head.idle))
+
+    @property
+    def key(self) -> str | None:
+        """The name of the key that began the session; None without one."""
+        return key_of(self.begun_by)
 
     @property
     def idle(self) -> float:
@@ -165,14 +170,6 @@ class Session:
                 yield
         finally:
             self.waiting -= 1
-
-
-def _key_of(begun_by: str | None) -> str | None:
-    """The name of the key with which a session was begun, by its record; None without one."""
-    if begun_by is None:
-        return None
-    principal, key, _ = json.loads(begun_by)
-    return None if key is None else str(principal)
 
 
 def creation_time(map_: Map) -> str:

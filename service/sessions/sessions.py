@@ -12,11 +12,12 @@ clock, and are found and listed without a look at the disk.
 
 from __future__ import annotations
 
-import json
 import logging
 import secrets
 import threading
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -31,17 +32,19 @@ from service.access.audit import ASKER
 from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NO_ASKER, SessionEvent
+from service.fairness import Holding, SharedRoom
 from service.learning.run_notes import RunNotes
 from service.peers.peers import Peers
 from service.sessions.graphs import SessionGraphs
 from service.sessions.schemas import NewSession
 from service.sessions.session import Session, creation_time
-from service.sessions.table import SessionRecord, SessionTable
+from service.sessions.table import SessionRecord, SessionTable, begun_by, caller_of
 from service.settings import Settings
 
 EXPIRED = "No frame came for too long."
 MAP_GONE = "Its map was deleted; the map of that id is another one now."
 STATE_LOST = "Its saved belief was damaged on disk."
+GAVE_WAY = "Its room was needed for others, and it had waited longest for a frame."
 
 REFUSALS = (StorageFull, StorageFailure, Damage)
 
@@ -109,7 +112,8 @@ class Sessions:
         The same request again, because its answer was lost, gets the session that it has begun, if no frame has come.
 
         Raises:
-            TooManySessions: there are too many sessions, or they would need too much memory.
+            TooManySessions: there are too many sessions, or they would need too much memory, and no other caller has
+                more of them.
             UnknownSequence: the map has no sequence of one of the names.
         """
         if absent := map_.unknown_sequences(options.sequences or []):
@@ -118,37 +122,46 @@ class Sessions:
         expires_after = min(options.expires_after or longest, longest)
         session = Session(f"s-{secrets.token_hex(8)}", map_.record.id, creation_time(map_), options, expires_after)
         self._end_expired()
-        begun_by, asker = _begun_by(), ASKER.get()
-        session.key = None if asker.key is None else asker.principal
-        if (begun := self._begun_before(map_, session, begun_by)) is not None:
+        asker = ASKER.get()
+        session.begun_by = begun_by(asker)
+        if asker.request_id is not None and (begun := self._begun_before(map_, session)) is not None:
             return begun
         session.run = Run(options.run_options(), self._graphs.graph(map_, session.selection))
         self._hold(session)
         try:
-            session.created = session.used = self._table.add(session.record(), self._settings.max_sessions, begun_by)
+            added, given_way = self._table.add(session.record(), self._settings.max_sessions, GAVE_WAY)
         except BaseException:
             self._let_go(session.id)
             raise
+        session.created = session.used = added
+        for record in given_way:
+            self._let_go(record.id)
+            if (ended := self._session_of(record)) is not None:
+                self._tell(ended, "ended", GAVE_WAY)
         self._tell(session, "begun")
         return session
 
     def _hold(self, session: Session) -> None:
         """Hold a new session in memory.
 
+        Sessions of a caller that needs more memory end to make room for it.
+
         Raises:
             TooManySessions: it would need too much memory.
         """
-        with self._lock:
-            runs = [one.run for one in (*self._held.values(), session) if one.run]
-            graphs = {id(run.graph): run.graph.bytes for run in runs}
-            held = sum(graphs.values()) + sum(run.bytes for run in runs)
-            if held <= self._settings.max_session_memory:
-                self._held[session.id] = session
-                return
-            self._graphs.drop_unused(self._held.values())
-        raise TooManySessions(
-            f"The sessions would hold {held >> 20} MiB, more than they are allowed to; delete one that is over."
-        )
+        while True:
+            with self._lock:
+                sizes = sizes_of([*self._held.values(), session])
+                if (held := sum(sizes.values())) <= self._settings.max_session_memory:
+                    self._held[session.id] = session
+                    return
+                if (given_way := _greediest(session, sizes)) is None:
+                    self._graphs.drop_unused(self._held.values())
+                    raise TooManySessions(
+                        f"The sessions would hold {held >> 20} MiB, more than they are allowed to; delete one that is"
+                        " over."
+                    )
+            self._end(given_way, GAVE_WAY)
 
     def _let_go(self, session_id: str) -> bool:
         """Hold a session no longer; whether it was held."""
@@ -159,9 +172,9 @@ class Sessions:
             self.on_run(held, held.notes)
         return held is not None
 
-    def _begun_before(self, map_: Map, session: Session, begun_by: str | None) -> Session | None:
+    def _begun_before(self, map_: Map, session: Session) -> Session | None:
         """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
-        found = None if begun_by is None else self._table.begun(begun_by, session.record())
+        found = self._table.begun(session.record())
         if found is None:
             return None
         begun = self.find(map_, found)
@@ -261,7 +274,7 @@ class Sessions:
         """Tell the listeners of a session's map, if it has any; a session that ends by itself was ended by nobody."""
         if not self._events.heard(session.map_id):
             return
-        by = NO_ASKER if reason in (EXPIRED, MAP_GONE, STATE_LOST) else None
+        by = NO_ASKER if reason in (EXPIRED, MAP_GONE, STATE_LOST, GAVE_WAY) else None
         camera = session.options.camera
         event = SessionEvent.now(
             session.map_id, by, session=session.id, change=change, reason=reason, camera=camera, frame=session.number
@@ -333,7 +346,24 @@ def _ended(session_id: str, reason: str) -> SessionExpired:
     return SessionExpired(f"The session {session_id[:80]} is over. {reason} Begin a new one.")
 
 
-def _begun_by() -> str | None:
-    """The present caller and the id of the request; None if requests cannot be distinguished."""
-    asker = ASKER.get()
-    return None if asker.request_id is None else json.dumps([asker.principal, asker.key, asker.request_id])
+def sizes_of(sessions: Sequence[Session]) -> dict[Session, int]:
+    """The bytes that each session holds; those of a graph are divided among the sessions over it."""
+    runs = {one: one.run for one in sessions if one.run is not None}
+    users = Counter(id(run.graph) for run in runs.values())
+    return {one: run.bytes + run.graph.bytes // users[id(run.graph)] for one, run in runs.items()}
+
+
+def _greediest(session: Session, sizes: Mapping[Session, int]) -> Session | None:
+    """The session that gives way to a new one, the longest without a frame of the caller and map that hold most."""
+    chosen: list[Session] = []
+    others = sorted((one for one in sizes if one is not session), key=lambda one: one.idle)
+    room = SharedRoom(sum(sizes[one] for one in others))
+    for one in others:
+        room.take(Holding(partial(_choose, chosen, one), one.map_id, caller_of(one.begun_by)), sizes[one])
+    room.take(Holding(lambda: False, session.map_id, caller_of(session.begun_by)), sizes[session])
+    return chosen[0] if chosen else None
+
+
+def _choose(chosen: list[Session], session: Session) -> bool:
+    chosen.append(session)
+    return True

@@ -6,7 +6,10 @@ frame.  Moments are seconds since 1970 UTC by the database's clock.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,9 @@ from core.disk.sqlite_file import DURABLE
 from core.ledger import Ledger, Lock, Statement, Tables
 from core.ledger.sqlite import SqliteLedger, file_of
 from core.ledger.statements import binary, integer, real, seconds_now, text
+from service.access.audit import Asker
 from service.errors.faults import TooManySessions
+from service.fairness import Holding, SharedRoom
 
 FILE = "sessions.sqlite"
 
@@ -59,12 +64,12 @@ class SessionRecord:
     expires_after: seconds.
     created, used: when the session was created and when its last frame came; the table gives them.
     idle: seconds since its last frame when it was read.
-    begun_by: the caller that began it and the request, JSON; None if that is not known.
     number, moment, request, lost, frames: as in :class:`service.sessions.session.Session`.
     revision: grows with every frame.
     ended: why the session has ended; None if it has not.
     state: the belief, as ``core.belief.record`` writes it; None where it is not read.
     answer: the last answer, JSON; None where it is not read.
+    begun_by: the caller and the request that began it, from :func:`begun_by`; None if unknown.
     """
 
     id: str
@@ -81,10 +86,32 @@ class SessionRecord:
     frames: int = 0
     revision: int = 0
     ended: str | None = None
-    idle: float = 0.0
     begun_by: str | None = None
+    idle: float = 0.0
     state: bytes | None = None
     answer: str | None = None
+
+
+def begun_by(asker: Asker) -> str:
+    """The caller, the id of the request that begins a session, and the name of the key, as JSON."""
+    return json.dumps([asker.caller, asker.request_id, asker.principal if asker.key is not None else None])
+
+
+def caller_of(begun_by: str | None) -> str:
+    """The caller of :func:`begun_by`."""
+    try:
+        return str(json.loads(begun_by or "")[0])
+    except (ValueError, IndexError, KeyError, TypeError):
+        return "unknown"
+
+
+def key_of(begun_by: str | None) -> str | None:
+    """The name of the key of :func:`begun_by`; None without one."""
+    try:
+        name = json.loads(begun_by or "")[2]
+    except (ValueError, IndexError, KeyError, TypeError):
+        return None
+    return None if name is None else str(name)
 
 
 _METADATA = MetaData()
@@ -178,6 +205,7 @@ _RENEW = Statement(
         | {"used": seconds_now(), "revision": _C.revision + 1}
     )
 )
+_BY_USE = Statement(select(*_HEAD).where(_IN_TIME).order_by(_C.used.desc(), _C.id))
 _END = Statement(update(_TABLE).where(_NAMED, _LIVES).values(_ENDING))
 _END_EXPIRED = Statement(
     update(_TABLE).where(_LIVES, seconds_now() - LATE_SECONDS > _EXPIRES).values(_ENDING).returning(*_HEAD)
@@ -208,27 +236,32 @@ class SessionTable:
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
 
-    def add(self, session: SessionRecord, most: int, begun_by: str | None = None) -> float:
-        """Add a session that has no frame yet; when that was.
+    def add(self, session: SessionRecord, most: int, reason: str = "") -> tuple[float, list[SessionRecord]]:
+        """Add a session that has no frame yet.
 
         Args:
             most: how many sessions may live.
-            begun_by: the caller and the request; None if requests cannot be distinguished.
+            reason: why one ends that gives way to it.
+
+        Returns:
+            When that was, and the session that has ended to make room for it, if any: that of the caller with most
+            sessions, and of its map with most, that has waited longest for a frame.
 
         Raises:
-            TooManySessions: as many as may live do.
+            TooManySessions: as many as may live do, and the caller has no fewer than the others.
         """
         with self._ledger.transaction("keep a session", Lock.SESSIONS) as connection:
             ((living,),) = connection.execute(_COUNT)
-            if living >= most:
-                raise TooManySessions(f"There are {living} sessions already; delete one that is over.")
-            ((created,),) = connection.execute(_ADD, **{**vars(session), "begun_by": begun_by})
-        return float(created)
+            given_way = [] if living < most else _give_way(session, connection.execute(_BY_USE))
+            for one in given_way:
+                connection.change(_END, session=one.id, ended=reason)
+            ((created,),) = connection.execute(_ADD, **vars(session))
+        return float(created), given_way
 
-    def begun(self, begun_by: str, session: SessionRecord) -> str | None:
-        """The id of the session without a frame that a request has begun a moment ago, with the map and the options of
-        ``session``; None if there is none."""
-        found = self._ledger.execute("find a session", _BEGUN, **{**vars(session), "begun_by": begun_by})
+    def begun(self, session: SessionRecord) -> str | None:
+        """The id of the session without a frame that the request of ``session`` has begun a moment ago, with its map
+        and its options; None if there is none."""
+        found = self._ledger.execute("find a session", _BEGUN, **vars(session))
         return found[0][0] if found else None
 
     def head(self, session_id: str) -> SessionRecord | None:
@@ -276,3 +309,23 @@ class SessionTable:
     def forget(self, session_id: str) -> None:
         """Delete a session."""
         self._ledger.change("delete a session", _FORGET, session=session_id)
+
+
+def _give_way(session: SessionRecord, rows: Sequence[Sequence[Any]]) -> list[SessionRecord]:
+    """The session that gives way to a new one, among those that live, the latest used first.
+
+    Raises:
+        TooManySessions: no other caller has more sessions, and no map of this one.
+    """
+    chosen: list[SessionRecord] = []
+    room = SharedRoom(len(rows))
+    for one in (SessionRecord(*row) for row in rows):
+        room.take(Holding(partial(_choose, chosen, one), one.map, caller_of(one.begun_by)))
+    if not room.take(Holding(lambda: False, session.map, caller_of(session.begun_by))):
+        raise TooManySessions(f"There are {len(rows)} sessions already; delete one that is over.")
+    return chosen
+
+
+def _choose(chosen: list[SessionRecord], session: SessionRecord) -> bool:
+    chosen.append(session)
+    return True

@@ -223,6 +223,7 @@ def test_the_pixels_decoded_at_one_time_are_bounded(watched: Watched, monkeypatc
 
     frames = [watched.frame(seed) for seed in range(7)]
     frames.append(watched.frame(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
+    monkeypatch.setattr(encoder_threads, "FEW_PIXELS", 0)
     go = watched.hold()
     monkeypatch.setattr(encoder_threads, "MOST_PIXELS", 2 * 320 * 240 - 1)
     monkeypatch.setattr(watched.threads, "_encode", counted)
@@ -286,6 +287,34 @@ async def collected(queue: EncoderQueue, frames: Sequence[bytes], deadline: Requ
     return [one async for some in queue.encode_many(identity, frames, deadline) for one in some]
 
 
+def test_one_callers_frames_delay_another_by_no_more_than_one(watched: Watched) -> None:
+    go = watched.hold()
+    greedy = [watched.frame(seed, caller="greedy") for seed in range(6)]
+    watched.threads.put(greedy)
+    robot = watched.frame(7, caller="robot")
+    watched.threads.put([robot])
+    go()
+    answers([*greedy, robot])
+    assert watched.taken.index(robot) <= 1
+    assert [frame for frame in watched.taken if frame is not robot] == greedy, "those of one caller stay in order"
+
+
+def test_large_frames_are_more_turns_than_small_ones(watched: Watched) -> None:
+    """What frames are expected to take counts as soon as they are taken, so this is the same at any speed."""
+    frames = WaitingFrames()
+    large = [watched.frame(0, data=encoded(scene(1, 4000, 3000)), caller="greedy") for _ in range(3)]
+    small = [watched.frame(seed, caller="robot") for seed in range(12)]
+    for frame in [*large, *small]:
+        frames.add(frame)
+    order = []
+    while (following := frames.first()) is not None:
+        frames.remove_first()
+        frames.count_turn(following)
+        order.append(following)
+    first, second = order.index(large[0]), order.index(large[1])
+    assert first == 0 and 6 <= second <= 8, "140 ms are expected for twelve million pixels, and 21 for a small frame"
+
+
 @pytest.mark.anyio
 async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
     frames = [jpeg(index % 6) for index in range(queue.encoders.ahead + 10)]
@@ -315,7 +344,7 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
     with pytest.raises(fault):
         await collected(queue, [jpeg(0)] * (queue.encoders.ahead + 5), deadline)
     left = waiting(queue)
-    assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk)
+    assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk.clear())
     free.set()
     await queue.encode(encoder.identity, jpeg(1), RequestDeadline(time.monotonic() + 60, stays))
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from contextvars import copy_context
 from statistics import median
+from typing import Any, TypeVar
 
 import httpx
 import pytest
@@ -17,14 +19,17 @@ from core.errors import NotAnImage
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from service.engine.encoders import Encoded
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
+from service.fairness import CALLER
 from service.telemetry.metrics import Metrics
 from tests.service.engine.busy import keep_busy
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server, assert_problem
 
 pytestmark = pytest.mark.anyio
+Made = TypeVar("Made")
 IDENTITY = EncoderCatalogue().resolve(DEFAULT_ENCODER)
 
 
@@ -81,6 +86,61 @@ async def test_a_full_queue_refuses(queue: EncoderQueue) -> None:
             pass
     queue.check_room()
     assert queue._metrics.registry.get_sample_value("placerec_queue_length") == 0
+
+
+def as_caller(caller: str, work: Coroutine[Any, Any, Made]) -> asyncio.Task[Made]:
+    """Work that a caller has asked for."""
+    context = copy_context()
+    context.run(CALLER.set, caller)
+    return asyncio.get_running_loop().create_task(work, context=context)
+
+
+async def test_the_caller_with_most_places_gives_way_to_another(queue: EncoderQueue, busy: threading.Event) -> None:
+    async def ask(seed: int, frames: int = 1) -> Encoded:
+        with queue.place(frames):
+            return await queue.encode(IDENTITY, jpeg(seed), deadline())
+
+    greedy = [as_caller("greedy", ask(seed)) for seed in (1, 2, 3)]
+    with pytest.raises(QueueFull):
+        await greedy[2]
+    robot = as_caller("robot", ask(4))
+    with pytest.raises(QueueFull):
+        await greedy[1]
+    assert queue.waiting == 2
+    for caller in ("robot", "greedy"):
+        with pytest.raises(QueueFull):  # both have one now
+            await as_caller(caller, ask(5))
+    busy.set()
+    assert len((await robot).encoding.regions) and len((await greedy[0]).encoding.regions)
+    assert queue.waiting == 0
+
+
+async def test_a_batch_gives_way_as_a_whole_unless_it_is_being_encoded(
+    queue: EncoderQueue, busy: threading.Event
+) -> None:
+    async def batch() -> int:
+        with queue.place(3):
+            return len([one async for some in queue.encode_many(IDENTITY, [jpeg(1)] * 3, deadline()) for one in some])
+
+    async def ask() -> Encoded:
+        with queue.place(3):
+            return await queue.encode(IDENTITY, jpeg(2), deadline())
+
+    first = as_caller("greedy", batch())
+    await asyncio.sleep(0)
+    while not queue.waiting or not len(queue.encoders._waiting):  # type: ignore[attr-defined]
+        await asyncio.sleep(0.001)
+    with pytest.raises(QueueFull):  # bulk requests have one place of two, and nobody has more than one
+        await as_caller("robot", ask())
+    queue._bulk_room.capacity = 2
+    second = as_caller("greedy", batch())
+    while queue.waiting < 2:
+        await asyncio.sleep(0.001)
+    robot = as_caller("robot", ask())
+    with pytest.raises(QueueFull):
+        await second
+    busy.set()
+    assert await first == 3 and len((await robot).encoding.regions)
 
 
 async def test_a_late_frame_is_dropped_before_it_is_encoded(queue: EncoderQueue, busy: threading.Event) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 from hypothesis import given
@@ -19,6 +20,7 @@ from service.events import feed as feeds
 from service.events.events import LINGER_SECONDS, Events
 from service.events.feed import Feed, FeedEvent, Listener
 from service.events.schemas import MapEvent, QueryEvent
+from service.fairness import CALLER
 from tests.service.scenes import jpeg
 
 pytestmark = pytest.mark.anyio
@@ -148,6 +150,22 @@ async def test_listeners_and_the_maps_that_they_left_are_bounded() -> None:
         with events.listening(f"map-{number}"):
             pass
     assert sum(events.heard(f"map-{number}") for number in range(20)) <= 3
+    assert events.listeners == 0
+
+
+async def test_the_caller_with_most_listeners_gives_way_to_another() -> None:
+    events, streams = Events(most_listeners=3), ExitStack()
+    with streams:
+        greedy = [streams.enter_context(events.listening("lab")) for _ in range(3)]
+        with pytest.raises(TooManyListeners), events.listening("lab"):
+            pass
+        token = CALLER.set("robot")
+        with events.listening("lab") as robot:
+            assert [listener.over for listener in greedy] == [False, False, True] and events.listeners == 3
+            await asyncio.wait_for(greedy[2].changed.wait(), 60)
+            assert not robot.over
+        CALLER.reset(token)
+        streams.enter_context(events.listening("lab"))
     assert events.listeners == 0
 
 

@@ -15,7 +15,9 @@ import pytest
 
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, StorageFailure, UnknownMap
 from core.ledger.sqlite import SqliteLedger
+from service.access.audit import ASKER, Asker
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
+from service.fairness import CALLER
 from service.jobs.context import JobContext
 from service.jobs.file import FILE
 from service.jobs.jobs import Jobs
@@ -86,12 +88,20 @@ def test_jobs_take_turns_and_the_queue_is_bounded(running: Running, tmp_path: Pa
         first = jobs.submit("gate", None, gate)
         assert gate.begun.wait(60)
         waiting = [jobs.submit("note", None, noting(number)) for number in range(2)]
-        with pytest.raises(JobQueueFull):
-            jobs.submit("note", None, lambda _: {})
+        for refused in (jobs.check_room, lambda: jobs.submit("note", None, lambda _: {})):
+            with pytest.raises(JobQueueFull):
+                refused()
         assert [jobs.get(job.id).state for job in (first, *waiting)] == ["running", "queued", "queued"]
+        token = ASKER.set(Asker("robot", "key-of-another"))
+        jobs.check_room()
+        waiting.append(jobs.submit("note", None, noting(2)))
+        for refused in (jobs.check_room, lambda: jobs.submit("note", None, lambda _: {})):
+            with pytest.raises(JobQueueFull):  # it has its half
+                refused()
+        ASKER.reset(token)
         gate.open.set()
-        assert [end_of(jobs, job).state for job in waiting] == ["succeeded"] * 2
-    assert order == [0, 1]
+        assert [end_of(jobs, job).state for job in waiting] == ["succeeded"] * 3
+    assert order == [0, 1, 2]
 
 
 def test_two_workers_never_work_on_one_map(running: Running, tmp_path: Path) -> None:
@@ -214,10 +224,28 @@ async def test_watchers_are_bounded(running: Running, tmp_path: Path) -> None:
         with jobs.watchers.watching(job.id) as changed:
             with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
                 pass
+            token = CALLER.set("robot")
+            with pytest.raises(TooManyWatchers), jobs.watchers.watching(job.id):
+                pass
+            assert not changed.over, "nobody has more than one"
+            CALLER.reset(token)
             gate.open.set()
             await changed.wait()
         with jobs.watchers.watching(job.id):
             pass
+
+
+@pytest.mark.anyio
+async def test_the_caller_with_most_watchers_gives_way_to_another(running: Running, tmp_path: Path) -> None:
+    gate = Gate()
+    with running(tmp_path, most_watchers=2) as jobs:
+        job = jobs.submit("gate", None, gate)
+        with jobs.watchers.watching(job.id) as first, jobs.watchers.watching(job.id) as second:
+            token = CALLER.set("robot")
+            with jobs.watchers.watching(job.id) as other:
+                assert second.over and second.is_set() and not first.over and not other.over
+            CALLER.reset(token)
+        gate.open.set()
 
 
 def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:

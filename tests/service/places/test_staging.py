@@ -15,6 +15,7 @@ import pytest
 from core.disk.files import write_at
 from core.errors import StorageFailure, StorageFull
 from service.errors.faults import BodyTooLarge, ClientGone, MalformedBody, StagingFull
+from service.fairness import CALLER
 from service.places import staging as module
 from service.places.staging import Staging
 
@@ -54,6 +55,20 @@ async def test_parts_come_back_as_they_were_sent(tmp_path: Path) -> None:
     staging.remove(name)
     staging.remove(name)
     assert left(tmp_path) == []
+
+
+@pytest.mark.anyio
+async def test_a_caller_with_less_than_its_share_is_let_in(tmp_path: Path) -> None:
+    staging = Staging(tmp_path, 10, reserve=0)
+    for _ in range(2):
+        await received(staging, body(one=b"12345"))
+    with pytest.raises(StagingFull):
+        await received(staging, body(one=b"1"), announced=1)
+    token = CALLER.set("robot")
+    await received(staging, body(one=b"12345"), announced=5)
+    with pytest.raises(StagingFull):
+        await received(staging, body(one=b"1"), announced=1)
+    CALLER.reset(token)
 
 
 @pytest.mark.anyio

@@ -13,9 +13,18 @@ from hypothesis import strategies as st
 from sqlalchemy import bindparam, update
 
 from core.ledger import Ledger, Statement
+from service.access.audit import Asker
 from service.errors.faults import TooManySessions
 from service.sessions import table as tables
-from service.sessions.table import FILE, LATE_SECONDS, REPEATED_SECONDS, SessionRecord, SessionTable, session_file
+from service.sessions.table import (
+    FILE,
+    LATE_SECONDS,
+    REPEATED_SECONDS,
+    SessionRecord,
+    SessionTable,
+    begun_by,
+    session_file,
+)
 
 NEW = SessionRecord("s-1", "lab", "2026", '{"lag":2}', 900.0, state=b"fresh")
 FRAME = replace(NEW, number=7, moment=3.5, request="robot", lost=0, frames=1, state=b"state", answer="{}")
@@ -55,7 +64,7 @@ def read(table: SessionTable, session_id: str) -> SessionRecord | None:
 
 
 def test_sessions_are_read_as_they_were_written(table: SessionTable) -> None:
-    created = table.add(NEW, MOST)
+    created, _ = table.add(NEW, MOST)
     assert read(table, "s-1") == NEW and table.read("s-2") is None
     assert table.renew(FRAME) and not table.renew(FRAME), "another frame was saved since revision 0"
     assert read(table, "s-1") == replace(FRAME, revision=1)
@@ -88,6 +97,24 @@ def test_no_more_live_than_may(ledger: Ledger, table: SessionTable) -> None:
     assert table.count() == 3 and len(table.living()) == 4
 
 
+def test_the_caller_with_most_sessions_gives_way(ledger: Ledger, table: SessionTable) -> None:
+    def new(name: str, caller: str, map_id: str = "lab") -> SessionRecord:
+        return replace(NEW, id=name, map=map_id, begun_by=begun_by(Asker(caller, key=caller)))
+
+    for number in range(4):
+        table.add(new(f"s-{number}", "greedy"), most=4)
+    pass_by(ledger, "s-2", 60)
+    assert [one.id for one in table.add(new("s-4", "robot"), 4, "room")[1]] == ["s-2"], "the longest without a frame"
+    assert (ended := table.head("s-2")) is not None and ended.ended == "room"
+    assert len(table.add(new("s-5", "robot"), 4, "room")[1]) == 1
+    for caller in ("robot", "greedy"):
+        with pytest.raises(TooManySessions):
+            table.add(new("s-6", caller), most=4)
+    pass_by(ledger, "s-4", 60)
+    assert [one.id for one in table.add(new("s-6", "robot", "hall"), 4, "room")[1]] == ["s-4"], "of its own other map"
+    assert table.count() == 4
+
+
 def test_sessions_expire_by_the_clock_of_the_database(ledger: Ledger, table: SessionTable) -> None:
     for name, idle in (("s-1", 0), ("s-2", 899), ("s-3", 901), ("s-4", 901 + LATE_SECONDS)):
         table.add(replace(NEW, id=name), MOST)
@@ -112,17 +139,19 @@ def test_ended_sessions_are_forgotten(ledger: Ledger, table: SessionTable) -> No
 
 
 def test_a_request_finds_the_session_that_it_began(ledger: Ledger, table: SessionTable) -> None:
-    table.add(NEW, MOST, "robot, request 7")
+    askers = [Asker("robot", key="robot", request_id=f"request {number}") for number in (7, 8)]
+    new, other_request = (replace(NEW, begun_by=begun_by(asker)) for asker in askers)
+    table.add(new, MOST)
     table.add(replace(NEW, id="s-2"), MOST)
-    assert table.begun("robot, request 7", NEW) == "s-1"
-    assert table.begun("robot, request 8", NEW) is None
+    assert table.begun(new) == "s-1"
+    assert table.begun(other_request) is None
     for other in ({"map": "hall"}, {"map_created_at": "2025"}, {"options": "{}"}, {"expires_after": 60.0}):
-        assert table.begun("robot, request 7", replace(NEW, **other)) is None
+        assert table.begun(replace(new, **other)) is None
     pass_by(ledger, "s-1", REPEATED_SECONDS)
-    assert table.begun("robot, request 7", NEW) is None
+    assert table.begun(new) is None
     pass_by(ledger, "s-1", -REPEATED_SECONDS)
     assert table.renew(FRAME)
-    assert table.begun("robot, request 7", NEW) is None, "a session with a frame is a robot's"
+    assert table.begun(new) is None, "a session with a frame is a robot's"
 
 
 IDS = ("s-1", "s-2", "s-3")
