@@ -10,12 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
+from core.frames.images import decode
 from service.access.keys import Keys
 from tests.service.map_jobs import finished
+from tests.service.scenes import encoded
 from tests.service.server import Server, typed
 
 CORRIDOR = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
@@ -36,10 +37,10 @@ def frames_of(folder: str) -> list[bytes]:
 
 def darkened(data: bytes, seed: int) -> bytes:
     """The frame at night, by a noisy camera."""
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(np.float32) / 255
+    picture = decode(data).astype(np.float32) / 255
     noise = np.random.default_rng(seed).normal(0, 0.03, picture.shape)
     shown = np.clip(255 * (0.35 * picture**2.5 + noise), 0, 255).astype(np.uint8)
-    return cv2.imencode(".png", shown)[1].tobytes()
+    return encoded(shown, ".png")
 
 
 def by_night(number: int, data: bytes) -> bytes:
