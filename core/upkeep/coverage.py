@@ -49,8 +49,12 @@ class Gap:
 
 def distances(where: Whereabouts) -> NDArray[np.float64]:
     """Metres from each of n places to the next, float64 [n - 1]; NaN without two poses of one kind."""
-    steps = np.sqrt(np.square(np.diff(where.position, axis=0)).sum(axis=1))
-    known = (where.kind[1:] == where.kind[:-1]) & (where.kind[1:] != NO_POSE)
+    return _distances(where.kind, where.position)
+
+
+def _distances(kind: NDArray[np.int8], position: NDArray[np.float64]) -> NDArray[np.float64]:
+    steps = np.sqrt(np.square(np.diff(position, axis=0)).sum(axis=1))
+    known = (kind[1:] == kind[:-1]) & (kind[1:] != NO_POSE)
     return np.where(known, steps, np.nan)
 
 
@@ -96,7 +100,7 @@ def long_ways(where: Whereabouts, walk: NDArray[np.int64], first: NDArray[np.int
             to the next is no step.
     """
     stood = first[walk[1:]] == first[walk[:-1]]
-    return long_steps(np.where(stood, np.nan, distances(where.take(walk))), "distance")
+    return long_steps(np.where(stood, np.nan, _distances(where.kind[walk], where.position[walk])), "distance")
 
 
 def backward_steps(durations: NDArray[np.float64]) -> int:

@@ -58,8 +58,10 @@ def stops(where: Whereabouts) -> list[Stop]:
     """Where a robot stood while it mapped: the views with ``FEWEST_FRAMES_OF_STOP`` frames or more, largest first."""
     found = np.flatnonzero(where.sequence != NO_SEQUENCE)
     order = found[np.lexsort((where.ordinal[found], where.sequence[found]))]
-    begins = np.flatnonzero((np.diff(where.sequence[order]) != 0) | (np.diff(where.ordinal[order]) != 0)) + 1
-    views = [np.sort(view) for view in np.split(order, begins) if len(view) >= FEWEST_FRAMES_OF_STOP]
+    changes = np.flatnonzero((np.diff(where.sequence[order]) != 0) | (np.diff(where.ordinal[order]) != 0)) + 1
+    bounds = np.concatenate([[0], changes, [len(order)]])
+    crowded = np.flatnonzero(np.diff(bounds) >= FEWEST_FRAMES_OF_STOP)
+    views = [np.sort(order[bounds[one] : bounds[one + 1]]) for one in crowded]
     return sorted(map(Stop, views), key=lambda stop: (-len(stop.places), int(stop.places[0])))
 
 

@@ -448,7 +448,7 @@ def measure_overlap(engine: Engine, context: JobContext, map_: Map, other: Map) 
                 continue
             score, match = located.matches[0]
             pairs.append({"place": place.id, "match": match.id, "score": float(score)})
-            ours, theirs = match.pose, stored[place.id][0].pose
+            ours, theirs = (one.pose if one.pose_of is None else None for one in (match, stored[place.id][0]))
             if ours is not None and theirs is not None and ours.kind() == theirs.kind():
                 apart.append(float(np.linalg.norm(ours.position() - theirs.position())))
         context.progress(first + len(some), len(chosen), "comparing the maps")
