@@ -20,12 +20,13 @@ from typing import Any, Protocol
 
 from placerec_client import Client, DeadlineExceeded, InvalidOdometry, PlacerecError, Problem
 from placerec_ros.frame_queue import Frame, FrameQueue
+from placerec_ros.fusion import Fix, Fusion
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
 from placerec_ros.parameters import Settings
 from placerec_ros.pictures import UnfitPicture, picture_of
-from placerec_ros.planar import Planar, map_to_odom
-from placerec_ros.pose import UNKNOWN_ANGLE, PoseEstimate, estimate, metric
+from placerec_ros.planar import Planar
+from placerec_ros.pose import PoseEstimate, estimate, metric
 from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
@@ -44,15 +45,15 @@ class Answered:
     """An answer with what follows from it.
 
     report: the answer that is published as JSON.
-    robot: the robot's pose in the map; None while it is not localized.
-    correction: the transform from the map to the odometry; None without odometry, or if the heading is not known.
+    robot: the robot's pose in the map by this answer; None while it is not localized.
+    fix: where it is by all answers and odometry; None without odometry, or if that is not known yet.
     """
 
     frame: Frame
     report: dict[str, Any]
     estimate: PoseEstimate | None
     robot: Planar | None
-    correction: Planar | None
+    fix: Fix | None
 
 
 class Outlet(Protocol):
@@ -96,7 +97,9 @@ class Localizer:
         self._run: Run | None = None
         self._run_generation = 0
         self._sent: Frame | None = None
-        self._correction: Planar | None = None
+        self._fusion = Fusion()
+        self.fix: Fix | None = None
+        """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
         self._mapping = False
         self._paused_until = 0.0
         self._heard = self._pictured = -math.inf  # a robot that has just started counts few seconds
@@ -186,8 +189,7 @@ class Localizer:
 
     def _work_once(self) -> None:
         while not self._stopped:
-            if self._run is not None and self._run_generation != self._generation:
-                self._end_run()
+            self._renew()
             if self._commands:
                 command, future = self._commands.popleft()
                 future.set_result(self._done(command))
@@ -290,18 +292,26 @@ class Localizer:
             return True
         if frame.stamp < self._sent.stamp - CLOCK_JUMP * NANOSECONDS:
             self._mapping = False
+            self._forget()
             self._end_run()
             return True
         self._health.counts["frames out of order"] += 1
         return False
 
+    def _renew(self) -> None:
+        """End the run of before, if the node was deactivated or activated meanwhile."""
+        if self._run_generation != self._generation:
+            self._run_generation = self._generation
+            self._forget()
+            self._end_run()
+
     def _running(self) -> Run:
         """The present run; it begins if there is none, and anew when intrinsics come or change."""
+        self._renew()
         known = self._intrinsics if self._settings.use_camera_info else None
         if self._run is not None and known is not None and self._run.intrinsics != known:
             self._end_run()
         if self._run is None:
-            self._run_generation = self._generation
             self._run = Run(self._open(), self._settings, self._health, known)
         return self._run
 
@@ -314,13 +324,9 @@ class Localizer:
                 self._health.begins("pose", f"The robot is recognized, but the place has {kind}.")
         elif found is not None:
             self._health.over("pose")
-        robot = correction = None
-        if found is not None:
-            robot = found.planar.then(Planar(0.0, 0.0, -math.radians(self._settings.camera_yaw)))
-            in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
-            if in_odom is not None and found.covariance[35] < 0.99 * UNKNOWN_ANGLE:
-                correction = map_to_odom(robot, in_odom)
-                self._correction = correction
+        mount = Planar(0.0, 0.0, math.radians(self._settings.camera_yaw))
+        of_robot = None if found is None else found.of_robot(mount)
+        self._fuse(frame, of_robot)
         self._health.fact("verdict", answer["verdict"])
         report = {
             "stamp": frame.stamp / NANOSECONDS,
@@ -335,7 +341,21 @@ class Localizer:
             "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
-        return Answered(frame, report, found, robot, correction)
+        return Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, self.fix)
+
+    def _fuse(self, frame: Frame, found: PoseEstimate | None) -> None:
+        """Take in where the robot is by one answer, if it is known by odometry where it was then."""
+        odom = self.odometer.at(frame.stamp) if frame.stamp else None
+        if odom is None:
+            return
+        self.fix = self._fusion.add(odom, self.odometer.origin, found)
+        self._health.counts["localizations refused"] = self._fusion.refused
+        self._health.counts["tracks replaced"] = self._fusion.replaced
+
+    def _forget(self) -> None:
+        """Forget where the robot is."""
+        self._fusion.clear()
+        self.fix = None
 
     def _annotate(self, frame: Frame, picture: Any, run: Run) -> None:
         """Send the frame again for a picture, if somebody looks on; the answer of the session is out already."""
@@ -355,7 +375,7 @@ class Localizer:
 
     def _end_run(self) -> None:
         """End the session, if the service lets us; it ends by itself otherwise."""
-        run, self._run, self._sent, self._correction = self._run, None, None, None
+        run, self._run, self._sent = self._run, None, None
         if run is not None:
             with suppress(PlacerecError):
                 run.end()
@@ -387,6 +407,7 @@ class Localizer:
         if not self._active:
             return Done(False, "The node is not active.")
         self._mapping = False
+        self._forget()
         self._end_run()
         self._paused_until = 0.0
         run = self._running()
@@ -406,8 +427,8 @@ class Localizer:
             robot = in_odom
         elif self._mapping or run.places() == 0:
             self._mapping, robot = True, in_odom  # the frame of the odometry is that of the new map
-        elif self._correction is not None:
-            robot = self._correction.then(in_odom)
+        elif self.fix is not None:
+            robot = self.fix.correction.then(in_odom)
         else:
             return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
         heading = math.degrees(robot.yaw) + self._settings.camera_yaw

@@ -6,6 +6,7 @@ lifecycle services at any time, also while the service cannot be reached.
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -37,6 +38,12 @@ from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
 from placerec_ros.localizer import Answered, Done, Localizer
 from placerec_ros.odometry import stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
+from placerec_ros.repetition import Repetition
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # where ROS is not installed, but its wheels
+    TFMessage = None
 
 IMAGE_TYPES = {
     "compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage),
@@ -74,7 +81,7 @@ class PlacerecNode(LifecycleNode):
         self._subscriptions_made: list[Any] = []
         self._image_subscription: Any = None
         self._topics: list[Any] = []
-        self._broadcaster: Any = None
+        self._repetition = Repetition(1.0, 0.0)
         self._frames = 0
         self._heard = {"image": 0.0, "info": 0.0}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -103,6 +110,7 @@ class PlacerecNode(LifecycleNode):
         values = {one.name: one.value for one in changed if one.name in live}
         if values and self._settings is not None and self._localizer is not None:
             self._settings = replace(self._settings, **values)
+            self._repetition = Repetition(self._settings.transform_rate, self._settings.transform_tolerance)
             self._localizer.change(self._settings)
 
     # ---- transitions
@@ -121,11 +129,16 @@ class PlacerecNode(LifecycleNode):
         self._health.fact("service", chosen.url)
         self._pose = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._transform = self.create_lifecycle_publisher(TransformStamped, "~/map_to_odom", 10)
+        self._filtered = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/filtered_pose", 10)
         self._answer = self.create_lifecycle_publisher(String, "~/answer", 10)
         self._picture = self.create_lifecycle_publisher(CompressedImage, "~/annotated/compressed", 1)
-        self._topics = [self._pose, self._transform, self._answer, self._picture]
-        self._broadcaster = _broadcaster(self) if chosen.publish_tf else None
-        self._health.fact("tf", "sent" if self._broadcaster else "not sent")
+        self._topics = [self._pose, self._transform, self._filtered, self._answer, self._picture]
+        self._tf: Any = None
+        if chosen.publish_tf and TFMessage is not None:
+            self._tf = self.create_lifecycle_publisher(TFMessage, "/tf", 100)
+            self._topics.append(self._tf)
+        self._repetition = Repetition(chosen.transform_rate, chosen.transform_tolerance)
+        self._health.fact("tf", "not sent" if self._tf is None else "sent")
         self._localizer = Localizer(chosen, self, self._health)
         self._health.state = "inactive"
         return Success
@@ -189,7 +202,7 @@ class PlacerecNode(LifecycleNode):
             self._localizer = None
         while self._topics:
             self.destroy_lifecycle_publisher(self._topics.pop())
-        self._broadcaster = self._settings = None
+        self._settings = None
 
     def close(self) -> None:
         """End the run where the process ends without a transition."""
@@ -268,6 +281,7 @@ class PlacerecNode(LifecycleNode):
             self._health.begins("odometry", f"A message of odometry cannot be used: {error}.")
         else:
             self._health.over("odometry")
+            self._send_transform(stamp_of(message))
 
     def _ask_for(self, name: str, ask: Callable[[Localizer], ThreadFuture[Done]]) -> None:
         """Make a service that the localizer's thread answers."""
@@ -301,17 +315,39 @@ class PlacerecNode(LifecycleNode):
         with self._outlet_lock:
             if not self._publishing:
                 return
-            localizer, chosen = self._made()
-            if answered.robot is not None:
-                self._pose.publish(messages.pose_message(answered, chosen.map_frame))
+            _, chosen = self._made()
+            stamp = answered.frame.message.header.stamp
+            if (found := answered.estimate) is not None:
+                self._pose.publish(messages.pose_message(found.planar, found.covariance, stamp, chosen.map_frame))
             self._answer.publish(messages.answer_message(answered))
-            if answered.correction is not None:
-                transform = messages.transform_message(
-                    answered.correction, answered.frame.message.header.stamp, chosen.map_frame, localizer.odometer.frame
-                )
+            if answered.fix is not None:
+                self._filtered.publish(messages.filtered_message(answered.fix, stamp, chosen.map_frame))
+
+    def _send_transform(self, stamp: int) -> None:
+        """Send the transform from the map to the odometry, at a moment of odometry in nanoseconds, if it is due."""
+        localizer, chosen = self._made()
+        fix, odom = localizer.fix, localizer.odometer.at(stamp)
+        if fix is None or odom is None or fix.origin != localizer.odometer.origin:
+            return
+        if (ahead := self._repetition.due(stamp)) is None:
+            return
+        position, heading = fix.at(odom).deviations
+        if position > chosen.position_limit or math.degrees(heading) > chosen.heading_limit:
+            self._health.begins(
+                "transform",
+                f"The transform is not sent: the position has a standard deviation of {position:.1f} m, "
+                f"the heading of {math.degrees(heading):.0f}°.",
+            )
+            return
+        self._health.over("transform")
+        transform = messages.transform_message(
+            fix.correction, messages.time_message(ahead), chosen.map_frame, localizer.odometer.frame
+        )
+        with self._outlet_lock:
+            if self._publishing:
                 self._transform.publish(transform)
-                if self._broadcaster is not None:
-                    self._broadcaster.sendTransform(transform)
+                if self._tf is not None:
+                    self._tf.publish(TFMessage(transforms=[transform]))
 
     def wants_picture(self) -> bool:
         """Whether somebody subscribes to annotated pictures."""
@@ -375,15 +411,6 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         else:
             made.integer_range = [IntegerRange(from_value=int(parameter.least), to_value=int(parameter.most), step=1)]
     return made
-
-
-def _broadcaster(node: LifecycleNode) -> Any:
-    """A broadcaster of transforms; None where tf2_ros is not installed."""
-    try:
-        from tf2_ros import TransformBroadcaster
-    except ImportError:
-        return None
-    return TransformBroadcaster(node)
 
 
 def _is_local(url: str) -> bool:

@@ -106,6 +106,11 @@ class Odometer:
                 first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_POSES)
                 del self._poses[:first]
 
+    @property
+    def origin(self) -> str:
+        """A name for where the odometry began, of 128 characters at most."""
+        return f"{self._beginnings} {self.frame}"[:128]
+
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
@@ -126,7 +131,7 @@ class Odometer:
                 camera, as headings of a map are.
         """
         with self._lock:
-            reading, origin = self._read(stamp), f"{self._beginnings} {self.frame}"[:128]
+            reading, origin = self._read(stamp), self.origin
         if reading is None:
             return None
         pose = reading.pose

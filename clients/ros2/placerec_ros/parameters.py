@@ -73,10 +73,31 @@ PARAMETERS = (
         choices=("auto", "compressed", "raw"),
     ),
     Parameter("map_frame", "map", "Frame of the map's poses, in all that is published."),
+    Parameter("publish_tf", True, "Send the transform from the map to the odometry to /tf, where tf2_msgs is installed."),
+    Parameter("transform_rate", 20.0, "Most transforms a second; none is sent without odometry.", 0.5, 200.0, live=True),
     Parameter(
-        "publish_tf",
-        True,
-        "Send the transform from the map to the odometry to /tf, where tf2_ros is installed.",
+        "transform_tolerance",
+        0.5,
+        "Seconds by which the stamp of the transform lies ahead of odometry.",
+        0.0,
+        10.0,
+        live=True,
+    ),
+    Parameter(
+        "position_limit",
+        3.0,
+        "Metres: where the standard deviation of the position is larger, no transform is sent.",
+        0.1,
+        1000.0,
+        live=True,
+    ),
+    Parameter(
+        "heading_limit",
+        15.0,
+        "Degrees: where the standard deviation of the heading is larger, no transform is sent.",
+        1.0,
+        180.0,
+        live=True,
     ),
     Parameter("queue_length", 2, "Most images that wait for the service; the oldest gives way.", 1, 100),
     Parameter(
@@ -129,6 +150,10 @@ class Settings:
     image_type: str
     map_frame: str
     publish_tf: bool
+    transform_rate: float
+    transform_tolerance: float
+    position_limit: float
+    heading_limit: float
     queue_length: int
     deadline: float
     advance: float

@@ -32,6 +32,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:
+    TFMessage = None
+
 KINDS = {kind.__name__: kind for kind in (CompressedImage, Image, CameraInfo, Odometry, String)}
 TRANSITIONS = {
     "configure": 1,
@@ -76,11 +81,13 @@ class Peer:
         return {}
 
     def listen(self, topic: str, durable: bool = False, node: str = "placerec") -> dict[str, Any]:
-        """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
+        """Record a topic of the node, such as answer, or one of all, /diagnostics or /tf."""
         known: dict[str, tuple[Any, Callable[[Any], dict[str, Any]]]] = {
             "answer": (String, lambda message: json.loads(message.data)),
             "pose": (PoseWithCovarianceStamped, pose_of),
             "map_to_odom": (TransformStamped, transform_of),
+            "/tf": (TFMessage, lambda message: transform_of(message.transforms[0])),
+            "filtered_pose": (PoseWithCovarianceStamped, pose_of),
             "annotated/compressed": (CompressedImage, picture_of),
             "/diagnostics": (DiagnosticArray, diagnostics_of),
         }
@@ -95,6 +102,10 @@ class Peer:
             kind, full, lambda message: self.note(topic, show(message)), qos
         )
         return {}
+
+    def knows_tf(self) -> dict[str, Any]:
+        """Whether the message of /tf could be built."""
+        return {"known": TFMessage is not None}
 
     def deafen(self, topic: str) -> dict[str, Any]:
         """End the recording of a topic, if there is one."""
