@@ -2,9 +2,9 @@
 
 The references stand a metre apart on a curve.  lip6_outdoor goes around: its references from 460 on pass the first ones
 again, so its curve is closed, and they stand where they belong by their own keypoints (lab/training/ground_truth.py).
-The robot drives along the curve by the true references of its frames, also found by their keypoints, for the stated ones
-are up to nine references off.  Odometry sees each step and turn with an error of ``DRIFT`` that lasts, another one that
-does not, and a heading that wanders.
+The robot drives along the curve by the true references of its frames, which are found by keypoints too, for the stated
+ones are up to nine references off.  Odometry sees each step and turn with an error of ``DRIFT`` that lasts, another one
+that does not, and a heading that wanders.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def odometry(true: Sequence[Planar], seed: int) -> list[Planar]:
     random = np.random.default_rng(seed)
     longer, more = 1 + DRIFT * random.choice((-1, 1), size=2)
     poses = [Planar(0.0, 0.0, float(random.uniform(-3, 3)))]
-    for before, after in zip(true, true[1:], strict=False):
+    for before, after in pairwise(true):
         step = before.inverse().then(after)
         length, noise = math.hypot(step.x, step.y), random.normal(size=3)
         factor = longer + DRIFT * noise[0]

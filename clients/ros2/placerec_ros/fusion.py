@@ -14,7 +14,7 @@ from placerec_ros.track import Array, Track
 BEGINS = 3
 """Localizations that agree with each other before a track is believed."""
 CHANGES, CHANGE_METRES = 5, 5.0
-"""Localizations in a row that contradict a track, and agree with each other over so many metres, before it is given up."""
+"""Localizations in a row that contradict a track, and agree over so many metres, before it is given up."""
 FLAT = np.ix_((0, 1, 5), (0, 1, 5))
 """Where a covariance of ROS, 6 x 6, has those of x, y and the turn about z."""
 NO_HEADING = 1e6
@@ -47,6 +47,11 @@ class Fix:
         across = max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
         return math.sqrt(across), math.sqrt(float(covariance[2, 2]))
 
+    def is_within(self, position: float, heading: float) -> bool:
+        """Whether the deviations are at most so many metres and degrees."""
+        found = self.deviations
+        return found[0] <= position and math.degrees(found[1]) <= heading
+
     def at(self, odom: Planar) -> Fix:
         """What is known after the robot has gone on to a pose by odometry, without another localization."""
         track = self.track.copy()
@@ -56,7 +61,7 @@ class Fix:
 
 @dataclass
 class Rival:
-    """A track that contradicts the believed one, with how many localizations agreed, and the metres driven meanwhile."""
+    """A track that contradicts the believed one; how many localizations agreed, and the metres driven meanwhile."""
 
     track: Track
     agreed: int = 1
@@ -66,8 +71,8 @@ class Rival:
 class Fusion:
     """The track that is believed, and a rival, which the localizations begin that contradict it.
 
-    A track is believed when ``BEGINS`` localizations agree. It gives way when ``CHANGES`` in a row contradict it and agree
-    with each other over ``CHANGE_METRES``: who stands sees the same wrong place again and again.
+    A track is believed when ``BEGINS`` localizations agree. It gives way when ``CHANGES`` in a row contradict it and
+    agree with each other over ``CHANGE_METRES``: who stands sees the same wrong place again and again.
     """
 
     def __init__(self) -> None:
@@ -101,6 +106,12 @@ class Fusion:
                 covariance[2, 2] = NO_HEADING
             self._weigh(found.planar, covariance)
         return None if self._believed is None else Fix(odom, origin, self._believed.copy())
+
+    def place(self, robot: Planar, covariance: Array, odom: Planar, origin: str) -> Fix:
+        """Believe a pose that somebody gives, with the covariance of its x, y and yaw, [3, 3]."""
+        self.clear()
+        self._believed, self._odom, self._origin = Track(robot, covariance), odom, origin
+        return Fix(odom, origin, self._believed.copy())
 
     def _move(self, odom: Planar) -> None:
         step = STANDING if self._odom is None else self._odom.inverse().then(odom)

@@ -28,6 +28,7 @@ from placerec_ros.pictures import UnfitPicture, picture_of
 from placerec_ros.planar import Planar
 from placerec_ros.pose import PoseEstimate, estimate, metric
 from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
+from placerec_ros.track import Array
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
 """Seconds before the next request after a trouble; they double."""
@@ -88,6 +89,10 @@ class Localizer:
         self._latest: Frame | None = None
         self._intrinsics: dict[str, Any] | None = None
         self._camera_due = 0.0
+        self.mount: Planar | None = None
+        """Where the camera is on the robot, by /tf_static; None if that is not known. The node sets it."""
+        self._wanted = True
+        self._let_in = 0
         self._commands: deque[tuple[Callable[[], Done], Future[Done]]] = deque()
         self._wake = threading.Event()
         self._active = self._stopped = False
@@ -112,10 +117,28 @@ class Localizer:
     # ---- for the node's callbacks; none of these waits
 
     def add(self, frame: Frame) -> None:
-        """Take in a frame."""
+        """Take in a frame; it is sent if frames are wanted, and not more often than they may be."""
         self._latest = frame
+        if self._settings.on_demand and not self._wanted:
+            self._health.counts["frames not wanted"] += 1
+            return
+        if self._too_soon(frame):
+            self._health.counts["frames above the rate limit"] += 1
+            return
         self.queue.put(frame)
         self._wake.set()
+
+    def want(self) -> None:
+        """Send frames until it is known again where the robot is."""
+        self._wanted = True
+
+    def _too_soon(self, frame: Frame) -> bool:
+        """Whether a frame comes too early after the last one that was let in; one of an earlier time does not."""
+        now = frame.stamp or round(frame.arrived * NANOSECONDS)
+        if self._settings.rate_limit and 0 <= now - self._let_in < NANOSECONDS / self._settings.rate_limit * 0.999:
+            return True
+        self._let_in = now
+        return False
 
     def camera(self, intrinsics: dict[str, Any] | None) -> None:
         """Take in the camera's intrinsics; None if the message has none."""
@@ -130,7 +153,7 @@ class Localizer:
         """Begin a run with the next frame."""
         self._generation += 1
         self._camera_due = time.monotonic() + CAMERA_WAIT
-        self._active = True
+        self._active = self._wanted = True
         self._wake.set()
 
     def deactivate(self) -> None:
@@ -159,6 +182,10 @@ class Localizer:
     def relocalize(self) -> Future[Done]:
         """Forget the belief: begin a new session."""
         return self._ask(self._relocalize)
+
+    def place(self, robot: Planar, covariance: Array, stamp: int) -> Future[Done]:
+        """Believe a pose that somebody gives, with the covariance of x, y and yaw, [3, 3]; its stamp in nanoseconds."""
+        return self._ask(lambda: self._place(robot, covariance, stamp))
 
     def _ask(self, command: Callable[[], Done]) -> Future[Done]:
         future: Future[Done] = Future()
@@ -271,7 +298,7 @@ class Localizer:
             return
         run = self._running()
         # Odometry's own pose: a frame without an answer may have reached the session, and its motion must count once.
-        odometry = self.odometer.odometry(frame.stamp, math.radians(self._settings.camera_yaw)) if frame.stamp else None
+        odometry = self.odometer.odometry(frame.stamp, self._mount().yaw) if frame.stamp else None
         began = time.monotonic()
         answer = run.send(picture, frame.number, frame.stamp, odometry)
         took = time.monotonic() - began
@@ -324,9 +351,10 @@ class Localizer:
                 self._health.begins("pose", f"The robot is recognized, but the place has {kind}.")
         elif found is not None:
             self._health.over("pose")
-        mount = Planar(0.0, 0.0, math.radians(self._settings.camera_yaw))
-        of_robot = None if found is None else found.of_robot(mount)
+        of_robot = None if found is None else found.of_robot(self._mount())
         self._fuse(frame, of_robot)
+        if self.fix is not None and self.fix.is_within(self._settings.position_limit, self._settings.heading_limit):
+            self._wanted = False
         self._health.fact("verdict", answer["verdict"])
         report = {
             "stamp": frame.stamp / NANOSECONDS,
@@ -352,8 +380,16 @@ class Localizer:
         self._health.counts["localizations refused"] = self._fusion.refused
         self._health.counts["tracks replaced"] = self._fusion.replaced
 
+    def _mount(self) -> Planar:
+        """Where the camera is on the robot, or only where it looks if the map has positions of the robot."""
+        known = self.mount
+        if known is None:
+            return Planar(0.0, 0.0, math.radians(self._settings.camera_yaw))
+        return known if self._settings.poses_of == "camera" else Planar(0.0, 0.0, known.yaw)
+
     def _forget(self) -> None:
         """Forget where the robot is."""
+        self._wanted = True
         self._fusion.clear()
         self.fix = None
 
@@ -413,6 +449,17 @@ class Localizer:
         run = self._running()
         return Done(True, f"The session {run.id} began.")
 
+    def _place(self, robot: Planar, covariance: Array, stamp: int) -> Done:
+        if not self._active:
+            return Done(False, "The node is not active.")
+        odom = self.odometer.at(stamp) or self.odometer.latest
+        if odom is None:
+            return Done(False, "There is no odometry, so the pose cannot be followed.")
+        self._forget()
+        self._end_run()
+        self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin)
+        return Done(True, f"The robot is believed to be at x {robot.x:.2f}, y {robot.y:.2f}.")
+
     def _enrol_here(self) -> Done:
         frame = self._present()
         if not self._active:
@@ -431,15 +478,16 @@ class Localizer:
             robot = self.fix.correction.then(in_odom)
         else:
             return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
-        heading = math.degrees(robot.yaw) + self._settings.camera_yaw
+        camera = robot.then(self._mount())
+        heading = math.degrees(camera.yaw)
         moment = moment_of(frame.stamp)
         assert moment is not None
         place = f"here-{moment:%Y%m%dT%H%M%S}-{moment.microsecond // 1000:03d}-{secrets.token_hex(2)}"
-        fields = {"x": robot.x, "y": robot.y, "heading": heading % 360, "sequence": self._sequence}
-        if robot.z:
-            fields["z"] = robot.z
+        fields = {"x": camera.x, "y": camera.y, "heading": heading % 360, "sequence": self._sequence}
+        if camera.z:
+            fields["z"] = camera.z
         run.enrol(place, picture_of(frame.message), frame.stamp, **fields)
-        return Done(True, f"{place} was enrolled at x {robot.x:.2f}, y {robot.y:.2f}, heading {heading % 360:.0f}°.")
+        return Done(True, f"{place} was enrolled at x {camera.x:.2f}, y {camera.y:.2f}, heading {heading % 360:.0f}°.")
 
     def _present(self) -> Frame | None:
         frame = self._latest

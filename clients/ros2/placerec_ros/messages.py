@@ -17,8 +17,9 @@ from placerec_ros.frame_queue import Frame
 from placerec_ros.fusion import FLAT, Fix
 from placerec_ros.localizer import Answered
 from placerec_ros.odometry import NANOSECONDS
-from placerec_ros.planar import Planar, quaternion
+from placerec_ros.planar import Planar, quaternion, yaw_of
 from placerec_ros.pose import UNKNOWN_ANGLE, UNKNOWN_HEIGHT
+from placerec_ros.track import Array
 
 
 def pose_message(robot: Planar, covariance: Sequence[float], stamp: Time, frame_id: str) -> PoseWithCovarianceStamped:
@@ -39,6 +40,22 @@ def filtered_message(fix: Fix, stamp: Time, frame_id: str) -> PoseWithCovariance
     covariance = np.diag([0.0, 0.0, UNKNOWN_HEIGHT, UNKNOWN_ANGLE, UNKNOWN_ANGLE, 0.0])
     covariance[FLAT] = fix.track.covariance
     return pose_message(fix.track.robot, covariance.ravel().tolist(), stamp, frame_id)
+
+
+def given_pose(message: PoseWithCovarianceStamped) -> tuple[Planar, Array]:
+    """The pose of a message, and the covariance of its x, y and yaw, [3, 3].
+
+    Raises:
+        ValueError: a number is not finite, the orientation is no rotation, or the covariance is none.
+    """
+    pose, stated = message.pose.pose, np.reshape(np.array(message.pose.covariance, np.float64), (6, 6))[FLAT]
+    covariance = (stated + stated.T) / 2
+    position, turned = pose.position, pose.orientation
+    if not np.isfinite([position.x, position.y, position.z]).all():
+        raise ValueError("its position is not finite")
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] < -1e-9:
+        raise ValueError("its covariance is none")
+    return Planar(position.x, position.y, yaw_of(turned.x, turned.y, turned.z, turned.w), position.z), covariance
 
 
 def time_message(stamp: int) -> Time:

@@ -123,6 +123,12 @@ class Odometer:
             reading = self._read(stamp)
         return None if reading is None else reading.pose
 
+    @property
+    def latest(self) -> Planar | None:
+        """The last pose; None if there is none."""
+        with self._lock:
+            return self._poses[-1].pose if self._poses else None
+
     def odometry(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
         """The odometry to send with a frame of a moment, in nanoseconds; None if none is near it.
 

@@ -8,8 +8,8 @@ from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS
 class Repetition:
     """The stamps of a transform that is repeated as odometry comes in.
 
-    A stamp lies ahead of the odometry by ``tolerance``, so that whoever asks for the transform at the time of a laser scan
-    or an image has it already.  The clock of the messages rules, so that bags can be played without ``/clock``.
+    A stamp lies ahead of the odometry by ``tolerance``, so that whoever asks for the transform at the time of a laser
+    scan or an image has it already. The clock of the messages rules, so that bags can be played without ``/clock``.
 
     Args:
         rate: stamps a second at most.

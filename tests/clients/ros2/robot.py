@@ -261,7 +261,9 @@ class Robot:
         for topic in ("answer", "pose", "filtered_pose", "map_to_odom", "annotated/compressed", "/tf", "/diagnostics"):
             self.peer.do("deafen", topic=topic)
             self.peer.take(topic)
-        for topic in ("/image", "/camera_info", "/odom"):
+        self.peer.do("deafen", topic="/initialpose")
+        self.peer.take("/initialpose")
+        for topic in ("/image", "/image/compressed", "/camera_info", "/odom", "/initialpose", "/tf_static"):
             self.peer.do("withdraw", topic=topic)
 
     def look(self, data: bytes | None = None, number: int | None = None, **fields: object) -> float:

@@ -1,4 +1,4 @@
-"""The transform along drives whose answers a service gave: recorded by ``python -m benchmarks.clients.map_to_odom --record``."""
+"""The transform along drives whose answers a service gave; ``benchmarks.clients.map_to_odom --record`` wrote them."""
 
 from __future__ import annotations
 

@@ -120,7 +120,9 @@ def test_places_without_headings_begin_nothing_and_pull_no_heading() -> None:
     unknown = math.sqrt(UNKNOWN_ANGLE)
     fusion = Fusion()
     for number in range(10):
-        assert fusion.add(Planar(float(number), 0.0, 0.0), "start", found(Planar(number, 0.0, 0.0), 1.0, unknown)) is None
+        assert (
+            fusion.add(Planar(float(number), 0.0, 0.0), "start", found(Planar(number, 0.0, 0.0), 1.0, unknown)) is None
+        )
     fusion = Fusion()
     fix = driven(fusion, 0, 20)
     assert fix is not None

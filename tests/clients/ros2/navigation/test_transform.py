@@ -7,35 +7,13 @@ from typing import Any
 
 import pytest
 
+from tests.clients.ros2.navigation.conftest import begin, go
 from tests.clients.ros2.robot import Robot, until
 
 SURE: dict[str, Any] = {"position_limit": 100.0, "heading_limit": 180.0}
 """Limits that never keep the transform back."""
 FOUND = 4
 """Frames of the walk after which the robot's place is believed."""
-
-
-@pytest.fixture
-def moving(robot: Robot) -> Robot:
-    """A robot with a camera and odometry; begin() is called by the test."""
-    robot.peer.do("advertise", topic="/image", kind="CompressedImage")
-    robot.peer.do("advertise", topic="/odom", kind="Odometry", reliable=True)
-    return robot
-
-
-def begin(robot: Robot, **parameters: object) -> None:
-    robot.begin(**parameters)
-    robot.connected()
-    robot.connected("/odom")
-
-
-def go(robot: Robot, start: int, stop: int) -> dict[str, Any]:
-    """Let the robot drive and see; its odometry is turned by 90°, and begins at (5, -2) of the map."""
-    answer: dict[str, Any] = {}
-    for number in range(start, stop):
-        robot.odometry(-2.0, 5.0 - number, -90.0)
-        answer = robot.asked(number)
-    return answer
 
 
 def sent(robot: Robot, topic: str = "map_to_odom", number: int = FOUND) -> list[dict[str, Any]]:
@@ -71,7 +49,9 @@ def test_it_is_repeated_ahead_of_odometry_and_changes_by_localizations_alone(mov
     # Map = R(90°) * odometry + t, with the odometry at (-2, 5 - FOUND): t = pose - (FOUND - 5, -2).
     assert (found[-1]["x"], found[-1]["y"]) == pytest.approx((pose["x"] + 5 - FOUND, pose["y"] + 2.0), abs=1.0)
     assert all(before["stamp"] < after["stamp"] for before, after in pairwise(found))
-    assert {(one["x"], one["y"], one["heading"]) for one in found} == {(found[0]["x"], found[0]["y"], found[0]["heading"])}
+    assert {(one["x"], one["y"], one["heading"]) for one in found} == {
+        (found[0]["x"], found[0]["y"], found[0]["heading"])
+    }
     newest = robot.BASE + 0.1 * robot.frame
     assert newest < found[-1]["stamp"] <= newest + 0.5 + 1e-6
 
