@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -134,7 +134,7 @@ def with_wrong_ones(drive: Sequence[DriveFrame], every: int = 10) -> list[DriveF
     return changed
 
 
-KINDS = {
+KINDS: dict[str, Callable[[Sequence[DriveFrame], Course], Course]] = {
     "single": by_itself,
     "filtered": filtered,
     "tenth wrong": lambda drive, course: filtered(with_wrong_ones(drive), course),

@@ -17,8 +17,6 @@ from placerec_ros.planar import Planar
 
 Array = NDArray[np.float64]
 
-DEEPEST = 100
-"""Frames between a frame and its root, at most; more, and they go in a circle."""
 STEEPEST = math.sin(math.radians(60))
 """A camera that looks up or down more steeply than that has no heading that could be used."""
 
@@ -50,7 +48,7 @@ class StaticFrames:
     def _to_root(self, frame: str) -> dict[str, Array]:
         """The pose of a frame in itself and in all above it, from itself on."""
         poses, pose = {frame: np.eye(4)}, np.eye(4)
-        while frame in self._parents and len(poses) <= DEEPEST:
+        while frame in self._parents and self._parents[frame][0] not in poses:  # frames in a circle have no root
             frame, matrix = self._parents[frame]
             pose = matrix @ pose
             poses[frame] = pose

@@ -110,7 +110,7 @@ class Fusion:
     def place(self, robot: Planar, covariance: Array, odom: Planar, origin: str) -> Fix:
         """Believe a pose that somebody gives, with the covariance of its x, y and yaw, [3, 3]."""
         self.clear()
-        self._believed, self._odom, self._origin = Track(robot, covariance), odom, origin
+        self._believed, self._odom, self._origin = Track(robot, covariance, given=True), odom, origin
         return Fix(odom, origin, self._believed.copy())
 
     def _move(self, odom: Planar) -> None:

@@ -123,7 +123,7 @@ PARAMETERS = (
     ),
     Parameter(
         "heading_limit",
-        15.0,
+        20.0,
         "Degrees: where the standard deviation of the heading is larger, no transform is sent.",
         1.0,
         180.0,

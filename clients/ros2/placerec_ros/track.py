@@ -34,6 +34,8 @@ OWN = 1.0
 """The variance of the error that each localization has by itself, by that which it states."""
 LEAST_POSITION, LEAST_HEADING = 0.1, math.radians(2)
 """Metres and radians: no localization is surer, whatever it says."""
+TYPICAL = (1.0, 1.0, math.radians(10))
+"""Standard deviations of a localization in metres and radians, before there is one."""
 LIKELY = 11.34
 """Squared normalized innovation of three values that one in a hundred right localizations exceeds (chi square)."""
 
@@ -47,16 +49,20 @@ class Track:
     Args:
         robot: the first localization.
         covariance: of its x, y and yaw, [3, 3].
+        given: it is no localization, but somebody's word, whose error localizations do not share.
     """
 
-    def __init__(self, robot: Planar, covariance: Array) -> None:
-        self._stated = _floored(covariance)
+    def __init__(self, robot: Planar, covariance: Array, given: bool = False) -> None:
+        self._stated = np.diag(TYPICAL) ** 2 if given else _floored(covariance)
         self._state: Array = np.array([robot.x, robot.y, robot.yaw, *[0.0] * 4])
         self._z = robot.z
         self._covariance: Array = np.zeros((7, 7))
         self._covariance[:3, :3] = (COMMON + OWN) * self._stated
         self._covariance[3, 3] = SCALE**2
         self._covariance[4:, 4:] = COMMON * self._stated
+        if given:
+            self._covariance[:3, :3] = _floored(covariance)
+            return
         self._covariance[:3, 4:] = self._covariance[4:, :3] = -COMMON * self._stated  # by so much the pose is off
 
     @property

@@ -17,7 +17,7 @@ def moving(robot: Robot) -> Robot:
     return robot
 
 
-def begin(robot: Robot, **parameters: object) -> None:
+def begin(robot: Robot, **parameters: Any) -> None:
     """Activate the node with parameters, and wait until it hears the robot."""
     robot.begin(**parameters)
     robot.connected()

@@ -122,7 +122,7 @@ def test_the_camera_is_found_on_the_robot(moving: Robot) -> None:
         answer = robot.asked(number)
     pose = until(lambda: robot.peer.take("pose"))[-1]
     camera = answer["answer"]["single"]["pose"]
-    assert (pose["heading"] - camera["heading"] + 90) % 360 == pytest.approx(0, abs=0.1) or answer[
+    assert (pose["heading"] - camera["heading"] + 270) % 360 == pytest.approx(180, abs=0.1) or answer[
         "pose_source"
     ] == "belief"
     assert pose["heading"] == pytest.approx(270, abs=20)

@@ -116,6 +116,20 @@ def test_odometry_that_begins_anew_is_another_drive() -> None:
     assert fusion.add(Planar(0.0, 0.0, 0.0), "again", None) is None
 
 
+def test_a_pose_that_is_given_is_as_sure_as_it_says_and_gives_way_to_what_is_seen() -> None:
+    fusion = Fusion()
+    fix = fusion.place(
+        Planar(0.0, 1.0, 0.0), np.diag([0.25, 0.25, math.radians(15) ** 2]), Planar(5.0, 5.0, 0.0), "start"
+    )
+    assert fix.deviations == pytest.approx((0.5, math.radians(15)), rel=0.03)
+    later = driven(fusion, 0, 1)
+    assert later is not None and abs(later.track.robot.y) < 1.0
+    for number in range(1, 101):
+        odom = Planar(5.0, 5.0 + number, math.pi / 2)
+        later = fusion.add(odom, "start", found(Planar(number, 0.0, 0.0)))
+    assert later is not None and later.track.robot.y == pytest.approx(0, abs=0.4)
+
+
 def test_places_without_headings_begin_nothing_and_pull_no_heading() -> None:
     unknown = math.sqrt(UNKNOWN_ANGLE)
     fusion = Fusion()
