@@ -81,7 +81,7 @@ def curve(metres: Array, length: float) -> list[Planar]:
 
 
 def odometry(true: Sequence[Planar], seed: int) -> list[Planar]:
-    """What drifting odometry makes of a drive, from a start of its own."""
+    """The poses that drifting odometry makes of a drive, from a start of its own."""
     random = np.random.default_rng(seed)
     longer, more = 1 + DRIFT * random.choice((-1, 1), size=2)
     poses = [Planar(0.0, 0.0, float(random.uniform(-3, 3)))]

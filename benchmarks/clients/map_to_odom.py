@@ -40,7 +40,7 @@ LIMITS = [float(one.default) for one in PARAMETERS if one.name in ("position_lim
 
 @dataclass
 class Course:
-    """What a robot would have seen of the transform, in metres.
+    """The course of the transform as a robot sees it, in metres.
 
     jumps, slides: how far each frame moved the robot, if it was localized in it, and if not.
     steps: the steps of the slides.

@@ -53,7 +53,7 @@ class Fix:
         return found[0] <= position and math.degrees(found[1]) <= heading
 
     def at(self, odom: Planar) -> Fix:
-        """What is known after the robot has gone on to a pose by odometry, without another localization."""
+        """The fix after the robot has gone on to a pose by odometry, without another localization."""
         track = self.track.copy()
         track.move(self.odom.inverse().then(odom))
         return Fix(odom, self.origin, track)
