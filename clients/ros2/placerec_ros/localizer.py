@@ -47,7 +47,7 @@ class Answered:
 
     report: the answer that is published as JSON.
     robot: the robot's pose in the map by this answer; None while it is not localized.
-    fix: where it is by all answers and odometry; None without odometry, or if that is not known yet.
+    fix: where it is by all answers and odometry; None without odometry of the frame, or if that is not known.
     """
 
     frame: Frame
@@ -352,8 +352,8 @@ class Localizer:
         elif found is not None:
             self._health.over("pose")
         of_robot = None if found is None else found.of_robot(self._mount())
-        self._fuse(frame, of_robot)
-        if self.fix is not None and self.fix.is_within(self._settings.position_limit, self._settings.heading_limit):
+        fix = self._fuse(frame, of_robot)
+        if fix is not None and fix.is_within(self._settings.position_limit, self._settings.heading_limit):
             self._wanted = False
         self._health.fact("verdict", answer["verdict"])
         report = {
@@ -369,16 +369,17 @@ class Localizer:
             "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
-        return Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, self.fix)
+        return Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix)
 
-    def _fuse(self, frame: Frame, found: PoseEstimate | None) -> None:
-        """Take in where the robot is by one answer, if it is known by odometry where it was then."""
+    def _fuse(self, frame: Frame, found: PoseEstimate | None) -> Fix | None:
+        """Take in where the robot is by one answer; where it was at its frame, None if odometry has nothing of then."""
         odom = self.odometer.at(frame.stamp) if frame.stamp else None
         if odom is None:
-            return
+            return None
         self.fix = self._fusion.add(odom, self.odometer.origin, found)
         self._health.counts["localizations refused"] = self._fusion.refused
         self._health.counts["tracks replaced"] = self._fusion.replaced
+        return self.fix
 
     def _mount(self) -> Planar:
         """Where the camera is on the robot, or only where it looks if the map has positions of the robot."""

@@ -390,7 +390,7 @@ class PlacerecNode(LifecycleNode):
         with self._outlet_lock:
             if not self._publishing:
                 return
-            _, chosen = self._made()
+            localizer, chosen = self._made()
             stamp = answered.frame.message.header.stamp
             if (found := answered.estimate) is not None:
                 self._pose.publish(messages.pose_message(found.planar, found.covariance, stamp, chosen.map_frame))
@@ -399,7 +399,7 @@ class PlacerecNode(LifecycleNode):
                 filtered = messages.filtered_message(answered.fix, stamp, chosen.map_frame)
                 self._filtered.publish(filtered)
                 self._send_initial_pose(answered.fix, filtered)
-            else:
+            elif localizer.fix is None:
                 self._initial_pose_due = True
 
     def _send_initial_pose(self, fix: Fix, message: PoseWithCovarianceStamped) -> None:
@@ -414,8 +414,8 @@ class PlacerecNode(LifecycleNode):
     def _send_transform(self, stamp: int) -> None:
         """Send the transform from the map to the odometry, at a moment of odometry in nanoseconds, if it is due."""
         localizer, chosen = self._made()
-        fix, odom = localizer.fix, localizer.odometer.at(stamp)
-        if fix is None or odom is None or fix.origin != localizer.odometer.origin:
+        fix, odom, frame = localizer.fix, localizer.odometer.at(stamp), chosen.odom_frame or localizer.odometer.frame
+        if fix is None or odom is None or fix.origin != localizer.odometer.origin or frame == chosen.map_frame:
             return
         if (ahead := self._repetition.due(stamp)) is None:
             return
@@ -430,12 +430,7 @@ class PlacerecNode(LifecycleNode):
             )
             return
         self._health.over("transform")
-        transform = messages.transform_message(
-            fix.correction,
-            messages.time_message(ahead),
-            chosen.map_frame,
-            chosen.odom_frame or localizer.odometer.frame,
-        )
+        transform = messages.transform_message(fix.correction, messages.time_message(ahead), chosen.map_frame, frame)
         with self._outlet_lock:
             if self._publishing:
                 self._transform.publish(transform)

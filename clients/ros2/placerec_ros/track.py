@@ -34,6 +34,8 @@ OWN = 1.0
 """The variance of the error that each localization has by itself, by that which it states."""
 LEAST_POSITION, LEAST_HEADING = 0.1, math.radians(2)
 """Metres and radians: no localization is surer, whatever it says."""
+HEIGHT = 0.1
+"""Share by which a localization corrects the height, which is no state."""
 TYPICAL = (1.0, 1.0, math.radians(10))
 """Standard deviations of a localization in metres and radians, before there is one."""
 LIKELY = 11.34
@@ -114,7 +116,7 @@ class Track:
         self._state = self._state + gain @ off
         self._covariance = self._covariance - gain @ expected @ gain.T
         self._covariance = (self._covariance + self._covariance.T) / 2
-        self._z = robot.z
+        self._z += HEIGHT * (robot.z - self._z)
         self._stated = _floored(covariance)
 
     def _innovation(self, robot: Planar, covariance: Array) -> tuple[Array, Array, Array]:
