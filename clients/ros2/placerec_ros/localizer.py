@@ -75,6 +75,25 @@ class Done:
     message: str
 
 
+@dataclass
+class Drive:
+    """A drive on which the robot enrols images.
+
+    origin: of its odometry; with another one it is over.
+    last: the pose by odometry of the last image that was enrolled.
+    """
+
+    origin: str
+    last: Planar | None = None
+
+    def goes_on(self, odom: Planar, metres: float, degrees: float) -> bool:
+        """Whether the robot has gone so many metres, or turned by so many degrees, since the last one."""
+        if self.last is None:
+            return True
+        step = self.last.inverse().then(odom)
+        return math.hypot(step.x, step.y) >= metres or abs(math.degrees(step.yaw)) >= degrees
+
+
 class Localizer:
     """The worker; it lives from the node's configuration until its clean-up.
 
@@ -106,6 +125,7 @@ class Localizer:
         self.fix: Fix | None = None
         """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
         self._mapping = False
+        self._driving: Drive | None = None
         self._paused_until = 0.0
         self._heard = self._pictured = -math.inf  # a robot that has just started counts few seconds
         self._pause = FIRST_PAUSE
@@ -119,7 +139,7 @@ class Localizer:
     def add(self, frame: Frame) -> None:
         """Take in a frame; it is sent if frames are wanted, and not more often than they may be."""
         self._latest = frame
-        if self._settings.on_demand and not self._wanted:
+        if self._settings.on_demand and not self._wanted and self._driving is None:
             self._health.counts["frames not wanted"] += 1
             return
         if self._too_soon(frame):
@@ -179,6 +199,10 @@ class Localizer:
         """Enrol the present frame with the pose that odometry gives."""
         return self._ask(self._enrol_here)
 
+    def enrol_keyframes(self, begin: bool) -> Future[Done]:
+        """Begin to enrol images as the robot drives, or end it."""
+        return self._ask(self._begin_drive if begin else self._end_drive)
+
     def relocalize(self) -> Future[Done]:
         """Forget the belief: begin a new session."""
         return self._ask(self._relocalize)
@@ -223,7 +247,8 @@ class Localizer:
             elif time.monotonic() < self._paused_until:
                 return
             elif self._active and (frame := self.queue.take(time.monotonic() - self._settings.deadline)) is not None:
-                self._guarded(lambda frame=frame: self._locate(frame))  # type: ignore[misc]
+                step = self._locate if self._driving is None else self._enrol_keyframe
+                self._guarded(lambda frame=frame, step=step: step(frame))  # type: ignore[misc]
             else:
                 if time.monotonic() - self._heard >= IDLE_CHECK:
                     self._guarded(self._check_service)
@@ -329,6 +354,7 @@ class Localizer:
         """End the run of before, if the node was deactivated or activated meanwhile."""
         if self._run_generation != self._generation:
             self._run_generation = self._generation
+            self._driving = None
             self._forget()
             self._end_run()
 
@@ -475,10 +501,51 @@ class Localizer:
             robot = in_odom
         elif self._mapping or run.places() == 0:
             self._mapping, robot = True, in_odom  # the frame of the odometry is that of the new map
-        elif self.fix is not None:
+        elif self.fix is not None and self.fix.origin == self.odometer.origin:
             robot = self.fix.correction.then(in_odom)
         else:
             return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
+        return self._enrol(frame, robot)
+
+    def _begin_drive(self) -> Done:
+        if not self._active:
+            return Done(False, "The node is not active.")
+        if not self._mapping and self.odometer.frame != self._settings.map_frame and self._running().places():
+            return Done(False, "The map has places. Drive into an empty one, or with odometry in the frame of the map.")
+        if not self.odometer.frame:
+            return Done(False, "There is no odometry, so no pose is known.")
+        self._mapping = self.odometer.frame != self._settings.map_frame
+        self._driving = Drive(self.odometer.origin)
+        return Done(True, "Images are enrolled as the robot drives; meanwhile it is not localized.")
+
+    def _end_drive(self) -> Done:
+        driven, self._driving = self._driving, None
+        if driven is None:
+            return Done(False, "No images are being enrolled.")
+        return Done(True, "Images are no longer enrolled.")
+
+    def _enrol_keyframe(self, frame: Frame) -> None:
+        """Enrol a frame if the robot has gone on far enough since the last one."""
+        odom, drive = self.odometer.at(frame.stamp) if frame.stamp else None, self._driving
+        if odom is None or drive is None:
+            self._health.counts["frames without odometry"] += 1
+            return
+        if self.odometer.origin != drive.origin:
+            self._driving = None
+            self._mapping = False
+            self._health.begins("keyframes", "Odometry has begun anew, so images are no longer enrolled.")
+            return
+        self._health.over("keyframes")
+        if not drive.goes_on(odom, self._settings.keyframe_metres, self._settings.keyframe_degrees):
+            return
+        self._enrol(frame, odom)
+        drive.last = odom
+        self._heard_from_service()
+        self._health.counts["keyframes enrolled"] += 1
+
+    def _enrol(self, frame: Frame, robot: Planar) -> Done:
+        """Enrol a frame at which the robot was at a pose of the map."""
+        run = self._running()
         camera = robot.then(self._mount())
         heading = math.degrees(camera.yaw)
         moment = moment_of(frame.stamp)

@@ -29,7 +29,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from placerec_ros import messages
 from placerec_ros.frame_queue import Frame
@@ -91,9 +91,10 @@ class PlacerecNode(LifecycleNode):
         self._heard = {"image": 0.0, "info": 0.0}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._waiting = ReentrantCallbackGroup()  # while one of these waits, all other callbacks go on
-        self._ask_for("create_map", lambda localizer: localizer.create_map())
-        self._ask_for("enrol_here", lambda localizer: localizer.enrol_here())
-        self._ask_for("relocalize", lambda localizer: localizer.relocalize())
+        self._ask_for("create_map", lambda localizer, _: localizer.create_map())
+        self._ask_for("enrol_here", lambda localizer, _: localizer.enrol_here())
+        self._ask_for("relocalize", lambda localizer, _: localizer.relocalize())
+        self._ask_for("enrol_keyframes", lambda localizer, asked: localizer.enrol_keyframes(asked.data), SetBool)
         self.add_on_set_parameters_callback(self._may_set)
         self.add_post_set_parameters_callback(self._were_set)
         self.create_timer(TICK_SECONDS, self._tick)
@@ -358,18 +359,20 @@ class PlacerecNode(LifecycleNode):
             self._health.over("odometry")
             self._send_transform(stamp_of(message))
 
-    def _ask_for(self, name: str, ask: Callable[[Localizer], ThreadFuture[Done]]) -> None:
+    def _ask_for(
+        self, name: str, ask: Callable[[Localizer, Any], ThreadFuture[Done]], kind: type[Any] = Trigger
+    ) -> None:
         """Make a service that the localizer's thread answers."""
 
-        async def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        async def answer(request: Any, response: Any) -> Any:
             if self._localizer is None:
                 response.success, response.message = False, "The node is not configured."
                 return response
-            done = await self._awaited(ask(self._localizer))
+            done = await self._awaited(ask(self._localizer, request))
             response.success, response.message = done.success, done.message
             return response
 
-        self.create_service(Trigger, f"~/{name}", answer, callback_group=self._waiting)
+        self.create_service(kind, f"~/{name}", answer, callback_group=self._waiting)
 
     def _awaited(self, result: ThreadFuture[Done]) -> Future:
         """A future of the executor that is done when that of another thread is."""

@@ -180,9 +180,25 @@ PARAMETERS = (
     ),
     Parameter("autostart", False, "Configure and activate the node when it starts, without a manager of lifecycles."),
     Parameter(
+        "keyframe_metres",
+        1.0,
+        "Metres after which enrol_keyframes enrols another image.",
+        0.05,
+        1000.0,
+        live=True,
+    ),
+    Parameter(
+        "keyframe_degrees",
+        30.0,
+        "Degrees by which the robot has turned when enrol_keyframes enrols another image.",
+        1.0,
+        180.0,
+        live=True,
+    ),
+    Parameter(
         "sequence",
         "",
-        "Traverse of the places that enrol_here adds; empty: named by the time when the node was configured.",
+        "Traverse of the places that the node enrols; empty: named by the time when the node was configured.",
     ),
 )
 
@@ -224,6 +240,8 @@ class Settings:
     verify: str
     picture_period: float
     autostart: bool
+    keyframe_metres: float
+    keyframe_degrees: float
     sequence: str
     key: str | None
 

@@ -30,7 +30,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -225,6 +225,11 @@ class Peer:
     def call(self, service: str, patience: float = PATIENCE) -> dict[str, Any]:
         """Call one of the node's own services."""
         done = self._call(Trigger, f"/placerec/{service}", Trigger.Request(), patience)
+        return {"success": done.success, "message": done.message}
+
+    def switch(self, service: str, on: bool) -> dict[str, Any]:
+        """Call one of the node's own services that switches something on or off."""
+        done = self._call(SetBool, f"/placerec/{service}", SetBool.Request(data=on))
         return {"success": done.success, "message": done.message}
 
     def transition(self, name: str, node: str = "placerec") -> dict[str, Any]:
