@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from tests.clients.ros2.navigation.conftest import begin
@@ -27,15 +29,18 @@ def test_keyframes_are_enrolled_as_the_robot_drives(moving: Robot) -> None:
         poses = [one["pose"] for one in server.places("driven").values()]
         return [(one["x"], one["y"], round(one["heading"])) for one in poses]
 
+    def has(count: int) -> bool:
+        return len(enrolled()) == count
+
     for number in range(7):
         robot.odometry(float(number), 1.0, 30.0)
         robot.look(encoded(robot.site.frames[number]))
-        until(lambda number=number: len(enrolled()) == number // 2 + 1)
+        until(partial(has, number // 2 + 1))
     assert enrolled() == [(0.0, 1.0, 30), (2.0, 1.0, 30), (4.0, 1.0, 30), (6.0, 1.0, 30)]
     assert {one["sequence"] for one in server.places("driven").values()} == {"drive"}
     robot.odometry(6.0, 1.0, 70.0)
     robot.look(encoded(robot.site.frames[6]))
-    until(lambda: len(enrolled()) == 5)
+    until(partial(has, 5))
     assert robot.peer.take("answer") == [], "meanwhile it is not localized"
     robot.frame += 1
     robot.odometry(100.0, 1.0, 0.0)
