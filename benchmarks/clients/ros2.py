@@ -1,7 +1,7 @@
 """The time that the ROS 2 node adds to an answer: from a published image to the published answer, beside HTTP.
 
-    PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2               # on drawn frames
-    PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2 --corridor    # the real corridor as a bag at 10 Hz
+    python -m benchmarks.clients.ros2               # on drawn frames
+    python -m benchmarks.clients.ros2 --corridor    # the real corridor as a bag at 10 Hz
 
 For the times, two sessions of one service get the same frames in turn, one over HTTP from this process, one by the
 node, whose peer publishes each frame and hears the answer; the node's share is also given beside its own request,

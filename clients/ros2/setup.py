@@ -14,6 +14,7 @@ setup(
     python_requires=">=3.11",
     # rclpy and the messages come with ROS, or from the wheels that README.md names.
     install_requires=["numpy", "placerec-client"],
+    extras_require={"test": ["pytest"]},  # by which colcon test knows how to run them
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -1,6 +1,8 @@
 """Start the node and bring it to the state active.
 
 ros2 launch placerec_ros placerec.launch.py map:=lab image:=/camera/image_raw/compressed
+
+In a namespace it sends to the topic ``tf`` and hears ``tf_static`` there, as the launch files of Nav2 do.
 """
 
 from pathlib import Path
@@ -45,6 +47,12 @@ def generate_launch_description() -> LaunchDescription:
                 "use_sim_time": ParameterValue(given("use_sim_time"), value_type=bool),
             },
         ],
-        remappings=[("image", given("image")), ("camera_info", given("camera_info")), ("odom", given("odom"))],
+        remappings=[
+            ("image", given("image")),
+            ("camera_info", given("camera_info")),
+            ("odom", given("odom")),
+            ("/tf", "tf"),  # of the namespace, as Nav2 has them
+            ("/tf_static", "tf_static"),
+        ],
     )
     return LaunchDescription([*arguments, node])

@@ -20,13 +20,15 @@ from typing import Any, Protocol
 
 from placerec_client import Client, DeadlineExceeded, InvalidOdometry, PlacerecError, Problem
 from placerec_ros.frame_queue import Frame, FrameQueue
+from placerec_ros.fusion import Fix, Fusion
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
 from placerec_ros.parameters import Settings
 from placerec_ros.pictures import UnfitPicture, picture_of
-from placerec_ros.planar import Planar, map_to_odom
-from placerec_ros.pose import UNKNOWN_ANGLE, PoseEstimate, estimate, metric
+from placerec_ros.planar import Planar
+from placerec_ros.pose import PoseEstimate, estimate, metric
 from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
+from placerec_ros.track import Array
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
 """Seconds before the next request after a trouble; they double."""
@@ -44,15 +46,15 @@ class Answered:
     """An answer with what follows from it.
 
     report: the answer that is published as JSON.
-    robot: the robot's pose in the map; None while it is not localized.
-    correction: the transform from the map to the odometry; None without odometry, or if the heading is not known.
+    robot: the robot's pose in the map by this answer; None while it is not localized.
+    fix: where it is by all answers and odometry; None without odometry of the frame, or if that is not known.
     """
 
     frame: Frame
     report: dict[str, Any]
     estimate: PoseEstimate | None
     robot: Planar | None
-    correction: Planar | None
+    fix: Fix | None
 
 
 class Outlet(Protocol):
@@ -73,6 +75,25 @@ class Done:
     message: str
 
 
+@dataclass
+class Drive:
+    """A drive on which the robot enrols images.
+
+    origin: of its odometry; with another one it is over.
+    last: the pose by odometry of the last image that was enrolled.
+    """
+
+    origin: str
+    last: Planar | None = None
+
+    def goes_on(self, odom: Planar, metres: float, degrees: float) -> bool:
+        """Whether the robot has gone so many metres, or turned by so many degrees, since the last one."""
+        if self.last is None:
+            return True
+        step = self.last.inverse().then(odom)
+        return math.hypot(step.x, step.y) >= metres or abs(math.degrees(step.yaw)) >= degrees
+
+
 class Localizer:
     """The worker; it lives from the node's configuration until its clean-up.
 
@@ -87,6 +108,10 @@ class Localizer:
         self._latest: Frame | None = None
         self._intrinsics: dict[str, Any] | None = None
         self._camera_due = 0.0
+        self.mount: Planar | None = None
+        """Where the camera is on the robot, by /tf_static; None if that is not known. The node sets it."""
+        self._wanted = True
+        self._let_in = 0
         self._commands: deque[tuple[Callable[[], Done], Future[Done]]] = deque()
         self._wake = threading.Event()
         self._active = self._stopped = False
@@ -96,8 +121,11 @@ class Localizer:
         self._run: Run | None = None
         self._run_generation = 0
         self._sent: Frame | None = None
-        self._correction: Planar | None = None
+        self._fusion = Fusion()
+        self.fix: Fix | None = None
+        """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
         self._mapping = False
+        self._driving: Drive | None = None
         self._paused_until = 0.0
         self._heard = self._pictured = -math.inf  # a robot that has just started counts few seconds
         self._pause = FIRST_PAUSE
@@ -109,10 +137,28 @@ class Localizer:
     # ---- for the node's callbacks; none of these waits
 
     def add(self, frame: Frame) -> None:
-        """Take in a frame."""
+        """Take in a frame; it is sent if frames are wanted, and not more often than they may be."""
         self._latest = frame
+        if self._settings.on_demand and not self._wanted and self._driving is None:
+            self._health.counts["frames not wanted"] += 1
+            return
+        if self._too_soon(frame):
+            self._health.counts["frames above the rate limit"] += 1
+            return
         self.queue.put(frame)
         self._wake.set()
+
+    def want(self) -> None:
+        """Send frames until it is known again where the robot is."""
+        self._wanted = True
+
+    def _too_soon(self, frame: Frame) -> bool:
+        """Whether a frame comes too early after the last one that was let in; one of an earlier time does not."""
+        now = frame.stamp or round(frame.arrived * NANOSECONDS)
+        if self._settings.rate_limit and 0 <= now - self._let_in < NANOSECONDS / self._settings.rate_limit * 0.999:
+            return True
+        self._let_in = now
+        return False
 
     def camera(self, intrinsics: dict[str, Any] | None) -> None:
         """Take in the camera's intrinsics; None if the message has none."""
@@ -127,7 +173,7 @@ class Localizer:
         """Begin a run with the next frame."""
         self._generation += 1
         self._camera_due = time.monotonic() + CAMERA_WAIT
-        self._active = True
+        self._active = self._wanted = True
         self._wake.set()
 
     def deactivate(self) -> None:
@@ -153,9 +199,17 @@ class Localizer:
         """Enrol the present frame with the pose that odometry gives."""
         return self._ask(self._enrol_here)
 
+    def enrol_keyframes(self, begin: bool) -> Future[Done]:
+        """Begin to enrol images as the robot drives, or end it."""
+        return self._ask(self._begin_drive if begin else self._end_drive)
+
     def relocalize(self) -> Future[Done]:
         """Forget the belief: begin a new session."""
         return self._ask(self._relocalize)
+
+    def place(self, robot: Planar, covariance: Array, stamp: int) -> Future[Done]:
+        """Believe a pose that somebody gives, with the covariance of x, y and yaw, [3, 3]; its stamp in nanoseconds."""
+        return self._ask(lambda: self._place(robot, covariance, stamp))
 
     def _ask(self, command: Callable[[], Done]) -> Future[Done]:
         future: Future[Done] = Future()
@@ -186,15 +240,15 @@ class Localizer:
 
     def _work_once(self) -> None:
         while not self._stopped:
-            if self._run is not None and self._run_generation != self._generation:
-                self._end_run()
+            self._renew()
             if self._commands:
                 command, future = self._commands.popleft()
                 future.set_result(self._done(command))
             elif time.monotonic() < self._paused_until:
                 return
             elif self._active and (frame := self.queue.take(time.monotonic() - self._settings.deadline)) is not None:
-                self._guarded(lambda frame=frame: self._locate(frame))  # type: ignore[misc]
+                step = self._locate if self._driving is None else self._enrol_keyframe
+                self._guarded(lambda frame=frame, step=step: step(frame))  # type: ignore[misc]
             else:
                 if time.monotonic() - self._heard >= IDLE_CHECK:
                     self._guarded(self._check_service)
@@ -269,7 +323,7 @@ class Localizer:
             return
         run = self._running()
         # Odometry's own pose: a frame without an answer may have reached the session, and its motion must count once.
-        odometry = self.odometer.odometry(frame.stamp, math.radians(self._settings.camera_yaw)) if frame.stamp else None
+        odometry = self.odometer.odometry(frame.stamp, self._mount().yaw) if frame.stamp else None
         began = time.monotonic()
         answer = run.send(picture, frame.number, frame.stamp, odometry)
         took = time.monotonic() - began
@@ -290,18 +344,27 @@ class Localizer:
             return True
         if frame.stamp < self._sent.stamp - CLOCK_JUMP * NANOSECONDS:
             self._mapping = False
+            self._forget()
             self._end_run()
             return True
         self._health.counts["frames out of order"] += 1
         return False
 
+    def _renew(self) -> None:
+        """End the run of before, if the node was deactivated or activated meanwhile."""
+        if self._run_generation != self._generation:
+            self._run_generation = self._generation
+            self._driving = None
+            self._forget()
+            self._end_run()
+
     def _running(self) -> Run:
         """The present run; it begins if there is none, and anew when intrinsics come or change."""
+        self._renew()
         known = self._intrinsics if self._settings.use_camera_info else None
         if self._run is not None and known is not None and self._run.intrinsics != known:
             self._end_run()
         if self._run is None:
-            self._run_generation = self._generation
             self._run = Run(self._open(), self._settings, self._health, known)
         return self._run
 
@@ -314,13 +377,10 @@ class Localizer:
                 self._health.begins("pose", f"The robot is recognized, but the place has {kind}.")
         elif found is not None:
             self._health.over("pose")
-        robot = correction = None
-        if found is not None:
-            robot = found.planar.then(Planar(0.0, 0.0, -math.radians(self._settings.camera_yaw)))
-            in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
-            if in_odom is not None and found.covariance[35] < 0.99 * UNKNOWN_ANGLE:
-                correction = map_to_odom(robot, in_odom)
-                self._correction = correction
+        of_robot = None if found is None else found.of_robot(self._mount())
+        fix = self._fuse(frame, of_robot)
+        if fix is not None and fix.is_within(self._settings.position_limit, self._settings.heading_limit):
+            self._wanted = False
         self._health.fact("verdict", answer["verdict"])
         report = {
             "stamp": frame.stamp / NANOSECONDS,
@@ -335,7 +395,30 @@ class Localizer:
             "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
-        return Answered(frame, report, found, robot, correction)
+        return Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix)
+
+    def _fuse(self, frame: Frame, found: PoseEstimate | None) -> Fix | None:
+        """Take in where the robot is by one answer; where it was at its frame, None if odometry has nothing of then."""
+        odom = self.odometer.at(frame.stamp) if frame.stamp else None
+        if odom is None:
+            return None
+        self.fix = self._fusion.add(odom, self.odometer.origin, found)
+        self._health.counts["localizations refused"] = self._fusion.refused
+        self._health.counts["tracks replaced"] = self._fusion.replaced
+        return self.fix
+
+    def _mount(self) -> Planar:
+        """Where the camera is on the robot, or only where it looks if the map has positions of the robot."""
+        known = self.mount
+        if known is None:
+            return Planar(0.0, 0.0, math.radians(self._settings.camera_yaw))
+        return known if self._settings.poses_of == "camera" else Planar(0.0, 0.0, known.yaw)
+
+    def _forget(self) -> None:
+        """Forget where the robot is."""
+        self._wanted = True
+        self._fusion.clear()
+        self.fix = None
 
     def _annotate(self, frame: Frame, picture: Any, run: Run) -> None:
         """Send the frame again for a picture, if somebody looks on; the answer of the session is out already."""
@@ -355,7 +438,7 @@ class Localizer:
 
     def _end_run(self) -> None:
         """End the session, if the service lets us; it ends by itself otherwise."""
-        run, self._run, self._sent, self._correction = self._run, None, None, None
+        run, self._run, self._sent = self._run, None, None
         if run is not None:
             with suppress(PlacerecError):
                 run.end()
@@ -387,10 +470,22 @@ class Localizer:
         if not self._active:
             return Done(False, "The node is not active.")
         self._mapping = False
+        self._forget()
         self._end_run()
         self._paused_until = 0.0
         run = self._running()
         return Done(True, f"The session {run.id} began.")
+
+    def _place(self, robot: Planar, covariance: Array, stamp: int) -> Done:
+        if not self._active:
+            return Done(False, "The node is not active.")
+        odom = self.odometer.at(stamp) or self.odometer.latest
+        if odom is None:
+            return Done(False, "There is no odometry, so the pose cannot be followed.")
+        self._forget()
+        self._end_run()
+        self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin)
+        return Done(True, f"The robot is believed to be at x {robot.x:.2f}, y {robot.y:.2f}.")
 
     def _enrol_here(self) -> Done:
         frame = self._present()
@@ -406,19 +501,61 @@ class Localizer:
             robot = in_odom
         elif self._mapping or run.places() == 0:
             self._mapping, robot = True, in_odom  # the frame of the odometry is that of the new map
-        elif self._correction is not None:
-            robot = self._correction.then(in_odom)
+        elif self.fix is not None and self.fix.origin == self.odometer.origin:
+            robot = self.fix.correction.then(in_odom)
         else:
             return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
-        heading = math.degrees(robot.yaw) + self._settings.camera_yaw
+        return self._enrol(frame, robot)
+
+    def _begin_drive(self) -> Done:
+        if not self._active:
+            return Done(False, "The node is not active.")
+        if not self._mapping and self.odometer.frame != self._settings.map_frame and self._running().places():
+            return Done(False, "The map has places. Drive into an empty one, or with odometry in the frame of the map.")
+        if not self.odometer.frame:
+            return Done(False, "There is no odometry, so no pose is known.")
+        self._mapping = self.odometer.frame != self._settings.map_frame
+        self._driving = Drive(self.odometer.origin)
+        return Done(True, "Images are enrolled as the robot drives; meanwhile it is not localized.")
+
+    def _end_drive(self) -> Done:
+        driven, self._driving = self._driving, None
+        if driven is None:
+            return Done(False, "No images are being enrolled.")
+        return Done(True, "Images are no longer enrolled.")
+
+    def _enrol_keyframe(self, frame: Frame) -> None:
+        """Enrol a frame if the robot has gone on far enough since the last one."""
+        odom, drive = self.odometer.at(frame.stamp) if frame.stamp else None, self._driving
+        if odom is None or drive is None:
+            self._health.counts["frames without odometry"] += 1
+            return
+        if self.odometer.origin != drive.origin:
+            self._driving = None
+            self._mapping = False
+            self._health.begins("keyframes", "Odometry has begun anew, so images are no longer enrolled.")
+            return
+        self._health.over("keyframes")
+        if not drive.goes_on(odom, self._settings.keyframe_metres, self._settings.keyframe_degrees):
+            return
+        self._enrol(frame, odom)
+        drive.last = odom
+        self._heard_from_service()
+        self._health.counts["keyframes enrolled"] += 1
+
+    def _enrol(self, frame: Frame, robot: Planar) -> Done:
+        """Enrol a frame at which the robot was at a pose of the map."""
+        run = self._running()
+        camera = robot.then(self._mount())
+        heading = math.degrees(camera.yaw)
         moment = moment_of(frame.stamp)
         assert moment is not None
         place = f"here-{moment:%Y%m%dT%H%M%S}-{moment.microsecond // 1000:03d}-{secrets.token_hex(2)}"
-        fields = {"x": robot.x, "y": robot.y, "heading": heading % 360, "sequence": self._sequence}
-        if robot.z:
-            fields["z"] = robot.z
+        fields = {"x": camera.x, "y": camera.y, "heading": heading % 360, "sequence": self._sequence}
+        if camera.z:
+            fields["z"] = camera.z
         run.enrol(place, picture_of(frame.message), frame.stamp, **fields)
-        return Done(True, f"{place} was enrolled at x {robot.x:.2f}, y {robot.y:.2f}, heading {heading % 360:.0f}°.")
+        return Done(True, f"{place} was enrolled at x {camera.x:.2f}, y {camera.y:.2f}, heading {heading % 360:.0f}°.")
 
     def _present(self) -> Frame | None:
         frame = self._latest

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -13,22 +14,53 @@ from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
 from placerec_ros.frame_queue import Frame
+from placerec_ros.fusion import FLAT, Fix
 from placerec_ros.localizer import Answered
-from placerec_ros.planar import Planar, quaternion
+from placerec_ros.odometry import NANOSECONDS
+from placerec_ros.planar import Planar, quaternion, yaw_of
+from placerec_ros.pose import UNKNOWN_ANGLE, UNKNOWN_HEIGHT
+from placerec_ros.track import Array
 
 
-def pose_message(answered: Answered, frame_id: str) -> PoseWithCovarianceStamped:
-    """The robot's pose, with the stamp of its image."""
-    assert answered.estimate is not None and answered.robot is not None
+def pose_message(robot: Planar, covariance: Sequence[float], stamp: Time, frame_id: str) -> PoseWithCovarianceStamped:
+    """The robot's pose with its covariance, 36 numbers."""
     message = PoseWithCovarianceStamped()
-    message.header.stamp = answered.frame.message.header.stamp
+    message.header.stamp = stamp
     message.header.frame_id = frame_id
-    pose, robot = message.pose.pose, answered.robot
+    pose = message.pose.pose
     pose.position.x, pose.position.y, pose.position.z = robot.x, robot.y, robot.z
     turned = pose.orientation
     turned.x, turned.y, turned.z, turned.w = quaternion(robot.yaw)
-    message.pose.covariance = list(answered.estimate.covariance)
+    message.pose.covariance = list(covariance)
     return message
+
+
+def filtered_message(fix: Fix, stamp: Time, frame_id: str) -> PoseWithCovarianceStamped:
+    """Where the robot is by all localizations; height, roll and pitch are not filtered and count as not known."""
+    covariance = np.diag([0.0, 0.0, UNKNOWN_HEIGHT, UNKNOWN_ANGLE, UNKNOWN_ANGLE, 0.0])
+    covariance[FLAT] = fix.track.covariance
+    return pose_message(fix.track.robot, covariance.ravel().tolist(), stamp, frame_id)
+
+
+def given_pose(message: PoseWithCovarianceStamped) -> tuple[Planar, Array]:
+    """The pose of a message, and the covariance of its x, y and yaw, [3, 3].
+
+    Raises:
+        ValueError: a number is not finite, the orientation is no rotation, or the covariance is none.
+    """
+    pose, stated = message.pose.pose, np.reshape(np.array(message.pose.covariance, np.float64), (6, 6))[FLAT]
+    covariance = (stated + stated.T) / 2
+    position, turned = pose.position, pose.orientation
+    if not np.isfinite([position.x, position.y, position.z]).all():
+        raise ValueError("its position is not finite")
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] < -1e-9:
+        raise ValueError("its covariance is none")
+    return Planar(position.x, position.y, yaw_of(turned.x, turned.y, turned.z, turned.w), position.z), covariance
+
+
+def time_message(stamp: int) -> Time:
+    """A stamp in nanoseconds."""
+    return Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
 
 
 def transform_message(correction: Planar, stamp: Time, parent: str, child: str) -> TransformStamped:

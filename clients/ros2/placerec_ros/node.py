@@ -6,6 +6,7 @@ lifecycle services at any time, also while the service cannot be reached.
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -23,20 +24,28 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from placerec_ros import messages
 from placerec_ros.frame_queue import Frame
-from placerec_ros.health import ERROR, WARN, Health
+from placerec_ros.frames import StaticFrames, UnfitMount, mount_of
+from placerec_ros.fusion import Fix
+from placerec_ros.health import ERROR, OK, WARN, Health
 from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
 from placerec_ros.localizer import Answered, Done, Localizer
 from placerec_ros.odometry import stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
+from placerec_ros.repetition import Repetition
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # where ROS is not installed, but its wheels
+    TFMessage = None
 
 IMAGE_TYPES = {
     "compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage),
@@ -74,14 +83,18 @@ class PlacerecNode(LifecycleNode):
         self._subscriptions_made: list[Any] = []
         self._image_subscription: Any = None
         self._topics: list[Any] = []
-        self._broadcaster: Any = None
+        self._repetition = Repetition(1.0, 0.0)
+        self._frames_of_robot: StaticFrames | None = None
+        self._initial_pose_due = False
+        self._initial_pose_sent: PoseWithCovarianceStamped | None = None
         self._frames = 0
         self._heard = {"image": 0.0, "info": 0.0}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._waiting = ReentrantCallbackGroup()  # while one of these waits, all other callbacks go on
-        self._ask_for("create_map", lambda localizer: localizer.create_map())
-        self._ask_for("enrol_here", lambda localizer: localizer.enrol_here())
-        self._ask_for("relocalize", lambda localizer: localizer.relocalize())
+        self._ask_for("create_map", lambda localizer, _: localizer.create_map())
+        self._ask_for("enrol_here", lambda localizer, _: localizer.enrol_here())
+        self._ask_for("relocalize", lambda localizer, _: localizer.relocalize())
+        self._ask_for("enrol_keyframes", lambda localizer, asked: localizer.enrol_keyframes(asked.data), SetBool)
         self.add_on_set_parameters_callback(self._may_set)
         self.add_post_set_parameters_callback(self._were_set)
         self.create_timer(TICK_SECONDS, self._tick)
@@ -103,6 +116,7 @@ class PlacerecNode(LifecycleNode):
         values = {one.name: one.value for one in changed if one.name in live}
         if values and self._settings is not None and self._localizer is not None:
             self._settings = replace(self._settings, **values)
+            self._repetition = Repetition(self._settings.transform_rate, self._settings.transform_tolerance)
             self._localizer.change(self._settings)
 
     # ---- transitions
@@ -121,11 +135,21 @@ class PlacerecNode(LifecycleNode):
         self._health.fact("service", chosen.url)
         self._pose = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._transform = self.create_lifecycle_publisher(TransformStamped, "~/map_to_odom", 10)
+        self._filtered = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/filtered_pose", 10)
         self._answer = self.create_lifecycle_publisher(String, "~/answer", 10)
         self._picture = self.create_lifecycle_publisher(CompressedImage, "~/annotated/compressed", 1)
-        self._topics = [self._pose, self._transform, self._answer, self._picture]
-        self._broadcaster = _broadcaster(self) if chosen.publish_tf else None
-        self._health.fact("tf", "sent" if self._broadcaster else "not sent")
+        self._initial_pose = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "initialpose", 1)
+        self._topics = [
+            *(self._pose, self._transform, self._filtered, self._answer, self._picture),
+            self._initial_pose,
+        ]
+        self._frames_of_robot = StaticFrames() if chosen.use_tf_static and TFMessage is not None else None
+        self._tf: Any = None
+        if chosen.publish_tf and TFMessage is not None:
+            self._tf = self.create_lifecycle_publisher(TFMessage, "/tf", 100)
+            self._topics.append(self._tf)
+        self._repetition = Repetition(chosen.transform_rate, chosen.transform_tolerance)
+        self._health.fact("tf", "not sent" if self._tf is None else "sent")
         self._localizer = Localizer(chosen, self, self._health)
         self._health.state = "inactive"
         return Success
@@ -141,7 +165,16 @@ class PlacerecNode(LifecycleNode):
         self._look_for_images()
         with self._outlet_lock:
             self._publishing = True
+        if self._frames_of_robot is not None:
+            latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._subscriptions_made.append(
+                self.create_subscription(TFMessage, "/tf_static", self._on_static_frames, latched)
+            )
+        self._subscriptions_made.append(
+            self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 1)
+        )
         localizer.activate()
+        self._initial_pose_due = True
         self._health.state = "active"
         return result
 
@@ -189,7 +222,7 @@ class PlacerecNode(LifecycleNode):
             self._localizer = None
         while self._topics:
             self.destroy_lifecycle_publisher(self._topics.pop())
-        self._broadcaster = self._settings = None
+        self._settings = None
 
     def close(self) -> None:
         """End the run where the process ends without a transition."""
@@ -212,7 +245,7 @@ class PlacerecNode(LifecycleNode):
     def _look_for_images(self) -> None:
         """Subscribe to the images once their type is known; say so if it is none of an image."""
         _, chosen = self._made()
-        topic = self.resolve_topic_name("image")
+        topic = self._image_topic()
         published = {one.topic_type for one in self.get_publishers_info_by_topic(topic)}
         wanted = {name: pair for name, pair in IMAGE_TYPES.items() if chosen.image_type in ("auto", name)}
         fitting = [kind for name, kind in wanted.values() if name in published]
@@ -233,17 +266,73 @@ class PlacerecNode(LifecycleNode):
         if fitting and (self._image_subscription is None or self._image_subscription.msg_type not in fitting):
             self._drop_images()
             try:
-                self._image_subscription = self._subscribe(fitting[0], "image", self._on_image, sensor_qos(QUEUED))
+                self._image_subscription = self._subscribe(fitting[0], topic, self._on_image, sensor_qos(QUEUED))
             except (
                 RCLError
             ) as error:  # the middleware has not forgotten the type from before; the next tick tries again
                 self.get_logger().debug(f"No subscription yet: {error}")
 
+    def _image_topic(self) -> str:
+        """The full name of the topic of images, by image_transport's convention if that is set."""
+        _, chosen = self._made()
+        topic = str(self.resolve_topic_name("image"))
+        compressed = chosen.image_transport == "compressed" and not topic.endswith("/compressed")
+        return f"{topic}/compressed" if compressed else topic
+
     def _on_image(self, message: Any) -> None:
         self._frames += 1
         self._heard["image"] = time.monotonic()
         if self._localizer is not None:
+            self._find_camera(message.header.frame_id)
             self._localizer.add(Frame(self._frames, stamp_of(message), message))
+
+    def _find_camera(self, frame: str) -> None:
+        """Tell the localizer where the camera of an image is on the robot, once that is known."""
+        localizer, chosen = self._made()
+        if self._frames_of_robot is None or localizer.mount is not None:
+            return
+        frame, base = chosen.camera_frame or frame, chosen.base_frame or localizer.odometer.child
+        found = self._frames_of_robot.between(base, frame) if base and frame else None
+        if found is None:
+            return
+        try:
+            localizer.mount = mount = mount_of(found, frame)
+        except UnfitMount as error:
+            self._health.begins("mount", f"The place of the camera is not used: {error}.")
+        else:
+            self._health.over("mount")
+            yaw = math.degrees(mount.yaw)
+            self._health.fact("camera on the robot", f"x {mount.x:.2f} m, y {mount.y:.2f} m, {yaw:.0f}°, by /tf_static")
+
+    def _on_static_frames(self, message: Any) -> None:
+        if self._localizer is not None and self._frames_of_robot is not None:
+            self._frames_of_robot.add(message.transforms)
+            self._localizer.mount = None  # it is found again with the next image
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        if self._localizer is None or message == self._initial_pose_sent:
+            return
+        localizer, chosen = self._made()
+        if not chosen.take_initial_pose:
+            return
+        frame = message.header.frame_id
+        if frame not in ("", chosen.map_frame):
+            self._health.frame(f"An initial pose is in the frame {frame[:60]!r}, not in {chosen.map_frame!r}.")
+            return
+        try:
+            robot, covariance = messages.given_pose(message)
+        except ValueError as error:
+            self._health.frame(f"An initial pose cannot be used: {error}.")
+            return
+        self._initial_pose_due = False  # whoever sent it knows it
+        localizer.place(robot, covariance, stamp_of(message)).add_done_callback(self._tell_placed)
+
+    def _tell_placed(self, placed: ThreadFuture[Done]) -> None:
+        done = placed.result()
+        if done.success:
+            self._log(OK, done.message)
+        else:
+            self._health.frame(f"An initial pose is not used. {done.message}")
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         if self._localizer is None or self._settings is None:
@@ -268,19 +357,22 @@ class PlacerecNode(LifecycleNode):
             self._health.begins("odometry", f"A message of odometry cannot be used: {error}.")
         else:
             self._health.over("odometry")
+            self._send_transform(stamp_of(message))
 
-    def _ask_for(self, name: str, ask: Callable[[Localizer], ThreadFuture[Done]]) -> None:
+    def _ask_for(
+        self, name: str, ask: Callable[[Localizer, Any], ThreadFuture[Done]], kind: type[Any] = Trigger
+    ) -> None:
         """Make a service that the localizer's thread answers."""
 
-        async def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        async def answer(request: Any, response: Any) -> Any:
             if self._localizer is None:
                 response.success, response.message = False, "The node is not configured."
                 return response
-            done = await self._awaited(ask(self._localizer))
+            done = await self._awaited(ask(self._localizer, request))
             response.success, response.message = done.success, done.message
             return response
 
-        self.create_service(Trigger, f"~/{name}", answer, callback_group=self._waiting)
+        self.create_service(kind, f"~/{name}", answer, callback_group=self._waiting)
 
     def _awaited(self, result: ThreadFuture[Done]) -> Future:
         """A future of the executor that is done when that of another thread is."""
@@ -302,16 +394,51 @@ class PlacerecNode(LifecycleNode):
             if not self._publishing:
                 return
             localizer, chosen = self._made()
-            if answered.robot is not None:
-                self._pose.publish(messages.pose_message(answered, chosen.map_frame))
+            stamp = answered.frame.message.header.stamp
+            if (found := answered.estimate) is not None:
+                self._pose.publish(messages.pose_message(found.planar, found.covariance, stamp, chosen.map_frame))
             self._answer.publish(messages.answer_message(answered))
-            if answered.correction is not None:
-                transform = messages.transform_message(
-                    answered.correction, answered.frame.message.header.stamp, chosen.map_frame, localizer.odometer.frame
-                )
+            if answered.fix is not None:
+                filtered = messages.filtered_message(answered.fix, stamp, chosen.map_frame)
+                self._filtered.publish(filtered)
+                self._send_initial_pose(answered.fix, filtered)
+            elif localizer.fix is None:
+                self._initial_pose_due = True
+
+    def _send_initial_pose(self, fix: Fix, message: PoseWithCovarianceStamped) -> None:
+        """Publish the robot's pose for others to begin with, once for each time that it was not known."""
+        _, chosen = self._made()
+        if not (chosen.send_initial_pose and self._initial_pose_due):
+            return
+        if fix.is_within(chosen.position_limit, chosen.heading_limit):
+            self._initial_pose_due, self._initial_pose_sent = False, message
+            self._initial_pose.publish(message)
+
+    def _send_transform(self, stamp: int) -> None:
+        """Send the transform from the map to the odometry, at a moment of odometry in nanoseconds, if it is due."""
+        localizer, chosen = self._made()
+        fix, odom, frame = localizer.fix, localizer.odometer.at(stamp), chosen.odom_frame or localizer.odometer.frame
+        if fix is None or odom is None or fix.origin != localizer.odometer.origin or frame == chosen.map_frame:
+            return
+        if (ahead := self._repetition.due(stamp)) is None:
+            return
+        present = fix.at(odom)
+        if not present.is_within(chosen.position_limit, chosen.heading_limit):
+            localizer.want()
+            position, heading = present.deviations
+            self._health.begins(
+                "transform",
+                f"The transform is not sent: the position has a standard deviation of {position:.1f} m, "
+                f"the heading of {math.degrees(heading):.0f}°.",
+            )
+            return
+        self._health.over("transform")
+        transform = messages.transform_message(fix.correction, messages.time_message(ahead), chosen.map_frame, frame)
+        with self._outlet_lock:
+            if self._publishing:
                 self._transform.publish(transform)
-                if self._broadcaster is not None:
-                    self._broadcaster.sendTransform(transform)
+                if self._tf is not None:
+                    self._tf.publish(TFMessage(transforms=[transform]))
 
     def wants_picture(self) -> bool:
         """Whether somebody subscribes to annotated pictures."""
@@ -343,7 +470,7 @@ class PlacerecNode(LifecycleNode):
         _, chosen = self._made()
         silent = time.monotonic() - self._heard["image"]
         if silent > SILENCE_SECONDS:
-            self._health.begins("images", f"No image has come on {self.resolve_topic_name('image')}.", WARN)
+            self._health.begins("images", f"No image has come on {self._image_topic()}.", WARN)
             return
         self._health.over("images")
         if not chosen.use_camera_info or self._heard["info"]:
@@ -375,15 +502,6 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         else:
             made.integer_range = [IntegerRange(from_value=int(parameter.least), to_value=int(parameter.most), step=1)]
     return made
-
-
-def _broadcaster(node: LifecycleNode) -> Any:
-    """A broadcaster of transforms; None where tf2_ros is not installed."""
-    try:
-        from tf2_ros import TransformBroadcaster
-    except ImportError:
-        return None
-    return TransformBroadcaster(node)
 
 
 def _is_local(url: str) -> bool:

@@ -106,6 +106,11 @@ class Odometer:
                 first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_POSES)
                 del self._poses[:first]
 
+    @property
+    def origin(self) -> str:
+        """A name for where the odometry began, of 128 characters at most."""
+        return f"{self._beginnings} {self.frame}"[:128]
+
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
@@ -118,6 +123,12 @@ class Odometer:
             reading = self._read(stamp)
         return None if reading is None else reading.pose
 
+    @property
+    def latest(self) -> Planar | None:
+        """The last pose; None if there is none."""
+        with self._lock:
+            return self._poses[-1].pose if self._poses else None
+
     def odometry(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
         """The odometry to send with a frame of a moment, in nanoseconds; None if none is near it.
 
@@ -126,7 +137,7 @@ class Odometer:
                 camera, as headings of a map are.
         """
         with self._lock:
-            reading, origin = self._read(stamp), f"{self._beginnings} {self.frame}"[:128]
+            reading, origin = self._read(stamp), self.origin
         if reading is None:
             return None
         pose = reading.pose

@@ -65,18 +65,91 @@ PARAMETERS = (
         False,
         "The images are rectified: the intrinsics are those of the matrix P, without distortion.",
     ),
-    Parameter("camera_yaw", 0.0, "Degrees by which the camera looks to the left of the robot's front.", -180.0, 180.0),
+    Parameter(
+        "camera_yaw",
+        0.0,
+        "Degrees by which the camera looks to the left of the robot's front, where /tf_static does not tell.",
+        -180.0,
+        180.0,
+    ),
+    Parameter(
+        "use_tf_static", True, "Take the camera's place on the robot from /tf_static, where tf2_msgs is installed."
+    ),
+    Parameter(
+        "poses_of",
+        "base",
+        "The positions of the map's places: those of the robot's base, as odometry gives them, or of its camera.",
+        choices=("base", "camera"),
+    ),
     Parameter(
         "image_type",
         "auto",
         "Type of the image topic. auto: that of its publishers.",
         choices=("auto", "compressed", "raw"),
     ),
-    Parameter("map_frame", "map", "Frame of the map's poses, in all that is published."),
     Parameter(
-        "publish_tf",
-        True,
-        "Send the transform from the map to the odometry to /tf, where tf2_ros is installed.",
+        "image_transport",
+        "raw",
+        "compressed: images come on the topic image/compressed, as those of image_transport; raw: on image.",
+        choices=("raw", "compressed"),
+    ),
+    Parameter("map_frame", "map", "Frame of the map's poses, in all that is published."),
+    Parameter("odom_frame", "", "Frame of odometry, in the transform. Empty: that of its messages."),
+    Parameter(
+        "base_frame", "", "Frame of the robot, to find its camera. Empty: the child frame of odometry's messages."
+    ),
+    Parameter("camera_frame", "", "Frame of the camera, to find it on the robot. Empty: that of the images."),
+    Parameter(
+        "publish_tf", True, "Send the transform from the map to the odometry to /tf, where tf2_msgs is installed."
+    ),
+    Parameter(
+        "transform_rate", 20.0, "Most transforms a second; none is sent without odometry.", 0.5, 200.0, live=True
+    ),
+    Parameter(
+        "transform_tolerance",
+        0.5,
+        "Seconds by which the stamp of the transform lies ahead of odometry.",
+        0.0,
+        10.0,
+        live=True,
+    ),
+    Parameter(
+        "position_limit",
+        3.0,
+        "Metres: where the standard deviation of the position is larger, no transform is sent.",
+        0.1,
+        1000.0,
+        live=True,
+    ),
+    Parameter(
+        "heading_limit",
+        20.0,
+        "Degrees: where the standard deviation of the heading is larger, no transform is sent.",
+        1.0,
+        180.0,
+        live=True,
+    ),
+    Parameter(
+        "send_initial_pose",
+        False,
+        "Publish the pose on initialpose once it is known, as AMCL takes it.",
+        live=True,
+    ),
+    Parameter("take_initial_pose", True, "Believe a pose that comes on initialpose, as RViz sends it.", live=True),
+    Parameter(
+        "on_demand",
+        False,
+        "Send images only until the robot's place is known: after activation, relocalize and initialpose, and when it "
+        "is uncertain.",
+        live=True,
+    ),
+    Parameter(
+        "rate_limit",
+        0.0,
+        "Most images a second that are sent; 0: all that the service can take.",
+        0.0,
+        1000.0,
+        live=True,
     ),
     Parameter("queue_length", 2, "Most images that wait for the service; the oldest gives way.", 1, 100),
     Parameter(
@@ -107,9 +180,25 @@ PARAMETERS = (
     ),
     Parameter("autostart", False, "Configure and activate the node when it starts, without a manager of lifecycles."),
     Parameter(
+        "keyframe_metres",
+        1.0,
+        "Metres after which enrol_keyframes enrols another image.",
+        0.05,
+        1000.0,
+        live=True,
+    ),
+    Parameter(
+        "keyframe_degrees",
+        30.0,
+        "Degrees by which the robot has turned when enrol_keyframes enrols another image.",
+        1.0,
+        180.0,
+        live=True,
+    ),
+    Parameter(
         "sequence",
         "",
-        "Traverse of the places that enrol_here adds; empty: named by the time when the node was configured.",
+        "Traverse of the places that the node enrols; empty: named by the time when the node was configured.",
     ),
 )
 
@@ -126,9 +215,23 @@ class Settings:
     use_camera_info: bool
     rectified: bool
     camera_yaw: float
+    use_tf_static: bool
+    poses_of: str
     image_type: str
+    image_transport: str
     map_frame: str
+    odom_frame: str
+    base_frame: str
+    camera_frame: str
     publish_tf: bool
+    transform_rate: float
+    transform_tolerance: float
+    position_limit: float
+    heading_limit: float
+    send_initial_pose: bool
+    take_initial_pose: bool
+    on_demand: bool
+    rate_limit: float
     queue_length: int
     deadline: float
     advance: float
@@ -137,6 +240,8 @@ class Settings:
     verify: str
     picture_period: float
     autostart: bool
+    keyframe_metres: float
+    keyframe_degrees: float
     sequence: str
     key: str | None
 

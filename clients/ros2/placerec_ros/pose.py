@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from placerec_ros.planar import Planar, wrapped
 
 UNKNOWN_HEIGHT = 1e6
@@ -30,6 +32,18 @@ class PoseEstimate:
     planar: Planar
     covariance: tuple[float, ...]
     source: Literal["frame", "belief"]
+
+    def of_robot(self, mount: Planar) -> PoseEstimate:
+        """The pose of the robot whose camera this is.
+
+        Args:
+            mount: where the camera is on the robot.
+        """
+        robot = self.planar.then(mount.inverse())
+        moved = np.eye(6)  # a turn of the camera moves the robot's origin
+        moved[0, 5], moved[1, 5] = self.planar.y - robot.y, robot.x - self.planar.x
+        covariance = moved @ np.reshape(self.covariance, (6, 6)) @ moved.T
+        return PoseEstimate(robot, tuple(covariance.ravel().tolist()), self.source)
 
 
 def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimate | None:

@@ -30,9 +30,18 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
-KINDS = {kind.__name__: kind for kind in (CompressedImage, Image, CameraInfo, Odometry, String)}
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:
+    TFMessage = None
+
+KINDS = {
+    kind.__name__: kind
+    for kind in (CompressedImage, Image, CameraInfo, Odometry, String, PoseWithCovarianceStamped, TFMessage)
+    if kind is not None
+}
 TRANSITIONS = {
     "configure": 1,
     "cleanup": 2,
@@ -76,11 +85,14 @@ class Peer:
         return {}
 
     def listen(self, topic: str, durable: bool = False, node: str = "placerec") -> dict[str, Any]:
-        """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
+        """Record a topic of the node, such as answer, or one of all, /diagnostics or /tf."""
         known: dict[str, tuple[Any, Callable[[Any], dict[str, Any]]]] = {
             "answer": (String, lambda message: json.loads(message.data)),
             "pose": (PoseWithCovarianceStamped, pose_of),
             "map_to_odom": (TransformStamped, transform_of),
+            "/initialpose": (PoseWithCovarianceStamped, pose_of),
+            "/tf": (TFMessage, lambda message: transform_of(message.transforms[0])),
+            "filtered_pose": (PoseWithCovarianceStamped, pose_of),
             "annotated/compressed": (CompressedImage, picture_of),
             "/diagnostics": (DiagnosticArray, diagnostics_of),
         }
@@ -96,6 +108,10 @@ class Peer:
         )
         return {}
 
+    def knows_tf(self) -> dict[str, Any]:
+        """Whether the message of /tf could be built."""
+        return {"known": TFMessage is not None}
+
     def deafen(self, topic: str) -> dict[str, Any]:
         """End the recording of a topic, if there is one."""
         if (made := self._subscriptions.pop(topic, None)) is not None:
@@ -107,10 +123,12 @@ class Peer:
         with self._lock:
             return {"heard": self.heard.pop(topic, [])}
 
-    def advertise(self, topic: str, kind: str, reliable: bool = False) -> dict[str, Any]:
+    def advertise(self, topic: str, kind: str, reliable: bool = False, durable: bool = False) -> dict[str, Any]:
         """Make a publisher."""
-        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        reliability = ReliabilityPolicy.RELIABLE if reliable or durable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=10, reliability=reliability)
+        if durable:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         self.withdraw(topic)
         until = time.monotonic() + PATIENCE
         while topic not in self._publishers:  # the middleware takes a moment to forget another type
@@ -131,6 +149,10 @@ class Peer:
     def subscribers(self, topic: str) -> dict[str, Any]:
         """How many subscribe to a topic of this peer."""
         return {"subscribers": self._publishers[topic].get_subscription_count()}
+
+    def listeners(self, topic: str) -> dict[str, Any]:
+        """To how many publishers the recording of a topic is connected."""
+        return {"publishers": self._subscriptions[topic].get_publisher_count()}
 
     def publishers(self) -> dict[str, Any]:
         """To how many publishers of the node each of this peer's recordings is connected."""
@@ -205,6 +227,11 @@ class Peer:
         done = self._call(Trigger, f"/placerec/{service}", Trigger.Request(), patience)
         return {"success": done.success, "message": done.message}
 
+    def switch(self, service: str, on: bool) -> dict[str, Any]:
+        """Call one of the node's own services that switches something on or off."""
+        done = self._call(SetBool, f"/placerec/{service}", SetBool.Request(data=on))
+        return {"success": done.success, "message": done.message}
+
     def transition(self, name: str, node: str = "placerec") -> dict[str, Any]:
         """Ask a node for a transition; how long it took."""
         request = ChangeState.Request()
@@ -258,7 +285,15 @@ def message_of(kind: str, fields: dict[str, Any]) -> Any:
     if kind == "String":
         message.data = fields.get("data", "")
         return message
-    stamp = fields["stamp"]
+    stamp = fields.get("stamp", 0)
+    if kind == "TFMessage":
+        transform = TransformStamped(child_frame_id=fields["child"])
+        transform.header.frame_id = fields["parent"]
+        moved, turned = transform.transform.translation, transform.transform.rotation
+        moved.x, moved.y, moved.z = map(float, fields["moved"])
+        turned.x, turned.y, turned.z, turned.w = map(float, fields["turned"])
+        message.transforms = [transform]
+        return message
     message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(1e9 * (stamp - int(stamp)))
     message.header.frame_id = fields.get("frame_id", "camera")
     if kind == "CompressedImage":
@@ -273,7 +308,12 @@ def message_of(kind: str, fields: dict[str, Any]) -> Any:
         message.k = [fields["fx"], 0.0, fields["cx"], 0.0, fields["fy"], fields["cy"], 0.0, 0.0, 1.0]
         message.distortion_model, message.d = fields.get("distortion_model", "plumb_bob"), fields.get("d", [0.0] * 5)
     else:
-        message.header.frame_id, message.child_frame_id = fields.get("frame_id", "odom"), "base_link"
+        message.header.frame_id = fields.get("frame_id", "map" if kind == "PoseWithCovarianceStamped" else "odom")
+        if kind == "Odometry":
+            message.child_frame_id = "base_link"
+        else:
+            message.pose.covariance[0] = message.pose.covariance[7] = fields.get("variance", 0.25)
+            message.pose.covariance[35] = 0.07
         pose, yaw = message.pose.pose, math.radians(fields.get("heading", 0.0))
         pose.position.x, pose.position.y = float(fields["x"]), float(fields["y"])
         pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)

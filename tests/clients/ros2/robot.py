@@ -258,10 +258,12 @@ class Robot:
             assert self.transition("deactivate")
         if self.state == "inactive":
             assert self.transition("cleanup")
-        for topic in ("answer", "pose", "map_to_odom", "annotated/compressed", "/diagnostics"):
+        for topic in ("answer", "pose", "filtered_pose", "map_to_odom", "annotated/compressed", "/tf", "/diagnostics"):
             self.peer.do("deafen", topic=topic)
             self.peer.take(topic)
-        for topic in ("/image", "/camera_info", "/odom"):
+        self.peer.do("deafen", topic="/initialpose")
+        self.peer.take("/initialpose")
+        for topic in ("/image", "/image/compressed", "/camera_info", "/odom", "/initialpose", "/tf_static"):
             self.peer.do("withdraw", topic=topic)
 
     def look(self, data: bytes | None = None, number: int | None = None, **fields: object) -> float:
@@ -272,6 +274,13 @@ class Robot:
         stamp = self.BASE + 0.1 * self.frame
         self.frame += 1
         self.peer.do("publish", topic="/image", kind="CompressedImage", stamp=stamp, file=file, **fields)
+        return stamp
+
+    def odometry(self, x: float, y: float, heading: float, settle: float = 0.1) -> float:
+        """Publish odometry of the moment of the next frame, give it so many seconds to arrive first; its stamp."""
+        stamp = self.BASE + 0.1 * self.frame
+        self.peer.do("publish", topic="/odom", kind="Odometry", stamp=stamp, x=x, y=y, heading=heading)
+        self.peer.do("sleep", seconds=settle)
         return stamp
 
     def answers(self, count: int = 1) -> list[dict[str, Any]]:

@@ -404,35 +404,6 @@ def test_a_key_that_may_not_define_cameras_is_said(image: Robot) -> None:
     assert "frames count without intrinsics" in said["message"]
 
 
-def odometry(robot: Robot, x: float, y: float, heading: float, ahead: int = 0, settle: float = 0.1) -> None:
-    """Publish odometry of the moment of the next frame, and give it so many seconds to arrive first."""
-    stamp = robot.BASE + 0.1 * (robot.frame + ahead)
-    robot.peer.do("publish", topic="/odom", kind="Odometry", stamp=stamp, x=x, y=y, heading=heading)
-    robot.peer.do("sleep", seconds=settle)
-
-
-@pytest.mark.thorough
-def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None:
-    """The odometry's frame is turned by 90° and lies at (5, -2) of the map: x of the map is y of the odometry."""
-    robot = image
-    robot.peer.do("advertise", topic="/odom", kind="Odometry")
-    robot.begin()
-    robot.connected()
-    robot.connected("/odom")
-    answer: dict[str, Any] = {}
-    for number in range(6):
-        odometry(robot, -2.0, 5.0 - number, -90.0)
-        answer = robot.asked(number)
-    assert answer["answer"]["motion"] == "odometry"
-    assert answer["verdict"] == "recognized"
-    found = robot.peer.take("map_to_odom")[-1]
-    assert (found["frame"], found["child"]) == ("map", "odom")
-    assert found["heading"] == pytest.approx(90, abs=5)
-    pose = robot.peer.take("pose")[-1]
-    # Map = R(90°) * odometry + t, with the odometry at (-2, 0): t = pose - (0, -2).
-    assert (found["x"], found["y"]) == pytest.approx((pose["x"], pose["y"] + 2.0), abs=0.5)
-
-
 @pytest.mark.thorough
 def test_odometry_counts_once_if_answers_are_lost(image: Robot) -> None:
     robot, site = image, image.site
@@ -452,7 +423,7 @@ def test_odometry_counts_once_if_answers_are_lost(image: Robot) -> None:
         robot.connected()
         robot.connected("/odom")
         for number, happens in enumerate(fates):
-            odometry(robot, -2.0, float(number), 90.0, settle=0.5)
+            robot.odometry(-2.0, float(number), 90.0, settle=0.5)
             if happens == "none":
                 answer = robot.asked(number)
             else:
@@ -486,7 +457,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     refused = robot.peer.do("call", service="enrol_here")
     assert not refused["success"] and "no odometry" in refused["message"]
     for number in (0, 6, 12):
-        odometry(robot, float(number), 1.0, 30.0)
+        robot.odometry(float(number), 1.0, 30.0)
         robot.look(encoded(robot.site.frames[number]))
         robot.peer.do("sleep", seconds=0.1)
         done = robot.peer.do("call", service="enrol_here")
@@ -502,7 +473,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     robot.begin(map="made", role="enrol")
     robot.connected()
     robot.connected("/odom")
-    odometry(robot, 50.0, 50.0, 0.0)
+    robot.odometry(50.0, 50.0, 0.0)
     robot.look(encoded(stranger(77)))
     robot.answers_settled()
     refused = robot.peer.do("call", service="enrol_here")

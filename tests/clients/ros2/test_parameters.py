@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,11 @@ def table() -> str:
         )
         rows.append(f"| `{one.name}` | {default} | {reach} | {one.description} |")
     return "\n".join(rows)
+
+
+def test_the_page_says_which_can_be_changed_at_any_time() -> None:
+    said = PAGE.read_text().partition("At any time can be changed:")[2].partition(";")[0]
+    assert set(re.findall("`([a-z_]+)`", said)) == {one.name for one in PARAMETERS if one.live}
 
 
 def test_the_page_lists_all_parameters() -> None:
