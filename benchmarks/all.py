@@ -56,6 +56,7 @@ PARTS = {
     "runs": Part("benchmarks.maps.sequences", "--data {data}/eval", "data sets"),
     "sessions": Part("benchmarks.maps.sessions", "--datasets {data}", "data sets"),
     "day": Part("benchmarks.day", "--datasets {data} --short --json {results}/day.json", "data sets"),
+    "learning": Part("benchmarks.learning", "--datasets {data}", "data sets"),
     "alignment": Part("benchmarks.maps.aligned_maps", "--datasets {data}", "data sets"),
     "poses": Part("benchmarks.geometry.pose", "--data {data}", "data sets"),
     "spacing": Part("benchmarks.geometry.spacing", "--data {data}", "data sets"),

@@ -52,7 +52,11 @@ class Tally:
     """The figures of one run, or of several.
 
     frames: those in the map; right, wrong: recognized ones, wrong also of frames from elsewhere.
-    proposed, proposed_wrong, taken, taken_wrong, withdrawn, wrong_left: looks; the last are in the map.
+    proposed, proposed_wrong, taken, taken_wrong, withdrawn: looks.
+    attackers: looks that were taken of the attacker's frames.
+    rows: of the map, living ones.
+    milliseconds: for the answer to a frame, without its encoding.
+    contradiction, refused: as of :class:`core.learning.Lesson`.
     """
 
     frames: int = 0
@@ -64,7 +68,6 @@ class Tally:
     taken_wrong: int = 0
     attackers: int = 0
     withdrawn: int = 0
-    wrong_left: int = 0
     rows: int = 0
     milliseconds: float = 0.0
     contradiction: str | None = None
@@ -130,7 +133,6 @@ class Learner:
             self._rehearse(lesson, run, tally)
         self.runs += 1
         tally.rows = len(self.map)
-        tally.wrong_left = sum(not one.right for one in self.learnt.values())
         return tally
 
     def examine(self, run: EncodedRun) -> Tally:
@@ -138,6 +140,12 @@ class Learner:
         tally = Tally()
         self._count(run, self.map.recognize(run.frames), tally)
         return tally
+
+    def left(self) -> dict[str, int]:
+        """What the map has now: rows, learnt looks, those of wrong places, and those of an attacker's frames."""
+        looks = self.learnt.values()
+        wrong, attackers = sum(not one.right for one in looks), sum(one.attacker for one in looks)
+        return {"rows": len(self.map), "looks": len(looks), "wrong": wrong, "attackers": attackers}
 
     def _count(self, run: EncodedRun, answers: Sequence[Recognized], tally: Tally) -> None:
         for moment, answer in zip(run.moments, answers, strict=True):

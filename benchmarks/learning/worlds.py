@@ -114,7 +114,7 @@ def cameras(datasets: Path) -> RobotWorld:
     return RobotWorld("cameras", first, later, METRES * places, right, ("day", "night"), strangers)
 
 
-def nordland(datasets: Path, places: int = 220, step: int = 6, start: int = 300) -> RobotWorld:
+def nordland(datasets: Path, places: int = 150, step: int = 6, start: int = 300) -> RobotWorld:
     """A railway; a place is ``step`` frames from the next, and two to either side are tolerated, fewer than usual."""
     folder = datasets / "eval/nordland_tiny"
     numbers = start + step * np.arange(places)

@@ -38,6 +38,10 @@ OUTVOTED = 1 / 3
 """At most this share of the anchors around a frame may miss the way."""
 
 
+LEAST_PAIRS = 5
+"""Pairs of anchors from which the scale of odometry is known."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """Where the anchors around a frame put it, by odometry.
@@ -101,6 +105,24 @@ def pace_of(trail: Trail, graph: PlaceGraph) -> float | None:
             paces.append(float(where.ordinal[b] - where.ordinal[a]) / gone)
     paces = [one for one in paces if one > 0]
     return float(np.median(paces)) if len(paces) >= BESIDE else None
+
+
+def scale_of(trail: Trail, anchors: NDArray[np.int64], graph: PlaceGraph) -> float | None:
+    """Metres of the map in a metre of odometry, the median over pairs of anchors.
+
+    The anchors of a pair are between two same-place radii and ``REACH`` of them apart, so that neither the places'
+    spacing nor drift hides the scale.  None for too few pairs, as in a map without poses.
+    """
+    radius = graph.neighborhood.radius
+    places = graph.places_at(np.array([trail.frames[one].row for one in anchors.tolist()], np.int64))
+    ratios = []
+    for first, place in enumerate(places.tolist()):
+        apart = np.abs(trail.points[anchors] - trail.points[anchors[first]])
+        near = (apart >= 2 * radius) & (apart <= REACH * radius) & graph.posed[places] & graph.posed[place]
+        near &= (trail.piece[anchors] == trail.piece[anchors[first]]) & (anchors > anchors[first])
+        there = np.abs(relative(graph, places[near], place))
+        ratios += (there / apart[near]).tolist()
+    return float(np.median(ratios)) if len(ratios) >= LEAST_PAIRS else None
 
 
 class Way:

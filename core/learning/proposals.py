@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from core.belief import PlaceGraph
 from core.geometry.verification import LEAST_MATCHES, verify
-from core.learning.anchors import Fit, Way, anchors_of, pace_of, place_of
+from core.learning.anchors import Fit, Way, anchors_of, pace_of, place_of, scale_of
 from core.learning.frames import RunFrame, Trail
 from core.learning.smoothing import Posterior, smoothed
 
@@ -32,8 +32,18 @@ LEAST_PROBABILITY = 0.95
 LEAST_ANCHORS = 6
 """A run with fewer anchors teaches nothing."""
 
-LEAST_AGREEING = 0.7
+LEAST_AGREEING = 0.5
 """A run teaches nothing if it contradicts more than the rest of the frames that are sure of themselves."""
+
+MOST_SCALED = 1.2
+"""A run teaches nothing if its odometry is off by more than this factor, by its anchors."""
+
+NEAR = 0.3
+"""Odometry from the anchors must lead to within this many same-place radii of the place.  Without poses, within so many
+times the frames that are the same place, and half a frame."""
+
+MISFIT = 0.4
+"""The anchors around a frame may miss the way of odometry by this many same-place radii, root mean square."""
 
 TURNED = math.radians(30)
 """A robot that looks farther than this from where the map looked sees something else."""
@@ -51,7 +61,7 @@ DESCRIBED = 40
 Refusal = Literal["recognized", "covered", "constant", "uncertain", "no anchors", "odometry", "turned", "geometry"]
 """Why a frame is no proposal: it was recognized at its place; its view; or what speaks against it."""
 
-Contradiction = Literal["no places", "too few recognized", "contradicted"]
+Contradiction = Literal["no places", "too few recognized", "contradicted", "odometry"]
 """Why a run teaches nothing."""
 
 
@@ -128,7 +138,7 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
     pace = None if graph.posed.all() else pace_of(trail, graph)
     posteriors = smoothed(trail.looks(graph, pace), graph)
     anchors, contradicted = anchors_of(frames, posteriors, graph)
-    contradiction = _contradiction(len(anchors), len(contradicted), options)
+    contradiction = _contradiction(len(anchors), len(contradicted), scale_of(trail, anchors, graph), options)
     if contradiction is not None:
         return Lesson((), contradiction, anchors, contradicted, np.full(len(frames), -1, np.int64))
     judge = _Judge(frames, graph, posteriors, Way(trail, anchors, graph, pace), options)
@@ -147,10 +157,14 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
     return Lesson(tuple(found), None, anchors, contradicted, rows, refused)
 
 
-def _contradiction(anchors: int, contradicted: int, options: LessonOptions) -> Contradiction | None:
+def _contradiction(
+    anchors: int, contradicted: int, scale: float | None, options: LessonOptions
+) -> Contradiction | None:
     if anchors < options.least_anchors:
         return "too few recognized"
-    return "contradicted" if anchors < LEAST_AGREEING * (anchors + contradicted) else None
+    if anchors < LEAST_AGREEING * (anchors + contradicted):
+        return "contradicted"
+    return "odometry" if scale is not None and not 1 / MOST_SCALED <= scale <= MOST_SCALED else None
 
 
 class _Judge:
@@ -198,7 +212,9 @@ class _Judge:
 
     def _near(self, fit: Fit, place: int) -> bool:
         same = self.graph.neighborhood
-        return self.way.distance(fit, place) <= (0.5 * same.radius if fit.point is not None else 0.5 * same.frames + 0.5)
+        if fit.point is None:
+            return self.way.distance(fit, place) <= 0.5 + NEAR * same.frames
+        return fit.misfit <= MISFIT * same.radius and self.way.distance(fit, place) <= NEAR * same.radius
 
     def outcome(self, number: int, place: int | None) -> Proposal | Refusal:
         """The proposal that a frame is, or why it is none."""
