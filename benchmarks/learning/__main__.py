@@ -42,7 +42,9 @@ def encoded(encoder: Encoder, pictures: Sequence[Pixels], keypoints: bool) -> li
     batches = [pictures[start : start + 8] for start in range(0, len(pictures), 8)]
     made = [one for batch in batches for one in encoder.encode_batch(batch)]
     network = packaged_xfeat() if keypoints else None
-    found = [None] * len(pictures) if network is None else each(lambda one: find_keypoints(network, one), pictures, cores())
+    found = (
+        [None] * len(pictures) if network is None else each(lambda one: find_keypoints(network, one), pictures, cores())
+    )
     return [EncodedPicture(one.descriptor, one.local, points) for one, points in zip(made, found, strict=True)]
 
 
@@ -64,8 +66,8 @@ def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int) -> dict[str
         run = encoded_run(encoder, world, plan, seed)
         tallies = {mode: learner.live(run) for mode, learner in learners.items()}
         print(line(world, plan, tallies), flush=True)
-        parts = {mode: asdict(tally) for mode, tally in tallies.items()}
-        told.append({"run": plan.number, "condition": plan.condition, "events": plan.events, **parts})
+        parts: dict[str, Any] = {mode: asdict(tally) for mode, tally in tallies.items()}
+        told.append({"run": plan.number, "condition": plan.condition, "events": plan.events} | parts)
     exam: dict[str, dict[str, Any]] = {mode: {} for mode in MODES}
     for number, condition in enumerate(world.conditions):
         run = encoded_run(encoder, world, Plan(EXAMINED + number, condition, "examiner"), seed)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -29,6 +28,7 @@ from core.learning import (
     services,
 )
 from core.learning.anchors import place_of
+from core.learning.proposals import Refusal
 
 Mode = Literal["off", "propose", "auto"]
 """The map stays; a perfect reviewer takes every right proposal; or what independent evidence agrees on is taken."""
@@ -71,7 +71,7 @@ class Tally:
     rows: int = 0
     milliseconds: float = 0.0
     contradiction: str | None = None
-    refused: dict[str, int] = field(default_factory=dict)
+    refused: Mapping[Refusal, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class Learner:
             graph = self.map.graph()
             frames = run_frames(run, answers, graph)
             lesson = lesson_of(frames, graph)
-            tally.contradiction, tally.refused = lesson.contradiction, dict(lesson.refused)
+            tally.contradiction, tally.refused = lesson.contradiction, lesson.refused
             self._observe(lesson, frames, graph, tally)
             self._propose(lesson, run, answers, Trail.of(frames), graph, tally)
             self._take(graph, tally)

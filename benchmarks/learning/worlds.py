@@ -36,7 +36,7 @@ class RobotWorld:
 
     first: their pictures on the day of the map.
     later: returns the picture at a place in a condition and a run; by their numbers.
-    metres: float64 [k], where along the way each later picture was taken; those of a robot that goes on.
+    metres: float [k], where along the way each later picture was taken; those of a robot that goes on.
     right: bool [k, n], the places of the map that a later picture shows.
     conditions: those that this world has, the one of the map first.
     strangers: pictures of another building or street.
@@ -47,7 +47,7 @@ class RobotWorld:
     name: str
     first: Sequence[Pixels]
     later: Callable[[int, str, int], Pixels]
-    metres: NDArray[np.float64]
+    metres: NDArray[np.floating]
     right: NDArray[np.bool_]
     conditions: tuple[str, ...]
     strangers: Sequence[Pixels]
@@ -84,7 +84,9 @@ def cameras(datasets: Path) -> RobotWorld:
     """Fixed cameras by day and by night."""
     folders = [one for one in sorted((datasets / "train/day_night").iterdir()) if one.is_dir()]
     folders = [one for one in folders if one.name not in MIXED_CAMERAS]
-    shown = [(list(map(read, sorted(one.glob("day_*")))), list(map(read, sorted(one.glob("night_*"))))) for one in folders]
+    shown = [
+        (list(map(read, sorted(one.glob("day_*")))), list(map(read, sorted(one.glob("night_*"))))) for one in folders
+    ]
     for folder in sorted(one for one in (datasets / "eval/webcams").iterdir() if one.is_dir()):
         pictures = [read(path) for path in find_photographs(folder)]
         shown.append(
@@ -97,9 +99,7 @@ def cameras(datasets: Path) -> RobotWorld:
         height, width = pixels.shape[:2]
         left = round((1 - WINDOW) * width * (number % CUTS) / (CUTS - 1))
         top = round((1 - WINDOW) * height * 0.6)
-        return np.ascontiguousarray(
-            pixels[top : top + round(WINDOW * height), left : left + round(WINDOW * width)]
-        )
+        return np.ascontiguousarray(pixels[top : top + round(WINDOW * height), left : left + round(WINDOW * width)])
 
     def later(number: int, condition: str, run: int) -> Pixels:
         random = np.random.default_rng((9, run, number // CUTS, number % 2))

@@ -61,7 +61,14 @@ class Plan:
 
 def year(world: RobotWorld, runs: int) -> list[Plan]:
     """The runs of a year: conditions in turn, of two robots, with what happens to robots; and an attacker in spring."""
-    events = {1: ("stands",), 2: ("detour",), 4: ("kidnapped",), 5: ("stands", "detour"), 8: ("detour",), 10: ("stands",)}
+    events = {
+        1: ("stands",),
+        2: ("detour",),
+        4: ("kidnapped",),
+        5: ("stands", "detour"),
+        8: ("detour",),
+        10: ("stands",),
+    }
     order = world.conditions[1:] + world.conditions
     plans = []
     for number in range(runs):
@@ -71,7 +78,7 @@ def year(world: RobotWorld, runs: int) -> list[Plan]:
     return plans
 
 
-def curve(metres: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+def curve(metres: NDArray[np.floating]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     """Where the way is at some metres, x + iy, complex128 [n], and its heading there, float64 [n]."""
     along = np.arange(-50, float(metres.max(initial=0)) + 50, 0.05)
     points = np.cumsum(0.05 * np.exp(1j * BEND * np.sin(along / BEND_METRES)))
@@ -117,7 +124,8 @@ def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[Moment]:
     """The frames of a run, in their order."""
     random = np.random.default_rng((seed, 20, plan.number))
     attacks = ATTACKER in plan.events
-    scale, found = 1 + DRIFT * random.normal(), []
+    scale = 1 + DRIFT * random.normal()
+    found: list[Moment] = []
     before: tuple[complex, float] | None = None
     odometry, heading = 0j, 0.0
     first = int(random.integers(len(world.strangers)))

@@ -1,7 +1,7 @@
 """The frames of a run that are beyond doubt, and where odometry puts the frames between them.
 
-An anchor is a frame that was recognized alone and that the rest of the run, which its own evidence is left out of, puts
-at the same place.  From the anchors shortly before and after a frame, the way of the odometry is laid onto the map: with
+An anchor is a frame that was recognized alone and that the rest of the run, without the frame's own evidence, puts at
+the same place.  From the anchors shortly before and after a frame, the way of the odometry is laid onto the map: with
 poses by the rigid motion of the plane that fits best (the least squares of positions and headings), without poses by a
 straight line of positions in a sequence over metres gone.  Anchors that miss it are outvoted; where too many do, the
 odometry or a recognition is wrong, and nothing is said.
@@ -47,7 +47,8 @@ class Fit:
     """Where the anchors around a frame put it, by odometry.
 
     before, after: numbers of the nearest anchors that agree.
-    misfit: metres, or frames of the sequence in maps without poses, by which the anchors miss the way: root mean square.
+    misfit: metres, or frames of the sequence in maps without poses, by which the anchors miss the way, root mean
+        square.
     point: x + iy relative to the coordinates of the place of anchor ``before``, metres; None without poses.
     heading: radians; NaN where not known.
     sequence, ordinal: the position in a sequence, in maps without poses; None with poses.
@@ -66,7 +67,8 @@ def anchors_of(
     frames: Sequence[RunFrame], posteriors: Sequence[Posterior], graph: PlaceGraph
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The anchors of a run, and the frames that were as sure of themselves but that the run contradicts; int64 each."""
-    agree, contradict = [], []
+    agree: list[int] = []
+    contradict: list[int] = []
     for number, (frame, posterior) in enumerate(zip(frames, posteriors, strict=True)):
         if frame.verdict != "recognized" or frame.row is None or frame.sight is not None:
             continue

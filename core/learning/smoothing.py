@@ -33,8 +33,9 @@ detours give it a say: in maps without poses, motion alone does not tell that a 
 WEIGHT = 1.5
 """Weight of a frame's evidence, relative to that in a belief: there, less than half of what a frame says is counted, as
 every mistake is believed at once; here, the frames after it contradict it.  With 1.5, in a year of runs on corridor,
-lip6, nordland and fixed cameras (``python -m benchmarks.learning``), 5 338 of 7 423 frames are placed with a certainty of
-0.95 by the others, all of them right within two places; with 1, 5 140; with 2, 5 524, of which 4 are wrong."""
+lip6, nordland and fixed cameras (``python -m benchmarks.learning``, maps without learnt looks), 5 338 of 7 423 frames
+are placed with a certainty of 0.95 by the others, all of them right within two places; with 1, 5 140; with 2, 5 524, of
+which 4 are wrong."""
 
 STORED = 512
 """At most this many places of each frame are stored with probabilities of their own."""

@@ -110,7 +110,7 @@ def keypoints(seed: int, count: int = 120, shift: float = 0.0, extra: int = 0) -
     if extra:
         shares = np.concatenate([shares, others.uniform(0.05, 0.95, (extra, 2))])
         descriptors = np.concatenate([descriptors, others.normal(0, 1, (extra, 64))])
-    shares = shares + [shift, 0.0]
+    shares = shares + np.array([shift, 0.0])
     lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
     quantized = np.clip(np.rint(254 * descriptors / lengths), -127, 127).astype(np.int8)
     return Keypoints(640, 480, np.rint(shares * 65535).astype(np.uint16), quantized)

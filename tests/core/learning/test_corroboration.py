@@ -31,7 +31,8 @@ class Scores:
     def __call__(self, number: int, others: Sequence[int]) -> NDArray[np.float32]:
         rows = [one.proposal.row for one in self.waiting]
         return np.array(
-            [self.pairs.get((number, other), 0.6 if rows[number] == rows[other] else 0.1) for other in others], np.float32
+            [self.pairs.get((number, other), 0.6 if rows[number] == rows[other] else 0.1) for other in others],
+            np.float32,
         )
 
 

@@ -112,7 +112,9 @@ def test_a_frame_has_no_say_about_itself(seen: list[tuple[list[int], float, floa
 
 @settings(deadline=None, max_examples=30)
 @given(evidences, st.integers(1, 12))
-def test_probabilities_sum_to_one_however_few_are_stored(seen: list[tuple[list[int], float, float]], stored: int) -> None:
+def test_probabilities_sum_to_one_however_few_are_stored(
+    seen: list[tuple[list[int], float, float]], stored: int
+) -> None:
     graph = way(12)
     for posterior in smoothed(frames_of(seen), graph, stored):
         everywhere = posterior.at(np.arange(len(graph)))
