@@ -63,11 +63,24 @@ class Fit:
     ordinal: float | None = None
 
 
-def anchors_of(
-    frames: Sequence[RunFrame], posteriors: Sequence[Posterior], graph: PlaceGraph
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The anchors of a run, and the frames that were as sure of themselves but that the run contradicts; int64 each."""
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """The recognized frames of a run.
+
+    frames, places: int64 [a], the anchors' numbers, and their places in the graph: of the same places as each was
+        recognized at the likeliest one, by the run and by itself.
+    contradicted: int64 [c], the frames that were as sure of themselves, but that the run denies.
+    """
+
+    frames: NDArray[np.int64]
+    places: NDArray[np.int64]
+    contradicted: NDArray[np.int64]
+
+
+def anchors_of(frames: Sequence[RunFrame], posteriors: Sequence[Posterior], graph: PlaceGraph) -> Anchors:
+    """The anchors of a run."""
     agree: list[int] = []
+    places: list[int] = []
     contradict: list[int] = []
     for number, (frame, posterior) in enumerate(zip(frames, posteriors, strict=True)):
         if frame.verdict != "recognized" or frame.row is None or frame.sight is not None:
@@ -77,9 +90,22 @@ def anchors_of(
         place = place_of(graph, frame.row)
         if place < 0:
             continue
-        near = posterior.at(graph.same_place(place))
-        (agree if near >= AGREEING else contradict).append(number)
-    return np.array(agree, np.int64), np.array(contradict, np.int64)
+        same = graph.same_place(place)
+        if posterior.at(same) < AGREEING:
+            contradict.append(number)
+            continue
+        agree.append(number)
+        likely = likelihoods(frame, posterior, graph)
+        places.append(max(same.tolist(), key=lambda one: likely.get(one, 0.0)))
+    return Anchors(np.array(agree, np.int64), np.array(places, np.int64), np.array(contradict, np.int64))
+
+
+def likelihoods(frame: RunFrame, posterior: Posterior, graph: PlaceGraph) -> dict[int, float]:
+    """How likely the places of a posterior are with the frame's own evidence, up to a common factor."""
+    places, gains = graph.evidence_at(frame.seen)
+    own = dict(zip(places.tolist(), np.exp(gains).tolist(), strict=True))
+    found = zip(posterior.places.tolist(), posterior.probabilities.tolist(), strict=True)
+    return {place: probability * own.get(place, 1.0) for place, probability in found}
 
 
 def place_of(graph: PlaceGraph, row: int) -> int:
@@ -109,19 +135,19 @@ def pace_of(trail: Trail, graph: PlaceGraph) -> float | None:
     return float(np.median(paces)) if len(paces) >= BESIDE else None
 
 
-def scale_of(trail: Trail, anchors: NDArray[np.int64], graph: PlaceGraph) -> float | None:
+def scale_of(trail: Trail, anchors: Anchors, graph: PlaceGraph) -> float | None:
     """Metres of the map in a metre of odometry, the median over pairs of anchors.
 
     The anchors of a pair are between two same-place radii and ``REACH`` of them apart, so that neither the places'
     spacing nor drift hides the scale.  None for too few pairs, as in a map without poses.
     """
     radius = graph.neighborhood.radius
-    places = graph.places_at(np.array([trail.frames[one].row for one in anchors.tolist()], np.int64))
-    ratios = []
-    for first, place in enumerate(places.tolist()):
-        apart = np.abs(trail.points[anchors] - trail.points[anchors[first]])
+    frames, places = anchors.frames, anchors.places
+    ratios: list[float] = []
+    for first, place in zip(frames.tolist(), places.tolist(), strict=True):
+        apart = np.abs(trail.points[frames] - trail.points[first])
         near = (apart >= 2 * radius) & (apart <= REACH * radius) & graph.posed[places] & graph.posed[place]
-        near &= (trail.piece[anchors] == trail.piece[anchors[first]]) & (anchors > anchors[first])
+        near &= (trail.piece[frames] == trail.piece[first]) & (frames > first)
         there = np.abs(relative(graph, places[near], place))
         ratios += (there / apart[near]).tolist()
     return float(np.median(ratios)) if len(ratios) >= LEAST_PAIRS else None
@@ -130,11 +156,10 @@ def scale_of(trail: Trail, anchors: NDArray[np.int64], graph: PlaceGraph) -> flo
 class Way:
     """Lays the odometry of a run onto the map, around each frame by its anchors."""
 
-    def __init__(self, trail: Trail, anchors: NDArray[np.int64], graph: PlaceGraph, pace: float | None = None) -> None:
+    def __init__(self, trail: Trail, anchors: Anchors, graph: PlaceGraph, pace: float | None = None) -> None:
         """``pace``: as of :func:`pace_of`; only needed for places without poses."""
-        self.trail, self.anchors, self.graph, self.pace = trail, anchors, graph, pace
-        rows = [trail.frames[one].row for one in anchors.tolist()]
-        self.places = graph.places_at(np.array(rows, np.int64))
+        self.trail, self.graph, self.pace = trail, graph, pace
+        self.anchors, self.places = anchors.frames, anchors.places
 
     def fit(self, number: int) -> Fit | None:
         """Where the anchors around a frame put it; None where they are too few or contradict one another."""

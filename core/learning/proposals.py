@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from core.belief import PlaceGraph
 from core.geometry.verification import LEAST_MATCHES, verify
-from core.learning.anchors import Fit, Way, anchors_of, pace_of, place_of, scale_of
+from core.learning.anchors import Anchors, Fit, Way, anchors_of, likelihoods, pace_of, place_of, scale_of
 from core.learning.frames import RunFrame, Trail
 from core.learning.smoothing import Posterior, smoothed
 
@@ -46,7 +46,7 @@ NEAR = 0.4
 times as many frames as are the same place.  In a year of runs on corridor and nordland, none of 991 proposals up to
 0.3 radii away was of another place, and three of 67 farther ones were, before ``EXACT`` had its say."""
 
-MISFIT = 0.4
+MISFIT = 0.6
 """The anchors around a frame may miss the way of odometry by this many same-place radii, root mean square."""
 
 TURNED = math.radians(30)
@@ -141,10 +141,10 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
     trail = Trail.of(frames)
     pace = None if graph.posed.all() else pace_of(trail, graph)
     posteriors = smoothed(trail.looks(graph, pace), graph)
-    anchors, contradicted = anchors_of(frames, posteriors, graph)
-    contradiction = _contradiction(len(anchors), len(contradicted), scale_of(trail, anchors, graph), options)
+    anchors = anchors_of(frames, posteriors, graph)
+    contradiction = _contradiction(anchors, scale_of(trail, anchors, graph), options)
     if contradiction is not None:
-        return Lesson((), contradiction, anchors, contradicted, np.full(len(frames), -1, np.int64))
+        return Lesson((), contradiction, anchors.frames, anchors.contradicted, np.full(len(frames), -1, np.int64))
     judge = _Judge(frames, graph, posteriors, Way(trail, anchors, graph, pace), options)
     found: list[Proposal] = []
     refused: Counter[Refusal] = Counter()
@@ -158,15 +158,14 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
             found.append(outcome)
         else:
             refused[outcome] += 1
-    return Lesson(tuple(found), None, anchors, contradicted, rows, refused)
+    return Lesson(tuple(found), None, anchors.frames, anchors.contradicted, rows, refused)
 
 
-def _contradiction(
-    anchors: int, contradicted: int, scale: float | None, options: LessonOptions
-) -> Contradiction | None:
-    if anchors < options.least_anchors:
+def _contradiction(anchors: Anchors, scale: float | None, options: LessonOptions) -> Contradiction | None:
+    agreeing, contradicted = len(anchors.frames), len(anchors.contradicted)
+    if agreeing < options.least_anchors:
         return "too few recognized"
-    if anchors < LEAST_AGREEING * (anchors + contradicted):
+    if agreeing < LEAST_AGREEING * (agreeing + contradicted):
         return "contradicted"
     return "odometry" if scale is not None and not 1 / MOST_SCALED <= scale <= MOST_SCALED else None
 
@@ -203,14 +202,12 @@ class _Judge:
         same = self.graph.same_place(best)
         if posterior.at(same) < self.options.least_probability:
             return None
-        places, gains = self.graph.evidence_at(self.frames[number].seen)
-        own = dict(zip(places.tolist(), gains.tolist(), strict=True))
-        there = dict(zip(posterior.places.tolist(), posterior.probabilities.tolist(), strict=True))
+        likely = likelihoods(self.frames[number], posterior, self.graph)
         fit = self.fit(number)
 
         def likelihood(place: int) -> float:
             off = 0.0 if fit is None else self.way.distance(fit, place) / (EXACT * self._unit(fit))
-            return there.get(place, 0.0) * math.exp(own.get(place, 0.0) - 0.5 * off**2)
+            return likely.get(place, 0.0) * math.exp(-0.5 * off**2)
 
         return int(max(same.tolist(), key=likelihood))
 

@@ -10,14 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.learning import RunFrame, Trail
-from core.learning.anchors import Way, pace_of
+from core.learning.anchors import Anchors, Way, pace_of
 from tests.core.learning.runs import except_at, heading_at, recognized, walked, way
 
 GRAPH = way(60)
 
 
 def laid(frames: list[RunFrame], anchors: list[int]) -> Way:
-    return Way(Trail.of(frames), np.array(anchors), GRAPH)
+    rows = [frames[number].row for number in anchors]
+    known = Anchors(np.array(anchors, np.int64), np.array(rows, np.int64), np.empty(0, np.int64))
+    return Way(Trail.of(frames), known, GRAPH)
 
 
 @settings(deadline=None, max_examples=25)
