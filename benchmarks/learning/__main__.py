@@ -55,12 +55,18 @@ def encoded_run(encoder: Encoder, world: RobotWorld, plan: Plan, seed: int) -> E
     return EncodedRun(plan, frames, encoded(encoder, pictures, world.keypoints), [view_of(one) for one in pictures])
 
 
-def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int) -> dict[str, Any]:
-    """The year of one world in every mode, run by run, and its examination."""
+def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int, any_score: bool = False) -> dict[str, Any]:
+    """The year of one world in every mode, run by run, and its examination.
+
+    Args:
+        any_score: looks are believed from any score on, and not from that which stands out of their cohort.
+    """
     first = encoded(encoder, world.first, world.keypoints)
     points, headings = curve(world.spacing * np.arange(len(first)))
     positions = np.column_stack([points.real, points.imag])
-    learners = {mode: Learner(world, LivingMap(encoder, first, positions, headings), first, mode) for mode in MODES}
+    learners = {
+        mode: Learner(world, LivingMap(encoder, first, positions, headings), first, mode, any_score) for mode in MODES
+    }
     told: list[dict[str, Any]] = []
     for plan in year(world, runs):
         run = encoded_run(encoder, world, plan, seed)
@@ -171,6 +177,7 @@ def main(
     runs: Annotated[int, typer.Option(help="Runs of the year, besides the attacker's.")] = 12,
     short: Annotated[bool, typer.Option("--short", help="Half of the year, in the corridor alone.")] = False,
     seed: Annotated[int, typer.Option(help="Of the runs.")] = 0,
+    any_score: Annotated[bool, typer.Option("--any-score", help="Believe a learnt look from any score on.")] = False,
     encoder: Annotated[str, typer.Option(help="Name of the encoder.")] = DEFAULT_ENCODER,
 ) -> None:
     """Print a line for each run and a table, and store the figures."""
@@ -178,7 +185,7 @@ def main(
         worlds, runs = "corridor", min(runs, 6)
     chosen = EncoderCatalogue().get(encoder)
     names = worlds.split(",")
-    lives = {name: lived(chosen, WORLDS[name](datasets), runs, seed) for name in names}
+    lives = {name: lived(chosen, WORLDS[name](datasets), runs, seed, any_score) for name in names}
     rows = [row for name in names for row in rows_of(name, [lives[name]])]
     if len(names) > 1:
         rows += rows_of("all", list(lives.values()))

@@ -107,7 +107,11 @@ class _Learnt:
 class Learner:
     """One world's map in one mode."""
 
-    def __init__(self, world: RobotWorld, map_: LivingMap, first: Sequence[EncodedPicture], mode: Mode) -> None:
+    def __init__(
+        self, world: RobotWorld, map_: LivingMap, first: Sequence[EncodedPicture], mode: Mode, any_score: bool = False
+    ) -> None:
+        """``any_score``: looks are believed from any score on."""
+        self.any_score = any_score
         self.world, self.map, self.mode, self.first = world, map_, mode, first
         self.base = len(map_)
         self.waiting: list[_Waiting] = []
@@ -238,7 +242,7 @@ class Learner:
                 self.map.withdraw_look(row)
                 del self.learnt[row]
         if len(looks) - 1 in staying:
-            row = self.map.add_look(one.place, one.frame, one.least)
+            row = self.map.add_look(one.place, one.frame, -np.inf if self.any_score else one.least)
             self.learnt[row] = _Learnt(one.frame, one.place, one.right, one.attacker, one.believable)
             tally.taken += 1
             tally.taken_wrong += not one.right

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from core.belief import OdometryPose, PlaceGraph
 from core.learning import Lesson, LessonOptions, RunFrame, lesson_of
-from tests.core.learning.runs import covered, dark, except_at, keypoints, missed, recognized, seen_at, walked, way
+from tests.core.learning.runs import covered, except_at, keypoints, missed, recognized, seen_at, walked, way
 
 ROWS = list(range(60))
 HIDDEN = [10, 11, 25, 26, 27, 28, 40]
@@ -219,4 +219,3 @@ def test_a_dark_run_with_evidence_of_its_own_is_still_not_sure(graph: PlaceGraph
         return RunFrame(seen_at(row, 1.5), "ambiguous", 0.4, row, pose)
 
     assert lesson_of(walked(ROWS, doubtful), graph).contradiction == "too few recognized"
-    assert dark().unknown > 0
