@@ -114,6 +114,11 @@ def cameras(datasets: Path) -> RobotWorld:
     return RobotWorld("cameras", first, later, METRES * places, right, ("day", "night"), strangers)
 
 
+def _sized(pixels: Pixels, interpolation: int = cv2.INTER_CUBIC) -> Pixels:
+    """A picture at the size at which nordland's are drawn in other conditions."""
+    return np.asarray(cv2.resize(pixels, (128, 64), interpolation=interpolation), np.uint8)
+
+
 def nordland(datasets: Path, places: int = 150, step: int = 6, start: int = 300) -> RobotWorld:
     """A railway; a place is ``step`` frames from the next, and two to either side are tolerated, fewer than usual."""
     folder = datasets / "eval/nordland_tiny"
@@ -126,13 +131,10 @@ def nordland(datasets: Path, places: int = 150, step: int = 6, start: int = 300)
 
     def later(number: int, condition: str, run: int) -> Pixels:
         season = winter if condition.startswith("winter") else summer
-        large = cv2.resize(picture(number, season, run), (128, 64), interpolation=cv2.INTER_CUBIC)
-        return CONDITIONS["night" if condition.endswith("night") else "day"](np.asarray(large, np.uint8), number, run)
+        drawn = CONDITIONS["night" if condition.endswith("night") else "day"]
+        return drawn(_sized(picture(number, season, run)), number, run)
 
-    first = [
-        np.asarray(cv2.resize(read(summer[one]), (128, 64), interpolation=cv2.INTER_CUBIC), np.uint8)
-        for one in numbers.tolist()
-    ]
+    first = [_sized(read(summer[one])) for one in numbers.tolist()]
     at = np.arange(places)
     return RobotWorld(
         "nordland",
@@ -141,7 +143,7 @@ def nordland(datasets: Path, places: int = 150, step: int = 6, start: int = 300)
         METRES * at,
         np.abs(at[:, None] - at) <= 2,
         ("summer", "summer night", "winter", "winter night"),
-        [cv2.resize(one, (128, 64), interpolation=cv2.INTER_AREA) for one in _strangers(datasets / "train/roads")],
+        [_sized(one, cv2.INTER_AREA) for one in _strangers(datasets / "train/roads")],
         keypoints=False,
     )
 

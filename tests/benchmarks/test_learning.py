@@ -54,8 +54,8 @@ def test_odometry_drifts_by_some_percent(world: RobotWorld) -> None:
         assert [one.at for one in found] == list(range(COUNT))
         points = [complex(one.pose.x, one.pose.y) for one in found]
         lengths.append(abs(points[-1] - points[0]))
-    points, _ = curve(world.metres)
-    true = abs(points[-1] - points[0])
+    way, _ = curve(world.metres)
+    true = abs(way[-1] - way[0])
     assert 0.01 < float(np.std(lengths)) / true < 0.15
     assert np.mean(lengths) == pytest.approx(true, rel=0.1)
 
@@ -120,12 +120,12 @@ def test_a_look_wins_from_its_score_on_and_is_one_place_with_the_first(
     refused = map_.add_look(7, stranger, np.inf)
     (same,) = map_.recognize([stranger])
     assert (same.row, same.judgement.verdict) == (before.row, before.judgement.verdict)
-    taken = map_.add_look(7, stranger, 0.5)
+    map_.withdraw_look(refused)
+    taken = map_.add_look(7, stranger, 0.2)
     (after,) = map_.recognize([stranger])
     assert (after.row, after.judgement.verdict) == (taken, "recognized")
     graph = map_.graph()
     assert len(graph) == COUNT
-    assert set(graph.places_at(np.array([7, refused, taken])).tolist()) == {7}
+    assert graph.places_at(np.array([7, refused, taken])).tolist() == [7, -1, 7]
     map_.withdraw_look(taken)
-    map_.withdraw_look(refused)
     assert len(map_) == COUNT
