@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.learning.learner import EncodedRun, Learner, Mode, Tally
+from benchmarks.learning.learner import EncodedRun, Learner, Mode, RunTally
 from benchmarks.learning.living_map import EncodedPicture, LivingMap
 from benchmarks.learning.worlds import WORLDS, RobotWorld
 from benchmarks.learning.year import Plan, curve, moments, year
@@ -84,7 +84,7 @@ def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int, any_score: 
     return {"places": len(first), "runs": told, "examination": exam, "left": left}
 
 
-def line(world: RobotWorld, plan: Plan, tallies: dict[Mode, Tally]) -> str:
+def line(world: RobotWorld, plan: Plan, tallies: dict[Mode, RunTally]) -> str:
     """One run in a line: recognized and right, wrong, and the looks of each mode."""
     parts = [f"{world.name} {plan.number:4d} {plan.condition:13s} {' '.join(plan.events):15s}"]
     for mode, one in tallies.items():

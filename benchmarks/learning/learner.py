@@ -48,7 +48,7 @@ class EncodedRun:
 
 
 @dataclass
-class Tally:
+class RunTally:
     """The figures of one run, or of several.
 
     frames: those in the map; right, wrong: recognized ones, wrong also of frames from elsewhere.
@@ -119,9 +119,9 @@ class Learner:
         self.runs = 0
         self._between: dict[tuple[tuple[str, int], tuple[str, int]], float] = {}
 
-    def live(self, run: EncodedRun) -> Tally:
+    def live(self, run: EncodedRun) -> RunTally:
         """Answer a run, then learn from it."""
-        tally = Tally()
+        tally = RunTally()
         began = time.perf_counter()
         answers = self.map.recognize(run.frames)
         tally.milliseconds = 1e3 * (time.perf_counter() - began) / len(answers)
@@ -139,19 +139,19 @@ class Learner:
         tally.rows = len(self.map)
         return tally
 
-    def examine(self, run: EncodedRun) -> Tally:
+    def examine(self, run: EncodedRun) -> RunTally:
         """Answer a run and learn nothing."""
-        tally = Tally()
+        tally = RunTally()
         self._count(run, self.map.recognize(run.frames), tally)
         return tally
 
     def left(self) -> dict[str, int]:
-        """What the map has now: rows, learnt looks, those of wrong places, and those of an attacker's frames."""
+        """The numbers of its rows, learnt looks, those of wrong places, and those of an attacker's frames."""
         looks = self.learnt.values()
         wrong, attackers = sum(not one.right for one in looks), sum(one.attacker for one in looks)
         return {"rows": len(self.map), "looks": len(looks), "wrong": wrong, "attackers": attackers}
 
-    def _count(self, run: EncodedRun, answers: Sequence[Recognized], tally: Tally) -> None:
+    def _count(self, run: EncodedRun, answers: Sequence[Recognized], tally: RunTally) -> None:
         for moment, answer in zip(run.moments, answers, strict=True):
             tally.frames += moment.at is not None
             if answer.judgement.verdict == "recognized":
@@ -162,7 +162,7 @@ class Learner:
     def _shows(self, moment: Moment, place: int) -> bool:
         return moment.at is not None and bool(self.world.right[moment.at, place])
 
-    def _observe(self, lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, tally: Tally) -> None:
+    def _observe(self, lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, tally: RunTally) -> None:
         """Count how the learnt looks have served, and withdraw those that mislead."""
         looks: dict[int, list[int]] = {}
         for row, one in self.learnt.items():
@@ -172,7 +172,7 @@ class Learner:
                 self.learnt[row].served += served
         self._withdraw([row for row, one in self.learnt.items() if one.served.misleads or one.served.idle], tally)
 
-    def _withdraw(self, rows: Sequence[int], tally: Tally) -> None:
+    def _withdraw(self, rows: Sequence[int], tally: RunTally) -> None:
         for row in rows:
             self.map.withdraw_look(row)
             del self.learnt[row]
@@ -185,7 +185,7 @@ class Learner:
         answers: Sequence[Recognized],
         trail: Trail,
         graph: PlaceGraph,
-        tally: Tally,
+        tally: RunTally,
     ) -> None:
         for proposal in lesson.proposals:
             moment, place = run.moments[proposal.frame], self.map.place[proposal.row]
@@ -207,7 +207,7 @@ class Learner:
             stranger = run.plan.robot == "stranger"
             self.waiting.append(_Waiting(pending, frame, believable, least, place, right, stranger))
 
-    def _take(self, graph: PlaceGraph, tally: Tally) -> None:
+    def _take(self, graph: PlaceGraph, tally: RunTally) -> None:
         """Take the proposals that this mode takes; the others wait for a while."""
         if self.mode == "propose":
             chosen = {number for number, one in enumerate(self.waiting) if one.right}
@@ -230,7 +230,7 @@ class Learner:
             self._add(self.waiting[number], tally)
         self.waiting = left
 
-    def _add(self, one: _Waiting, tally: Tally) -> None:
+    def _add(self, one: _Waiting, tally: RunTally) -> None:
         """Add a look to a place if it keeps it; another may go instead."""
         rows = [row for row, learnt in self.learnt.items() if learnt.place == one.place]
         looks = [self.first[one.place], *(self.learnt[row].frame for row in rows), one.frame]
@@ -248,7 +248,7 @@ class Learner:
             tally.taken_wrong += not one.right
             tally.attackers += one.attacker
 
-    def _rehearse(self, lesson: Lesson, run: EncodedRun, tally: Tally) -> None:
+    def _rehearse(self, lesson: Lesson, run: EncodedRun, tally: RunTally) -> None:
         """Ask the run again, and withdraw new looks that win frames which the run is certain to be elsewhere."""
         if not tally.taken:
             return

@@ -22,20 +22,21 @@ from core.learning.frames import RunFrame, Trail
 from core.learning.smoothing import Posterior
 
 SURE = 0.5
-"""A recognized frame is an anchor from this probability of its own on."""
+"""A recognized frame is an anchor from this probability of its own on.  With 0.8, five to eleven of the 111 frames of
+dark and foggy runs through corridor would be, in place of thirty or so."""
 
 AGREEING = 0.5
-"""The rest of the run must put an anchor at its place with at least this probability."""
+"""The rest of the run must put an anchor at its place with at least this probability; no other value was tried."""
 
 BESIDE = 3
-"""Anchors that are taken on each side of a frame."""
+"""Anchors that are taken on each side of a frame; no other number was tried."""
 
 REACH = 6.0
 """Anchors are taken up to this many same-place radii of way before and after a frame, or so many times as many frames
-of a sequence as are the same place."""
+of a sequence as are the same place.  On 30 m, odometry that drifts by 5 % loses 1.5 m."""
 
 OUTVOTED = 1 / 3
-"""At most this share of the anchors around a frame may miss the way."""
+"""At most this share of the anchors around a frame may miss the way: one of three, two of six."""
 
 
 LEAST_PAIRS = 5

@@ -20,7 +20,8 @@ MOST_LOOKS = 3
 """Looks of a place, the first included."""
 
 REPEATS = 2.5
-"""A look repeats another if its score against it is this many times the score at which it would just be believed."""
+"""A look repeats another if its score against it is this many times the score at which it would just be believed; as
+``verdict.ALIKE``, and not measured here."""
 
 
 def kept(

@@ -1,4 +1,4 @@
-"""What a run teaches: frames whose place the whole run knows beyond doubt, although alone they were not recognized.
+"""The lesson of a run: frames whose place the whole run knows beyond doubt, although alone they were not recognized.
 
 Each becomes a proposal, a further look of its place, unless something speaks against it: the view was covered, or shows
 what the frame before it showed; the rest of the run leaves doubt; there is no anchor shortly before or after it, or
@@ -27,13 +27,16 @@ from core.learning.frames import RunFrame, Trail
 from core.learning.smoothing import Posterior, smoothed
 
 LEAST_PROBABILITY = 0.95
-"""Certainty from which a frame's place counts as known."""
+"""Certainty from which a frame's place counts as known; ``smoothing.WEIGHT`` says how often that was right."""
 
 LEAST_ANCHORS = 6
-"""A run with fewer anchors teaches nothing."""
+"""A run with fewer anchors teaches nothing.  In a year of runs on four worlds, an attacker with the right odometry in
+another building or street had none."""
 
 LEAST_AGREEING = 0.5
-"""A run teaches nothing if it contradicts more than the rest of the frames that are sure of themselves."""
+"""A run teaches nothing if it contradicts more than the rest of the frames that are sure of themselves.  On pictures of
+64 x 32 pixels (nordland), where a third of the recognized frames are wrong, 0.7 would refuse half of the runs, although
+none of what they propose is wrong."""
 
 MOST_SCALED = 1.2
 """A run teaches nothing if its odometry is off by more than this factor, by its anchors."""
@@ -47,17 +50,19 @@ times as many frames as are the same place.  In a year of runs on corridor and n
 0.3 radii away was of another place, and three of 67 farther ones were, before ``EXACT`` had its say."""
 
 MISFIT = 0.6
-"""The anchors around a frame may miss the way of odometry by this many same-place radii, root mean square."""
+"""The anchors around a frame may miss the way of odometry by this many same-place radii, root mean square.  In a year
+on corridor, 43 of 240 proposals lie between 0.4 and 0.6, none of them wrong."""
 
 TURNED = math.radians(30)
 """A robot that looks farther than this from where the map looked sees something else."""
 
 OVERLAPPING = 1.0
-"""Anchors up to this many same-place radii of way from a frame show part of what it shows."""
+"""Anchors up to this many same-place radii of way from a frame show part of what it shows: by definition."""
 
 FITTING, STRANGE = 60.0, 8.0
 """Evidence (``core.geometry.verification``) from which keypoints prove that two frames overlap, and under which they
-deny it."""
+deny it.  The first is above the evidence at which right and wrong candidates are as frequent (``evidence.VERIFIED``).
+In a year on corridor, one of 157 proposals above it was wrong, by three places."""
 
 DESCRIBED = 40
 """Keypoints that both frames must have for the lack of evidence to mean anything."""
@@ -108,7 +113,7 @@ class Proposal:
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """What a run teaches.
+    """The proposals of a run, and what they rest on.
 
     proposals: in the order of the frames.
     contradiction: why the run teaches nothing; None if it may.
@@ -127,7 +132,7 @@ class Lesson:
 
 
 def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOptions | None = None) -> Lesson:
-    """What a whole run teaches a map.
+    """Judge a whole run, and propose what it teaches a map.
 
     Args:
         frames: of one robot, in the order in which they were taken.

@@ -54,7 +54,7 @@ class LookStatistics:
 def services(
     lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, looks: Mapping[int, Sequence[int]] | None = None
 ) -> dict[int, LookStatistics]:
-    """What a run says about the rows of a map.
+    """How the rows of a map have served in a run.
 
     Args:
         lesson: of the run.

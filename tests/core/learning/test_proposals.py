@@ -1,4 +1,4 @@
-"""What runs teach: dark stretches between recognized frames, and nothing that anything speaks against."""
+"""The lessons of runs: dark stretches between recognized frames, and nothing that anything speaks against."""
 
 from __future__ import annotations
 
