@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.learning.living_map import EncodedPicture, LivingMap, Recognized
 from benchmarks.learning.worlds import RobotWorld
-from benchmarks.learning.year import Moment, Plan
+from benchmarks.learning.year import RunMoment, Plan
 from core.belief import PlaceGraph, Run, RunOptions, Step, View
 from core.learning import (
     Lesson,
@@ -42,7 +42,7 @@ class EncodedRun:
     """A run with its encoded frames, which all ways of learning share."""
 
     plan: Plan
-    moments: Sequence[Moment]
+    moments: Sequence[RunMoment]
     frames: Sequence[EncodedPicture]
     views: Sequence[View]
 
@@ -159,7 +159,7 @@ class Learner:
                 tally.right += right
                 tally.wrong += not right
 
-    def _shows(self, moment: Moment, place: int) -> bool:
+    def _shows(self, moment: RunMoment, place: int) -> bool:
         return moment.at is not None and bool(self.world.right[moment.at, place])
 
     def _observe(self, lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, tally: RunTally) -> None:

@@ -32,7 +32,7 @@ STOOD, DETOUR, ASIDE = 12, 10, 15.0
 ATTACKER = "attacker"
 
 
-class Moment(NamedTuple):
+class RunMoment(NamedTuple):
     """One frame of a run.
 
     at: the number of the later picture of the world that it shows; None: it shows something that the map does not have.
@@ -120,12 +120,12 @@ def _route(world: RobotWorld, plan: Plan, random: np.random.Generator) -> Iterat
         at += 1
 
 
-def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[Moment]:
+def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[RunMoment]:
     """The frames of a run, in their order."""
     random = np.random.default_rng((seed, 20, plan.number))
     attacks = ATTACKER in plan.events
     scale = 1 + DRIFT * random.normal()
-    found: list[Moment] = []
+    found: list[RunMoment] = []
     before: tuple[complex, float] | None = None
     odometry, heading = 0j, 0.0
     first = int(random.integers(len(world.strangers)))
@@ -143,7 +143,7 @@ def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[Moment]:
             if found and found[-1].at == at:
                 pixels = another_look(found[-1].pixels, random)
         pose = OdometryPose(float(odometry.real), float(odometry.imag), heading, origin=str(plan.number))
-        found.append(Moment(None if attacks else at, pixels, pose))
+        found.append(RunMoment(None if attacks else at, pixels, pose))
     return found
 
 
