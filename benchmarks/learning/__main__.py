@@ -19,7 +19,7 @@ import typer
 from benchmarks.learning.learner import EncodedRun, Learner, Mode, RunTally
 from benchmarks.learning.living_map import EncodedPicture, LivingMap
 from benchmarks.learning.worlds import WORLDS, RobotWorld
-from benchmarks.learning.year import Plan, curve, moments, year
+from benchmarks.learning.year import RunPlan, curve, moments, year
 from benchmarks.report import report, verdict
 from core.belief import view_of
 from core.frames.preprocessing import Pixels
@@ -48,7 +48,7 @@ def encoded(encoder: Encoder, pictures: Sequence[Pixels], keypoints: bool) -> li
     return [EncodedPicture(one.descriptor, one.local, points) for one, points in zip(made, found, strict=True)]
 
 
-def encoded_run(encoder: Encoder, world: RobotWorld, plan: Plan, seed: int) -> EncodedRun:
+def encoded_run(encoder: Encoder, world: RobotWorld, plan: RunPlan, seed: int) -> EncodedRun:
     """A run with its encoded frames."""
     frames = moments(world, plan, seed)
     pictures = [one.pixels for one in frames]
@@ -76,7 +76,7 @@ def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int, any_score: 
         told.append({"run": plan.number, "condition": plan.condition, "events": plan.events} | parts)
     exam: dict[str, dict[str, Any]] = {mode: {} for mode in MODES}
     for number, condition in enumerate(world.conditions):
-        run = encoded_run(encoder, world, Plan(EXAMINED + number, condition, "examiner"), seed)
+        run = encoded_run(encoder, world, RunPlan(EXAMINED + number, condition, "examiner"), seed)
         for mode, learner in learners.items():
             tally = learner.examine(run)
             exam[mode][condition] = {"frames": tally.frames, "right": tally.right, "wrong": tally.wrong}
@@ -84,7 +84,7 @@ def lived(encoder: Encoder, world: RobotWorld, runs: int, seed: int, any_score: 
     return {"places": len(first), "runs": told, "examination": exam, "left": left}
 
 
-def line(world: RobotWorld, plan: Plan, tallies: dict[Mode, RunTally]) -> str:
+def line(world: RobotWorld, plan: RunPlan, tallies: dict[Mode, RunTally]) -> str:
     """One run in a line: recognized and right, wrong, and the looks of each mode."""
     parts = [f"{world.name} {plan.number:4d} {plan.condition:13s} {' '.join(plan.events):15s}"]
     for mode, one in tallies.items():

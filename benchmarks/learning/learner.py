@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.learning.living_map import EncodedPicture, LivingMap, Recognized
 from benchmarks.learning.worlds import RobotWorld
-from benchmarks.learning.year import RunMoment, Plan
+from benchmarks.learning.year import RunMoment, RunPlan
 from core.belief import PlaceGraph, Run, RunOptions, Step, View
 from core.learning import (
     Lesson,
@@ -41,7 +41,7 @@ REMEMBERED = 8
 class EncodedRun:
     """A run with its encoded frames, which all ways of learning share."""
 
-    plan: Plan
+    plan: RunPlan
     moments: Sequence[RunMoment]
     frames: Sequence[EncodedPicture]
     views: Sequence[View]

@@ -46,7 +46,7 @@ class RunMoment(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """One run of the year.
 
     number: of the run; robot: that makes it.
@@ -59,7 +59,7 @@ class Plan:
     events: tuple[str, ...] = ()
 
 
-def year(world: RobotWorld, runs: int) -> list[Plan]:
+def year(world: RobotWorld, runs: int) -> list[RunPlan]:
     """The runs of a year: conditions in turn, of two robots, with what happens to robots; and an attacker in spring."""
     events = {
         1: ("stands",),
@@ -73,8 +73,8 @@ def year(world: RobotWorld, runs: int) -> list[Plan]:
     plans = []
     for number in range(runs):
         if number == min(4, runs - 1):
-            plans.append(Plan(1000 + number, order[number % len(order)], "stranger", (ATTACKER,)))
-        plans.append(Plan(number, order[number % len(order)], "AB"[number // 2 % 2], events.get(number, ())))
+            plans.append(RunPlan(1000 + number, order[number % len(order)], "stranger", (ATTACKER,)))
+        plans.append(RunPlan(number, order[number % len(order)], "AB"[number // 2 % 2], events.get(number, ())))
     return plans
 
 
@@ -86,7 +86,9 @@ def curve(metres: NDArray[np.floating]) -> tuple[NDArray[np.complex128], NDArray
     return x + 1j * y, BEND * np.sin(metres / BEND_METRES)
 
 
-def _route(world: RobotWorld, plan: Plan, random: np.random.Generator) -> Iterator[tuple[int | None, complex, float]]:
+def _route(
+    world: RobotWorld, plan: RunPlan, random: np.random.Generator
+) -> Iterator[tuple[int | None, complex, float]]:
     """Where the robot truly goes: the picture, its pose as odometry without error would have it."""
     points, headings = curve(world.metres)
     count = len(points)
@@ -116,11 +118,11 @@ def _route(world: RobotWorld, plan: Plan, random: np.random.Generator) -> Iterat
             at = carried - third
             turned = complex(np.exp(1j * (heading - headings[at])))
             moved = here + 2 * complex(math.cos(heading), math.sin(heading)) - turned * points[at]
-            plan = Plan(plan.number, plan.condition, plan.robot)
+            plan = RunPlan(plan.number, plan.condition, plan.robot)
         at += 1
 
 
-def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[RunMoment]:
+def moments(world: RobotWorld, plan: RunPlan, seed: int = 0) -> list[RunMoment]:
     """The frames of a run, in their order."""
     random = np.random.default_rng((seed, 20, plan.number))
     attacks = ATTACKER in plan.events
@@ -147,7 +149,7 @@ def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[RunMoment]:
     return found
 
 
-def _stranger(world: RobotWorld, plan: Plan, number: int) -> Pixels:
+def _stranger(world: RobotWorld, plan: RunPlan, number: int) -> Pixels:
     """A picture of elsewhere, in the condition of the run."""
     pixels = world.strangers[number % len(world.strangers)]
     height, width = world.first[0].shape[:2]

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.learning.__main__ import encoded
 from benchmarks.learning.living_map import EncodedPicture, LivingMap
 from benchmarks.learning.worlds import RobotWorld
-from benchmarks.learning.year import ATTACKER, DETOUR, STOOD, Plan, curve, moments, year
+from benchmarks.learning.year import ATTACKER, DETOUR, STOOD, RunPlan, curve, moments, year
 from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 
@@ -50,7 +50,7 @@ def test_a_year_has_every_condition_and_one_attacker(world: RobotWorld) -> None:
 def test_odometry_drifts_by_some_percent(world: RobotWorld) -> None:
     lengths = []
     for seed in range(20):
-        found = moments(world, Plan(0, "day", "A"), seed)
+        found = moments(world, RunPlan(0, "day", "A"), seed)
         assert [one.at for one in found] == list(range(COUNT))
         points = [complex(one.pose.x, one.pose.y) for one in found]
         lengths.append(abs(points[-1] - points[0]))
@@ -61,13 +61,13 @@ def test_odometry_drifts_by_some_percent(world: RobotWorld) -> None:
 
 
 def test_an_attacker_goes_the_same_way_elsewhere(world: RobotWorld) -> None:
-    found = moments(world, Plan(1000, "day", "stranger", (ATTACKER,)))
+    found = moments(world, RunPlan(1000, "day", "stranger", (ATTACKER,)))
     assert len(found) == COUNT
     assert all(one.at is None for one in found)
 
 
 def test_a_robot_stands_where_it_is(world: RobotWorld) -> None:
-    found = moments(world, Plan(1, "day", "A", ("stands",)))
+    found = moments(world, RunPlan(1, "day", "A", ("stands",)))
     ats = [one.at for one in found]
     (stood,) = {at for at in ats if ats.count(at) > 1}
     assert ats.count(stood) == STOOD + 1
@@ -77,7 +77,7 @@ def test_a_robot_stands_where_it_is(world: RobotWorld) -> None:
 
 
 def test_a_detour_leads_aside_and_back(world: RobotWorld) -> None:
-    found = moments(world, Plan(2, "day", "A", ("detour",)))
+    found = moments(world, RunPlan(2, "day", "A", ("detour",)))
     away = [number for number, one in enumerate(found) if one.at is None]
     assert len(away) == DETOUR
     before = found[away[0] - 1].pose
@@ -87,7 +87,7 @@ def test_a_detour_leads_aside_and_back(world: RobotWorld) -> None:
 
 
 def test_odometry_does_not_notice_a_kidnapping(world: RobotWorld) -> None:
-    found = moments(world, Plan(4, "day", "A", ("kidnapped",)))
+    found = moments(world, RunPlan(4, "day", "A", ("kidnapped",)))
     ats = [one.at or 0 for one in found]
     (cut,) = [at for at in range(1, len(ats)) if ats[at] - ats[at - 1] != 1]
     assert ats[cut] < ats[cut - 1]
