@@ -163,7 +163,7 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
             found.append(outcome)
         else:
             refused[outcome] += 1
-    return Lesson(tuple(found), None, anchors.frames, anchors.contradicted, rows, refused)
+    return Lesson(tuple(found), None, anchors.frames, anchors.contradicted, rows, dict(refused))
 
 
 def _contradiction(anchors: Anchors, scale: float | None, options: LessonOptions) -> Contradiction | None:
