@@ -130,11 +130,11 @@ def rows_of(name: str, lives: Sequence[dict[str, Any]]) -> list[tuple[object, ..
             (
                 f"{name}, {mode}",
                 f"{found['right'] / found['frames']:.3f}",
-                f"{found['wrong']:.0f} of {found['frames']:.0f}",
+                f"{found['wrong']:.0f}/{found['frames']:.0f}",
                 f"{found['right in the year']:.0f}, {found['wrong in the year']:.0f}",
                 f"{found['taken']:.0f} ({found['taken wrongly']:.0f})",
                 f"{found['withdrawn']:.0f}",
-                f"{found['wrong looks']:.0f} of {found['looks']:.0f}",
+                f"{found['wrong looks']:.0f}/{found['looks']:.0f}",
                 f"{found['rows']:.2f}",
                 f"{found['ms']:.1f}",
             )
@@ -158,17 +158,10 @@ def bars(lives: Sequence[dict[str, Any]]) -> dict[str, str]:
     }
 
 
-COLUMNS = (
-    "in the examination",
-    "right",
-    "wrong",
-    "year: right, wrong",
-    "looks taken (wrong)",
-    "withdrawn",
-    "wrong looks left",
-    "rows",
-    "ms a query",
-)
+COLUMNS = ("", "right", "wrong", "in the year", "taken", "withdrawn", "left", "rows", "ms")
+"""In the examination recognized and right, as a share of the frames, and wrong; in the year right, and wrong; looks
+that were taken, those of wrong places in brackets; looks that were withdrawn; wrong looks that are left, and all; rows,
+in those of the first map; and the time that an answer takes, without encoding."""
 
 
 def main(
