@@ -204,9 +204,9 @@ class _Judge:
         best = posterior.best
         if best is None:
             return None
-        same = self.graph.same_place(best)
-        if posterior.at(same) < self.options.least_probability:
+        if not self._certain(number, best):
             return None
+        same = [place for place in self.graph.same_place(best).tolist() if self._certain(number, place)]
         likely = likelihoods(self.frames[number], posterior, self.graph)
         fit = self.fit(number)
 
@@ -214,7 +214,11 @@ class _Judge:
             off = 0.0 if fit is None else self.way.distance(fit, place) / (EXACT * self._unit(fit))
             return likely.get(place, 0.0) * math.exp(-0.5 * off**2)
 
-        return int(max(same.tolist(), key=likelihood))
+        return int(max(same, key=likelihood))
+
+    def _certain(self, number: int, place: int) -> bool:
+        """Whether the rest of the run is certain that a frame shows a place or one that is the same."""
+        return self.posteriors[number].at(self.graph.same_place(place)) >= self.options.least_probability
 
     def _unit(self, fit: Fit) -> float:
         """The same-place radius or, without poses, how many frames to either side are the same place."""
