@@ -58,6 +58,7 @@ PARTS = {
     "sessions": Part("benchmarks.maps.sessions", "--datasets {data}", "data sets"),
     "day": Part("benchmarks.day", "--datasets {data} --short --json {results}/day.json", "data sets"),
     "map-to-odom": Part("benchmarks.clients.map_to_odom", "--datasets {data}", "data sets"),
+    "learning": Part("benchmarks.learning", "--datasets {data}", "data sets"),
     "alignment": Part("benchmarks.maps.aligned_maps", "--datasets {data}", "data sets"),
     "poses": Part("benchmarks.geometry.pose", "--data {data}", "data sets"),
     "spacing": Part("benchmarks.geometry.spacing", "--data {data}", "data sets"),

@@ -57,7 +57,9 @@ def fog(pixels: Pixels, place: int, run: int) -> Pixels:
     random, weather = _generator(5, run, place), _generator(6, run)
     height, width = pixels.shape[:2]
     depth = 1 - np.abs(np.linspace(-1, 1, height))[:, None]  # most in the middle, where the view is deepest
-    share = np.clip(0.45 + 0.1 * weather.random() + 0.35 * depth + 0.1 * _cloud(pixels.shape, random, width / 8), 0, 0.92)
+    share = np.clip(
+        0.45 + 0.1 * weather.random() + 0.35 * depth + 0.1 * _cloud(pixels.shape, random, width / 8), 0, 0.92
+    )
     blurred = cv2.GaussianBlur(pixels, (0, 0), width / 120).astype(np.float64)
     return _finished(blurred * (1 - share[..., None]) + 200 * share[..., None], random)
 
@@ -68,12 +70,16 @@ def clutter(pixels: Pixels, place: int, run: int) -> Pixels:
     height, width = pixels.shape[:2]
     shown = another_look(pixels, random)
     for _ in range(3):
-        wide, tall = (int(size * share) for size, share in zip((width, height), season.uniform(0.25, 0.42, 2), strict=True))
+        wide, tall = (
+            int(size * share) for size, share in zip((width, height), season.uniform(0.25, 0.42, 2), strict=True)
+        )
         left, top = int(season.integers(0, width - wide)), height - tall - int(season.integers(0, height // 3))
         colour = season.uniform(30, 200, 3)
         block = np.full((tall, wide, 3), colour) * (1 + 0.25 * _cloud((tall, wide), season, wide / 6))[..., None]
         for stripe in range(1, 4):
-            cv2.line(block, (0, stripe * tall // 4), (wide, stripe * tall // 4), (0.6 * colour).tolist(), max(1, tall // 20))
+            cv2.line(
+                block, (0, stripe * tall // 4), (wide, stripe * tall // 4), (0.6 * colour).tolist(), max(1, tall // 20)
+            )
         shown[top : top + tall, left : left + wide] = np.clip(block, 0, 255).astype(np.uint8)
     return shown
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.learning.living_map import EncodedPicture, LivingMap, Recognized
 from benchmarks.learning.worlds import RobotWorld
-from benchmarks.learning.year import Moment, Plan
+from benchmarks.learning.year import RunMoment, RunPlan
 from core.belief import PlaceGraph, Run, RunOptions, Step, View
 from core.learning import (
     Lesson,
@@ -28,6 +28,7 @@ from core.learning import (
     services,
 )
 from core.learning.anchors import place_of
+from core.learning.proposals import Refusal
 
 Mode = Literal["off", "propose", "auto"]
 """The map stays; a perfect reviewer takes every right proposal; or what independent evidence agrees on is taken."""
@@ -40,18 +41,22 @@ REMEMBERED = 8
 class EncodedRun:
     """A run with its encoded frames, which all ways of learning share."""
 
-    plan: Plan
-    moments: Sequence[Moment]
+    plan: RunPlan
+    moments: Sequence[RunMoment]
     frames: Sequence[EncodedPicture]
     views: Sequence[View]
 
 
 @dataclass
-class Tally:
+class RunTally:
     """The figures of one run, or of several.
 
     frames: those in the map; right, wrong: recognized ones, wrong also of frames from elsewhere.
-    proposed, proposed_wrong, taken, taken_wrong, withdrawn, wrong_left: looks; the last are in the map.
+    proposed, proposed_wrong, taken, taken_wrong, withdrawn: looks.
+    attackers: looks that were taken of the attacker's frames.
+    rows: of the map, living ones.
+    milliseconds: for the answer to a frame, without its encoding.
+    contradiction, refused: as of :class:`core.learning.Lesson`.
     """
 
     frames: int = 0
@@ -63,11 +68,10 @@ class Tally:
     taken_wrong: int = 0
     attackers: int = 0
     withdrawn: int = 0
-    wrong_left: int = 0
     rows: int = 0
     milliseconds: float = 0.0
     contradiction: str | None = None
-    refused: dict[str, int] = field(default_factory=dict)
+    refused: Mapping[Refusal, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +107,11 @@ class _Learnt:
 class Learner:
     """One world's map in one mode."""
 
-    def __init__(self, world: RobotWorld, map_: LivingMap, first: Sequence[EncodedPicture], mode: Mode) -> None:
+    def __init__(
+        self, world: RobotWorld, map_: LivingMap, first: Sequence[EncodedPicture], mode: Mode, any_score: bool = False
+    ) -> None:
+        """``any_score``: looks are believed from any score on."""
+        self.any_score = any_score
         self.world, self.map, self.mode, self.first = world, map_, mode, first
         self.base = len(map_)
         self.waiting: list[_Waiting] = []
@@ -111,9 +119,9 @@ class Learner:
         self.runs = 0
         self._between: dict[tuple[tuple[str, int], tuple[str, int]], float] = {}
 
-    def live(self, run: EncodedRun) -> Tally:
+    def live(self, run: EncodedRun) -> RunTally:
         """Answer a run, then learn from it."""
-        tally = Tally()
+        tally = RunTally()
         began = time.perf_counter()
         answers = self.map.recognize(run.frames)
         tally.milliseconds = 1e3 * (time.perf_counter() - began) / len(answers)
@@ -122,23 +130,28 @@ class Learner:
             graph = self.map.graph()
             frames = run_frames(run, answers, graph)
             lesson = lesson_of(frames, graph)
-            tally.contradiction, tally.refused = lesson.contradiction, dict(lesson.refused)
+            tally.contradiction, tally.refused = lesson.contradiction, lesson.refused
             self._observe(lesson, frames, graph, tally)
             self._propose(lesson, run, answers, Trail.of(frames), graph, tally)
             self._take(graph, tally)
             self._rehearse(lesson, run, tally)
         self.runs += 1
         tally.rows = len(self.map)
-        tally.wrong_left = sum(not one.right for one in self.learnt.values())
         return tally
 
-    def examine(self, run: EncodedRun) -> Tally:
+    def examine(self, run: EncodedRun) -> RunTally:
         """Answer a run and learn nothing."""
-        tally = Tally()
+        tally = RunTally()
         self._count(run, self.map.recognize(run.frames), tally)
         return tally
 
-    def _count(self, run: EncodedRun, answers: Sequence[Recognized], tally: Tally) -> None:
+    def left(self) -> dict[str, int]:
+        """The numbers of its rows, learnt looks, those of wrong places, and those of an attacker's frames."""
+        looks = self.learnt.values()
+        wrong, attackers = sum(not one.right for one in looks), sum(one.attacker for one in looks)
+        return {"rows": len(self.map), "looks": len(looks), "wrong": wrong, "attackers": attackers}
+
+    def _count(self, run: EncodedRun, answers: Sequence[Recognized], tally: RunTally) -> None:
         for moment, answer in zip(run.moments, answers, strict=True):
             tally.frames += moment.at is not None
             if answer.judgement.verdict == "recognized":
@@ -146,10 +159,10 @@ class Learner:
                 tally.right += right
                 tally.wrong += not right
 
-    def _shows(self, moment: Moment, place: int) -> bool:
+    def _shows(self, moment: RunMoment, place: int) -> bool:
         return moment.at is not None and bool(self.world.right[moment.at, place])
 
-    def _observe(self, lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, tally: Tally) -> None:
+    def _observe(self, lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, tally: RunTally) -> None:
         """Count how the learnt looks have served, and withdraw those that mislead."""
         looks: dict[int, list[int]] = {}
         for row, one in self.learnt.items():
@@ -159,7 +172,7 @@ class Learner:
                 self.learnt[row].served += served
         self._withdraw([row for row, one in self.learnt.items() if one.served.misleads or one.served.idle], tally)
 
-    def _withdraw(self, rows: Sequence[int], tally: Tally) -> None:
+    def _withdraw(self, rows: Sequence[int], tally: RunTally) -> None:
         for row in rows:
             self.map.withdraw_look(row)
             del self.learnt[row]
@@ -172,7 +185,7 @@ class Learner:
         answers: Sequence[Recognized],
         trail: Trail,
         graph: PlaceGraph,
-        tally: Tally,
+        tally: RunTally,
     ) -> None:
         for proposal in lesson.proposals:
             moment, place = run.moments[proposal.frame], self.map.place[proposal.row]
@@ -194,7 +207,7 @@ class Learner:
             stranger = run.plan.robot == "stranger"
             self.waiting.append(_Waiting(pending, frame, believable, least, place, right, stranger))
 
-    def _take(self, graph: PlaceGraph, tally: Tally) -> None:
+    def _take(self, graph: PlaceGraph, tally: RunTally) -> None:
         """Take the proposals that this mode takes; the others wait for a while."""
         if self.mode == "propose":
             chosen = {number for number, one in enumerate(self.waiting) if one.right}
@@ -217,7 +230,7 @@ class Learner:
             self._add(self.waiting[number], tally)
         self.waiting = left
 
-    def _add(self, one: _Waiting, tally: Tally) -> None:
+    def _add(self, one: _Waiting, tally: RunTally) -> None:
         """Add a look to a place if it keeps it; another may go instead."""
         rows = [row for row, learnt in self.learnt.items() if learnt.place == one.place]
         looks = [self.first[one.place], *(self.learnt[row].frame for row in rows), one.frame]
@@ -229,13 +242,13 @@ class Learner:
                 self.map.withdraw_look(row)
                 del self.learnt[row]
         if len(looks) - 1 in staying:
-            row = self.map.add_look(one.place, one.frame, one.least)
+            row = self.map.add_look(one.place, one.frame, -np.inf if self.any_score else one.least)
             self.learnt[row] = _Learnt(one.frame, one.place, one.right, one.attacker, one.believable)
             tally.taken += 1
             tally.taken_wrong += not one.right
             tally.attackers += one.attacker
 
-    def _rehearse(self, lesson: Lesson, run: EncodedRun, tally: Tally) -> None:
+    def _rehearse(self, lesson: Lesson, run: EncodedRun, tally: RunTally) -> None:
         """Ask the run again, and withdraw new looks that win frames which the run is certain to be elsewhere."""
         if not tally.taken:
             return

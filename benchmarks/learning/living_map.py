@@ -41,7 +41,7 @@ class EncodedPicture(NamedTuple):
 
 
 class Recognized(NamedTuple):
-    """The answer to one frame: its judgement, the best row, its evidence for a belief, and the score of a believable place."""
+    """The answer to one frame: its judgement, the best row, its evidence, and the score of a believable place."""
 
     judgement: Judgement
     row: int
@@ -65,7 +65,11 @@ class LivingMap:
     """
 
     def __init__(
-        self, encoder: Encoder, frames: Sequence[EncodedPicture], positions: NDArray[np.float64], headings: NDArray[np.float64]
+        self,
+        encoder: Encoder,
+        frames: Sequence[EncodedPicture],
+        positions: NDArray[np.float64],
+        headings: NDArray[np.float64],
     ) -> None:
         """``positions``: metres, float64 [n, 2]; ``headings``: radians counter-clockwise from +x, float64 [n]."""
         self.encoder = encoder
@@ -143,8 +147,14 @@ class LivingMap:
         found = examine(scores[order], listed, SAME_PLACE, *stage)
         ranked = rows[found.order]
         candidates = Candidates(
-            ranked, found.scores, scores[order][found.order], listed.take(found.order), found.examined, None,
-            found.scores, len(living),
+            ranked,
+            found.scores,
+            scores[order][found.order],
+            listed.take(found.order),
+            found.examined,
+            None,
+            found.scores,
+            len(living),
         ).take(np.flatnonzero(found.scores >= np.array(self.least)[ranked]))
         calibration = self.encoder.calibration
 
@@ -154,7 +164,12 @@ class LivingMap:
                 return likeness_of_first(self.encoder, self._rows.descriptors[some], self._rows.local[some])
 
             return judge(
-                candidates.ordered, candidates.whereabouts, calibration, SAME_PLACE, candidates.examined, likeness,
+                candidates.ordered,
+                candidates.whereabouts,
+                calibration,
+                SAME_PLACE,
+                candidates.examined,
+                likeness,
                 candidates.geometry,
             )
 
@@ -162,7 +177,10 @@ class LivingMap:
         if frame.keypoints is not None:
             keypoints = frame.keypoints
             candidates, judgement, _ = verify_candidates(
-                candidates, judged, Verifier("auto", lambda: keypoints), calibration,
+                candidates,
+                judged,
+                Verifier("auto", lambda: keypoints),
+                calibration,
                 RowComparison(self.encoder, frame, self._rows.local, self._rows.glances, self.keypoints),
             )
         seen = evidence(
@@ -181,9 +199,7 @@ class LivingMap:
         _, believable = believable_score(
             falling, int(compared.sum()), calibration, candidates.scores[apart].astype(np.float64)
         )
-        return Recognized(
-            judgement, int(candidates.rows[0]), sighted(seen, candidates.rows, judgement), believable
-        )
+        return Recognized(judgement, int(candidates.rows[0]), sighted(seen, candidates.rows, judgement), believable)
 
     def scores_between(self, one: EncodedPicture, others: Sequence[EncodedPicture]) -> NDArray[np.float32]:
         """The scores of both stages of a frame against others, float32 [k]."""

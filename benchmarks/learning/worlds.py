@@ -36,7 +36,7 @@ class RobotWorld:
 
     first: their pictures on the day of the map.
     later: returns the picture at a place in a condition and a run; by their numbers.
-    metres: float64 [k], where along the way each later picture was taken; those of a robot that goes on.
+    metres: float [k], where along the way each later picture was taken; those of a robot that goes on.
     right: bool [k, n], the places of the map that a later picture shows.
     conditions: those that this world has, the one of the map first.
     strangers: pictures of another building or street.
@@ -47,7 +47,7 @@ class RobotWorld:
     name: str
     first: Sequence[Pixels]
     later: Callable[[int, str, int], Pixels]
-    metres: NDArray[np.float64]
+    metres: NDArray[np.floating]
     right: NDArray[np.bool_]
     conditions: tuple[str, ...]
     strangers: Sequence[Pixels]
@@ -84,7 +84,9 @@ def cameras(datasets: Path) -> RobotWorld:
     """Fixed cameras by day and by night."""
     folders = [one for one in sorted((datasets / "train/day_night").iterdir()) if one.is_dir()]
     folders = [one for one in folders if one.name not in MIXED_CAMERAS]
-    shown = [(list(map(read, sorted(one.glob("day_*")))), list(map(read, sorted(one.glob("night_*"))))) for one in folders]
+    shown = [
+        (list(map(read, sorted(one.glob("day_*")))), list(map(read, sorted(one.glob("night_*"))))) for one in folders
+    ]
     for folder in sorted(one for one in (datasets / "eval/webcams").iterdir() if one.is_dir()):
         pictures = [read(path) for path in find_photographs(folder)]
         shown.append(
@@ -97,9 +99,7 @@ def cameras(datasets: Path) -> RobotWorld:
         height, width = pixels.shape[:2]
         left = round((1 - WINDOW) * width * (number % CUTS) / (CUTS - 1))
         top = round((1 - WINDOW) * height * 0.6)
-        return np.ascontiguousarray(
-            pixels[top : top + round(WINDOW * height), left : left + round(WINDOW * width)]
-        )
+        return np.ascontiguousarray(pixels[top : top + round(WINDOW * height), left : left + round(WINDOW * width)])
 
     def later(number: int, condition: str, run: int) -> Pixels:
         random = np.random.default_rng((9, run, number // CUTS, number % 2))
@@ -114,7 +114,12 @@ def cameras(datasets: Path) -> RobotWorld:
     return RobotWorld("cameras", first, later, METRES * places, right, ("day", "night"), strangers)
 
 
-def nordland(datasets: Path, places: int = 220, step: int = 6, start: int = 300) -> RobotWorld:
+def _sized(pixels: Pixels, interpolation: int = cv2.INTER_CUBIC) -> Pixels:
+    """A picture at the size at which nordland's are drawn in other conditions."""
+    return np.asarray(cv2.resize(pixels, (128, 64), interpolation=interpolation), np.uint8)
+
+
+def nordland(datasets: Path, places: int = 150, step: int = 6, start: int = 300) -> RobotWorld:
     """A railway; a place is ``step`` frames from the next, and two to either side are tolerated, fewer than usual."""
     folder = datasets / "eval/nordland_tiny"
     numbers = start + step * np.arange(places)
@@ -126,13 +131,10 @@ def nordland(datasets: Path, places: int = 220, step: int = 6, start: int = 300)
 
     def later(number: int, condition: str, run: int) -> Pixels:
         season = winter if condition.startswith("winter") else summer
-        large = cv2.resize(picture(number, season, run), (128, 64), interpolation=cv2.INTER_CUBIC)
-        return CONDITIONS["night" if condition.endswith("night") else "day"](np.asarray(large, np.uint8), number, run)
+        drawn = CONDITIONS["night" if condition.endswith("night") else "day"]
+        return drawn(_sized(picture(number, season, run)), number, run)
 
-    first = [
-        np.asarray(cv2.resize(read(summer[one]), (128, 64), interpolation=cv2.INTER_CUBIC), np.uint8)
-        for one in numbers.tolist()
-    ]
+    first = [_sized(read(summer[one])) for one in numbers.tolist()]
     at = np.arange(places)
     return RobotWorld(
         "nordland",
@@ -141,7 +143,7 @@ def nordland(datasets: Path, places: int = 220, step: int = 6, start: int = 300)
         METRES * at,
         np.abs(at[:, None] - at) <= 2,
         ("summer", "summer night", "winter", "winter night"),
-        [cv2.resize(one, (128, 64), interpolation=cv2.INTER_AREA) for one in _strangers(datasets / "train/roads")],
+        [_sized(one, cv2.INTER_AREA) for one in _strangers(datasets / "train/roads")],
         keypoints=False,
     )
 

@@ -32,7 +32,7 @@ STOOD, DETOUR, ASIDE = 12, 10, 15.0
 ATTACKER = "attacker"
 
 
-class Moment(NamedTuple):
+class RunMoment(NamedTuple):
     """One frame of a run.
 
     at: the number of the later picture of the world that it shows; None: it shows something that the map does not have.
@@ -46,7 +46,7 @@ class Moment(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """One run of the year.
 
     number: of the run; robot: that makes it.
@@ -59,19 +59,26 @@ class Plan:
     events: tuple[str, ...] = ()
 
 
-def year(world: RobotWorld, runs: int) -> list[Plan]:
+def year(world: RobotWorld, runs: int) -> list[RunPlan]:
     """The runs of a year: conditions in turn, of two robots, with what happens to robots; and an attacker in spring."""
-    events = {1: ("stands",), 2: ("detour",), 4: ("kidnapped",), 5: ("stands", "detour"), 8: ("detour",), 10: ("stands",)}
+    events = {
+        1: ("stands",),
+        2: ("detour",),
+        4: ("kidnapped",),
+        5: ("stands", "detour"),
+        8: ("detour",),
+        10: ("stands",),
+    }
     order = world.conditions[1:] + world.conditions
     plans = []
     for number in range(runs):
         if number == min(4, runs - 1):
-            plans.append(Plan(1000 + number, order[number % len(order)], "stranger", (ATTACKER,)))
-        plans.append(Plan(number, order[number % len(order)], "AB"[number // 2 % 2], events.get(number, ())))
+            plans.append(RunPlan(1000 + number, order[number % len(order)], "stranger", (ATTACKER,)))
+        plans.append(RunPlan(number, order[number % len(order)], "AB"[number // 2 % 2], events.get(number, ())))
     return plans
 
 
-def curve(metres: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+def curve(metres: NDArray[np.floating]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     """Where the way is at some metres, x + iy, complex128 [n], and its heading there, float64 [n]."""
     along = np.arange(-50, float(metres.max(initial=0)) + 50, 0.05)
     points = np.cumsum(0.05 * np.exp(1j * BEND * np.sin(along / BEND_METRES)))
@@ -79,7 +86,9 @@ def curve(metres: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[
     return x + 1j * y, BEND * np.sin(metres / BEND_METRES)
 
 
-def _route(world: RobotWorld, plan: Plan, random: np.random.Generator) -> Iterator[tuple[int | None, complex, float]]:
+def _route(
+    world: RobotWorld, plan: RunPlan, random: np.random.Generator
+) -> Iterator[tuple[int | None, complex, float]]:
     """Where the robot truly goes: the picture, its pose as odometry without error would have it."""
     points, headings = curve(world.metres)
     count = len(points)
@@ -109,15 +118,16 @@ def _route(world: RobotWorld, plan: Plan, random: np.random.Generator) -> Iterat
             at = carried - third
             turned = complex(np.exp(1j * (heading - headings[at])))
             moved = here + 2 * complex(math.cos(heading), math.sin(heading)) - turned * points[at]
-            plan = Plan(plan.number, plan.condition, plan.robot)
+            plan = RunPlan(plan.number, plan.condition, plan.robot)
         at += 1
 
 
-def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[Moment]:
+def moments(world: RobotWorld, plan: RunPlan, seed: int = 0) -> list[RunMoment]:
     """The frames of a run, in their order."""
     random = np.random.default_rng((seed, 20, plan.number))
     attacks = ATTACKER in plan.events
-    scale, found = 1 + DRIFT * random.normal(), []
+    scale = 1 + DRIFT * random.normal()
+    found: list[RunMoment] = []
     before: tuple[complex, float] | None = None
     odometry, heading = 0j, 0.0
     first = int(random.integers(len(world.strangers)))
@@ -135,11 +145,11 @@ def moments(world: RobotWorld, plan: Plan, seed: int = 0) -> list[Moment]:
             if found and found[-1].at == at:
                 pixels = another_look(found[-1].pixels, random)
         pose = OdometryPose(float(odometry.real), float(odometry.imag), heading, origin=str(plan.number))
-        found.append(Moment(None if attacks else at, pixels, pose))
+        found.append(RunMoment(None if attacks else at, pixels, pose))
     return found
 
 
-def _stranger(world: RobotWorld, plan: Plan, number: int) -> Pixels:
+def _stranger(world: RobotWorld, plan: RunPlan, number: int) -> Pixels:
     """A picture of elsewhere, in the condition of the run."""
     pixels = world.strangers[number % len(world.strangers)]
     height, width = world.first[0].shape[:2]

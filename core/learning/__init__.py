@@ -1,9 +1,9 @@
 """Maps that learn from their robots: further looks of places, from frames whose place a whole run knows beyond doubt.
 
-``frames`` is a run with its odometry, ``smoothing`` the place of each frame by all others, ``anchors`` the frames beyond
-doubt and the way between them, ``proposals`` what a run teaches, ``corroboration`` which of it may be taken without a
-person, ``cohort`` from which score on a look is believed, ``looks`` which of them a place keeps, and ``statistics`` how
-they serve and when one is withdrawn.
+``frames`` is a run with its odometry, ``smoothing`` the place of each frame by all others, ``anchors`` the frames
+beyond doubt and the way between them, ``proposals`` what a run teaches, ``corroboration`` which of it may be taken
+without a person, ``cohort`` from which score on a look is believed, ``looks`` which of them a place keeps, and
+``statistics`` how they serve and when one is withdrawn.
 """
 
 from core.learning.cohort import Cohort, cohort_of, least_score

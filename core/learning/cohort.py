@@ -21,14 +21,17 @@ from core.judgement.verdict import Calibration
 from core.learning.frames import Trail
 
 LEAST_COHORT = 20
-"""A look with fewer frames of its run elsewhere is not learnt: nobody knows what else looks like it."""
+"""A look with fewer frames of its run elsewhere is not learnt: nobody knows what else looks like it.  It is a third of
+the places from which on a map imagines none (``background.FULL``)."""
 
 CLEAR = 1.2
 """Frames up to so many same-place radii away may show the same place, as odometry is not exact.  Those beyond show
 another."""
 
 STRICTER = 1.3
-"""A look is believed from this many times the score on at which its cohort would be left behind."""
+"""A look is believed from this many times the score on at which its cohort would be left behind.  After a year on
+corridor, of 444 frames in four conditions 325, 383 and 358 are recognized rightly with 1, 1.15 and 1.3, and 48, 27 and
+9 wrongly; without looks it is 184 and 11."""
 
 
 @dataclass(frozen=True)

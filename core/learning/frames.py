@@ -10,8 +10,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.belief import NOTHING, Evidence, Odometry, OdometryPose, PlaceGraph, Sight, Step, Stride, freshness
-from core.belief.odometry import motion_between
+from core.belief import (
+    NOTHING,
+    Evidence,
+    Odometry,
+    OdometryPose,
+    PlaceGraph,
+    Sight,
+    Step,
+    Stride,
+    freshness,
+    motion_between,
+)
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Verdict
 from core.learning.smoothing import WeighedFrame

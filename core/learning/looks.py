@@ -1,10 +1,10 @@
 """Which looks a place keeps: those that cover the conditions in which it was seen, with few repetitions.
 
 The first look of a place, with which the map was made, stays.  A look that repeats another, so that either would be
-recognized by the other with a high score, adds nothing; nor does one that never helps.  Of the rest, as many stay as may:
-one after the other is chosen, each time the look that is least like all those chosen before (farthest-first traversal,
-Gonzalez, Clustering to minimize the maximum intercluster distance, 1985), so that every look that goes is like one that
-stays.
+recognized by the other with a high score, adds nothing; nor does one that never helps.  Of the rest, as many stay as
+may: one after the other is chosen, each time the look that is least like all those chosen before (farthest-first
+traversal, Gonzalez, Clustering to minimize the maximum intercluster distance, 1985), so that every look that goes is
+like one that stays.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ MOST_LOOKS = 3
 """Looks of a place, the first included."""
 
 REPEATS = 2.5
-"""A look repeats another if its score against it is this many times the score at which it would just be believed."""
+"""A look repeats another if its score against it is this many times the score at which it would just be believed; as
+``verdict.ALIKE``, and not measured here."""
 
 
 def kept(

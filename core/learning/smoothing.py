@@ -22,19 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.belief.evidence import Evidence
-from core.belief.filter import JUMP, LEAVING, RETURNING, START_UNKNOWN
+from core.belief.filter import ALIKE, JUMP, LEAVING, MANY, RETURNING, START_UNKNOWN
 from core.belief.graph import PlaceGraph
 from core.belief.motion import Masses, Pending, Step, Stride, Transition, transition
 
 LOSING = 0.02
-"""Probability, at each look, that a robot that does not see the map is not at any of its places any more.  Robots on
-detours give it a say: in maps without poses, motion alone does not tell that a robot has left the way."""
+"""Probability, at each look, that a robot that does not see the map is not at any of its places any more.  In maps
+without poses, motion alone does not tell that a robot has left the way.  On three dark runs through corridor, 77 of 345
+frames are placed with a certainty of 0.95, and with 0 there would be 91, all of them right (with a ``WEIGHT`` of 1):
+the cautious value was taken."""
 
 WEIGHT = 1.5
 """Weight of a frame's evidence, relative to that in a belief: there, less than half of what a frame says is counted, as
 every mistake is believed at once; here, the frames after it contradict it.  With 1.5, in a year of runs on corridor,
-lip6, nordland and fixed cameras (``python -m benchmarks.learning``), 5 338 of 7 423 frames are placed with a certainty of
-0.95 by the others, all of them right within two places; with 1, 5 140; with 2, 5 524, of which 4 are wrong."""
+lip6, nordland and fixed cameras (``python -m benchmarks.learning``, maps without learnt looks), 5 338 of 7 423 frames
+are placed with a certainty of 0.95 by the others, all of them right within two places; with 1, 5 140; with 2, 5 524, of
+which 4 are wrong."""
 
 STORED = 512
 """At most this many places of each frame are stored with probabilities of their own."""
@@ -42,7 +45,7 @@ STORED = 512
 
 @dataclass(frozen=True)
 class WeighedFrame:
-    """What the smoother needs of one frame.
+    """One frame, as the smoother takes it.
 
     seen: its evidence; ``NOTHING`` for a covered one.
     step: the motion since the frame before.
@@ -212,7 +215,7 @@ def _ahead(states: _States, step: Transition, share: float) -> _States:
     away = states.away
     moved = []
     for masses in (states.seeing, states.blind):
-        there, spread, gone = step.forward(masses, 0.0)
+        there, spread, gone = step.forward(masses, ALIKE * float(masses.min()) if n >= MANY else 0.0)
         total = float(masses.sum(dtype=np.float64))
         there = (1 - jump) * there + np.float32(((1 - jump) * spread + jump * total) / n)
         moved.append(there.astype(np.float32))

@@ -1,7 +1,7 @@
 """How a look has served since a map has it, by what later runs say; and when it is withdrawn.
 
-A look wins a frame if it is the frame's best match and the frame is recognized.  The run that the frame is of, which the
-frame's own evidence is left out of, may be certain of the place: the look was right, or it was wrong.
+A look wins a frame if it is the frame's best match and the frame is recognized.  The other frames of the run may be
+certain of its place: then the look was right, or it was wrong.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LookStatistics:
 def services(
     lesson: Lesson, frames: Sequence[RunFrame], graph: PlaceGraph, looks: Mapping[int, Sequence[int]] | None = None
 ) -> dict[int, LookStatistics]:
-    """What a run says about the rows of a map.
+    """How the rows of a map have served in a run.
 
     Args:
         lesson: of the run.
