@@ -79,7 +79,7 @@ class Counterparts(Protocol):
     """Reads and writes where the places of one map have counterparts.  Any thread may use it."""
 
     def handed_over(self) -> dict[int, str]:
-        """The rows of the places, and looks, whose pose was handed over, each with the id of the place that it is from."""
+        """The rows of places and looks whose pose was handed over, each with the id of the place that it comes from."""
 
     def store(self, change: Correspondence) -> None:
         """Store stations and poses, all of them or, if this raises, none.

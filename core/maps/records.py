@@ -60,8 +60,8 @@ class LearningSetting(BaseModel):
 
     mode: LearningMode = Field(
         default="off",
-        description="propose: looks are stored for review, and a person accepts them. auto: the map also takes those on "
-        "which two runs, or keypoints of the frames beside them, agree, and withdraws looks that later runs "
+        description="propose: looks are stored for review, and a person accepts them. auto: the map also takes those "
+        "on which two runs, or keypoints of the frames beside them, agree, and withdraws looks that later runs "
         "contradict. off: nothing is learnt.",
     )
     least_probability: float = Field(

@@ -399,7 +399,7 @@ def stations(connection: MapConnection) -> dict[str, PlaceStation]:
 
 
 def handed_over(connection: MapConnection) -> dict[int, str]:
-    """The rows of the places, and looks, whose pose was handed over, each with the id of the place that it is from."""
+    """The rows of places and looks whose pose was handed over, each with the id of the place that it comes from."""
     return dict(connection.execute(_HANDED_OVER))
 
 
