@@ -49,12 +49,12 @@ class ReviewSetting(BaseModel):
 
 
 LearningMode = Literal["off", "propose", "auto"]
-"""What a map learns from runs: nothing; looks wait for review, and a person accepts them; or the map takes those on
+"""Ways to learn from runs: nothing is learnt; looks wait for review, and a person accepts them; or the map takes those on
 which independent evidence agrees, and the others wait for a person."""
 
 
 class LearningSetting(BaseModel):
-    """What a map learns from the runs of its robots."""
+    """The setting by which a map learns from the runs of its robots."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -111,7 +111,7 @@ class MapSettings(BaseModel):
         default=None, description="Which frames are stored to be reviewed by people; null: none."
     )
     learning: LearningSetting = Field(
-        default=LearningSetting(), description="What the map learns from the runs of its robots."
+        default=LearningSetting(), description="How the map learns from the runs of its robots."
     )
 
 

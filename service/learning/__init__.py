@@ -1,1 +1,1 @@
-"""What a map learns from the runs of its robots: notes of a run while it lasts, and its lesson once it is over."""
+"""Learning from the runs of robots: notes of a run while it lasts, and its lesson once it is over."""

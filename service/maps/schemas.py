@@ -88,7 +88,7 @@ class MapView(BaseModel):
     )
     verification: bool = Field(description="Whether keypoints of each frame are stored, by which answers are verified.")
     review: ReviewSetting | None = Field(description="Which frames are stored to be reviewed by people; null: none.")
-    learning: LearningSetting = Field(description="What the map learns from the runs of its robots.")
+    learning: LearningSetting = Field(description="How the map learns from the runs of its robots.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
@@ -170,7 +170,7 @@ class ReviewChanges(BaseModel):
 
 
 class LearningChanges(BaseModel):
-    """What to learn from runs; null restores a default."""
+    """Changes of how a map learns from runs; null restores a default."""
 
     model_config = ConfigDict(extra="forbid")
 

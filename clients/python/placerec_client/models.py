@@ -959,7 +959,7 @@ class Layer(Model):
 
 
 class LearningSetting(Model):
-    """What a map learns from the runs of its robots."""
+    """The setting by which a map learns from the runs of its robots."""
 
     mode: Known[Literal["off", "propose", "auto"]] = "off"
     least_probability: float = 0.95

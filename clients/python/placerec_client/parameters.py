@@ -776,7 +776,7 @@ class NewMap(TypedDict, total=False):
     """Which frames are stored to be reviewed by people; null: none."""
 
     learning: LearningSetting
-    """What the map learns from the runs of its robots."""
+    """How the map learns from the runs of its robots."""
 
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
@@ -1144,7 +1144,7 @@ class CalibrationChanges(TypedDict):
 
 
 class LearningChanges(TypedDict):
-    """What to learn from runs; null restores a default."""
+    """Changes of how a map learns from runs; null restores a default."""
 
     mode: NotRequired[Literal["off", "propose", "auto"] | None]
 
@@ -1164,7 +1164,7 @@ class ReviewChanges(TypedDict):
 
 
 class LearningSetting(TypedDict):
-    """What a map learns from the runs of its robots."""
+    """The setting by which a map learns from the runs of its robots."""
 
     mode: NotRequired[Literal["off", "propose", "auto"]]
     """propose: looks are stored for review, and a person accepts them. auto: the map also takes those on which two

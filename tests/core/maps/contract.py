@@ -200,10 +200,13 @@ class StoreContract(RuleBasedStateMachine):
         look = self.model.places[place_id].looks[name] if row is not None else None
         learnt = look is not None and look.run is not None
         assert (row in self.map.learnt_looks()) == learnt
-        self.agree(
-            lambda model: (model.forget_look(place_id, name) or 1) if learnt else 0,
-            lambda lab: lab.withdraw([] if row is None else [row]),
-        )
+
+        def withdrawn(model: MapModel) -> int:
+            if learnt:
+                model.forget_look(place_id, name)
+            return int(learnt)
+
+        self.agree(withdrawn, lambda lab: lab.withdraw([] if row is None else [row]))
 
     @rule(run=st.sampled_from(["night", "snow"]))
     def forget_learnt(self, run: str) -> None:
