@@ -49,8 +49,8 @@ class ReviewSetting(BaseModel):
 
 
 LearningMode = Literal["off", "propose", "auto"]
-"""Ways to learn from runs: nothing is learnt; looks wait for review, and a person accepts them; or the map takes those on
-which independent evidence agrees, and the others wait for a person."""
+"""Ways to learn from runs: nothing is learnt; looks wait for review, and a person accepts them; or the map takes those
+on which independent evidence agrees, and the others wait for a person."""
 
 
 class LearningSetting(BaseModel):
