@@ -18,6 +18,7 @@ export default function Review({ map }) {
   const [dialog, setDialog] = useState(null);
   const close = () => setDialog(null);
   const settings = about.data?.data.review;
+  const learns = about.data && about.data.data.learning.mode !== "off";
   const keep = () => setDialog(html`<${Keeping} map=${map} read=${about.data} close=${close} changed=${about.reload} />`);
   const write = async () => {
     const told = await get(mapPath(map, "review", "labels")).catch(complain);
@@ -30,12 +31,12 @@ export default function Review({ map }) {
     <//>
     <${Shown} resource=${about}>
       ${() => html`
-        ${settings === null && html`<p class="notice">This map stores no frames for review now. ${may("admin") ? "Choose under Stored frames the answers whose frames it stores." : "Somebody with an admin key can turn that on."}</p>`}
+        ${settings === null && !learns && html`<p class="notice">This map stores no frames for review now. ${may("admin") ? "Choose under Stored frames the answers whose frames it stores." : "Somebody with an admin key can turn that on."}</p>`}
         <div class="segments" role="group" aria-label="Which frames">
           <button type="button" aria-pressed=${!labelled} onClick=${() => setLabelled(false)}>To be looked at</button>
           <button type="button" aria-pressed=${labelled} onClick=${() => setLabelled(true)}>Labelled</button>
         </div>
-        <${Frames} key=${labelled} map=${map} labelled=${labelled} keeps=${settings !== null} />
+        <${Frames} key=${labelled} map=${map} labelled=${labelled} keeps=${settings !== null || learns} />
       `}
     <//>
     ${dialog}
@@ -129,11 +130,13 @@ function Frames({ map, labelled, keeps }) {
 
 const SAME_MOMENT = 60_000;
 
-/** Undo a label: the one before is given again; a place that came into the map with it goes. */
+/** Undo a label: the one before is given again; a place or a look that came into the map with it goes. */
 async function takeBack(map, frame, { frame: labelled, enrolled }) {
   const before = frame.label;
   const body = before?.place ? { place: before.place } : before?.stranger ? { stranger: true } : { clear: true };
   await post(mapPath(map, "review", String(frame.id)), body);
+  const { place, look } = labelled.label;
+  if (look && look !== before?.look) await remove(mapPath(map, "places", place, "looks", look));
   if (enrolled && new Date(labelled.labelled_at) - new Date(enrolled.created_at) < SAME_MOMENT) {
     await remove(mapPath(map, "places", enrolled.id));
   }
@@ -166,6 +169,7 @@ function useDiscards(map, setDone) {
 function labelText(label) {
   if (label?.stranger) return "Labelled: no place of this map.";
   const id = label?.place || label?.new?.id || label?.new || "";
+  if (label?.look) return `Added to the looks of ${id}.`;
   return label?.new ? `Enrolled as ${id}.` : `Labelled as ${id}.`;
 }
 
@@ -186,8 +190,9 @@ function Tile({ map, frame, chosen, choose }) {
 
 function Labelling({ map, frame, label, discard }) {
   const { answer } = frame;
+  const { proposal } = answer;
   const candidates = answer.matches.map((one) => one.place);
-  const [against, setAgainst] = useState(candidates[0] || null);
+  const [against, setAgainst] = useState(proposal?.place || candidates[0] || null);
   const [busy, setBusy] = useState(false);
   const [dialog, setDialog] = useState(null);
   const send = async (body) => {
@@ -208,6 +213,12 @@ function Labelling({ map, frame, label, discard }) {
         <${Kept} map=${map} frame=${frame} />
         ${against ? html`<${Thumbnail} map=${map} place=${against} />` : html`<span class="picture"><span class="faint">no match</span></span>`}
       </div>
+      ${proposal && html`
+        <div class="notice stack">
+          <p>A run puts this frame at <b>${proposal.place}</b>. ${proposal.why}</p>
+          ${!frame.label && html`<div class="row"><button type="button" class="primary" disabled=${busy} onClick=${clicked({ place: proposal.place, look: true })}>Add it to the looks of ${proposal.place}</button></div>`}
+        </div>
+      `}
       <div class="spread"><h2>Which place is it?</h2><span class="faint small">The number keys choose a candidate.</span></div>
       <ol class="matches">
         ${answer.matches.map((one, number) => html`
@@ -221,6 +232,7 @@ function Labelling({ map, frame, label, discard }) {
       <div class="row">
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Other} close=${() => setDialog(null)} send=${(place) => label(frame, { place })} />`)}>Another place …</button>
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Enrol} frame=${frame} close=${() => setDialog(null)} send=${(fields) => label(frame, { new: fields })} />`)}>Enrol it …</button>
+        ${against && against !== proposal?.place && html`<button type="button" disabled=${busy} onClick=${clicked({ place: against, look: true })}>A further look of <${Name} text=${against} among=${candidates} /></button>`}
         <button type="button" disabled=${busy} onClick=${clicked({ stranger: true })}>No place of this map</button>
         <button type="button" class="danger" disabled=${busy} onClick=${(event) => event.detail < 2 && discard(frame)}>Throw away</button>
       </div>
@@ -292,11 +304,12 @@ function Keeping({ map, read, close, changed }) {
   const [verdicts, setVerdicts] = useState(present?.verdicts || []);
   const [frames, setFrames] = useState(present?.most_frames ?? 500);
   const [size, setSize] = useState(present ? Math.round(present.most_bytes / MIB) : 256);
+  const [mode, setMode] = useState(read.data.learning.mode);
   const toggle = (name) => setVerdicts((old) => (old.includes(name) ? old.filter((one) => one !== name) : [...old, name]));
   const keep = async () => {
     const review = verdicts.length ? { verdicts, most_frames: frames, most_bytes: size * MIB } : null;
-    await patch(mapPath(map), { review }, read.tag);
-    say(review ? "Such frames are stored from now on." : "No further frames are stored.");
+    await patch(mapPath(map), { review, learning: { mode } }, read.tag);
+    say(review ? "Such frames are stored from now on." : "No further frames are stored for their answers.");
     changed();
   };
   return html`
@@ -307,6 +320,13 @@ function Keeping({ map, read, close, changed }) {
         ${VERDICTS.map((one) => html`<label class="row"><input type="checkbox" checked=${verdicts.includes(one)} onChange=${() => toggle(one)} /> ${one}</label>`)}
       </fieldset>
       <div class="fields">
+        <${Field} label="What runs teach">
+          <select value=${mode} onChange=${(event) => setMode(event.target.value)}>
+            <option value="off">nothing</option>
+            <option value="propose">looks, proposed here</option>
+            <option value="auto">looks, taken where evidence agrees</option>
+          </select>
+        <//>
         <${Field} label="At most, frames"><input type="number" min="1" step="1" value=${frames} onInput=${(event) => setFrames(event.target.valueAsNumber)} /><//>
         <${Field} label="At most, MiB"><input type="number" min="1" step="1" value=${size} onInput=${(event) => setSize(event.target.valueAsNumber)} /><//>
       </div>

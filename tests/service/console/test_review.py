@@ -276,3 +276,28 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     with page.expect_download() as saved:
         dialog.get_by_role("button", name="Export").click()
     assert Path(saved.value.path()).stat().st_size > 10_000
+
+
+def test_a_frame_becomes_a_look_and_is_taken_back(admin: Operator, keyed: Server, doubtful: str) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    panel.get_by_role("button", name="A further look of").click()  # the newest: a frame of no place
+    page.get_by_text("Added to the looks of").wait_for()
+    (look,) = keyed.client.get(f"/v1/maps/{doubtful}/looks").json()["items"]
+    page.get_by_role("button", name="Undo").click()
+    assert eventually(lambda: keyed.client.get(f"/v1/maps/{doubtful}/looks").json()["items"] == [])
+    assert look["place"] in {f"p{number}" for number in range(4)} and look["run"] is None
+    left = keyed.client.get(f"/v1/maps/{doubtful}/review", params={"labelled": "true"}).json()["items"]
+    assert left == []
+
+
+def test_an_admin_says_what_runs_teach(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("teaching")
+    page = admin.go("maps/teaching/review")
+    page.get_by_role("button", name="Stored frames").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("What runs teach").select_option("propose")
+    dialog.get_by_role("button", name="Save").click()
+    page.get_by_text("This map stores no frames for review now.").wait_for(state="detached")
+    read = keyed.client.get("/v1/maps/teaching").json()
+    assert read["learning"]["mode"] == "propose" and read["review"] is None

@@ -26,6 +26,7 @@ OPERATIONS = {
     "rebuild_map", "fill_keypoints",
     "export_map", "import_map",
     "list_review", "see_review_picture", "label_frame", "export_labels",
+    "add_look", "list_looks", "list_all_looks", "see_look", "delete_look", "delete_learnt_looks",
     "list_jobs", "read_job", "follow_job", "cancel_job",
     "encode", "regions", "match", "list_encoders",
     "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "delete_key", "read_audit", "read_service",
