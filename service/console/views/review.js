@@ -215,8 +215,8 @@ function Labelling({ map, frame, label, discard }) {
       </div>
       ${proposal && html`
         <div class="notice stack">
-          <p>A run puts this frame at <b>${proposal.place}</b>. ${proposal.why}</p>
-          ${!frame.label && html`<div class="row"><button type="button" class="primary" disabled=${busy} onClick=${clicked({ place: proposal.place, look: true })}>Add it to the looks of ${proposal.place}</button></div>`}
+          <p>A run puts this frame at <a class="name" href=${href("maps", map, "places", proposal.place)}><${Name} text=${proposal.place} /></a>. ${proposal.why}</p>
+          ${!frame.label && html`<div class="row"><button type="button" class="primary narrow" disabled=${busy} onClick=${clicked({ place: proposal.place, look: true })}>Add it to the looks of <${Name} text=${proposal.place} /></button></div>`}
         </div>
       `}
       <div class="spread"><h2>Which place is it?</h2><span class="faint small">The number keys choose a candidate.</span></div>
@@ -232,7 +232,7 @@ function Labelling({ map, frame, label, discard }) {
       <div class="row">
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Other} close=${() => setDialog(null)} send=${(place) => label(frame, { place })} />`)}>Another place …</button>
         <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Enrol} frame=${frame} close=${() => setDialog(null)} send=${(fields) => label(frame, { new: fields })} />`)}>Enrol it …</button>
-        ${against && against !== proposal?.place && html`<button type="button" disabled=${busy} onClick=${clicked({ place: against, look: true })}>A further look of <${Name} text=${against} among=${candidates} /></button>`}
+        ${against && against !== proposal?.place && html`<button type="button" class="narrow" disabled=${busy} onClick=${clicked({ place: against, look: true })}>A further look of <${Name} text=${against} among=${candidates} /></button>`}
         <button type="button" disabled=${busy} onClick=${clicked({ stranger: true })}>No place of this map</button>
         <button type="button" class="danger" disabled=${busy} onClick=${(event) => event.detail < 2 && discard(frame)}>Throw away</button>
       </div>

@@ -157,6 +157,7 @@ def tour(client: Client, folder: Path) -> None:
     assert client.match(jpeg(1), scene(1)).score > 0.5 and client.draw_match(jpeg(1), jpeg(2)).startswith(b"\x89PNG")
     session(lab)
     labelling(lab)
+    looks(lab)
     assert lab.answers(limit=5).items and lab.places.matches("p3").items
     assert lab.calibration(threshold=0.5).map == "tour"
     report = lab.calibrate("frames", frames=calibration_frames(), labels=LABELS, target=TARGET, dry_run=True)
@@ -182,6 +183,16 @@ def labelling(lab: Any) -> None:
     assert lab.review.label(kept[0].id, place="p3").frame is not None
     assert [one.place for one in lab.review.labels()] == ["p3"]
     assert lab.review.label(kept[0].id, discard=True).discarded
+
+
+def looks(lab: Any) -> None:
+    added = lab.places.add_look("p4", jpeg(71), timestamp="2026-11-20T22:00:00Z")
+    assert (added.change, added.place, added.run) == ("created", "p4", None)
+    assert [one.name for one in lab.places.looks("p4")] == [one.name for one in lab.places.all_looks()] == [added.name]
+    assert lab.places.look_thumbnail("p4", added.name).startswith(b"\xff\xd8")
+    assert lab.places.delete_learnt_looks("no run").looks == 0
+    lab.places.delete_look("p4", added.name)
+    assert list(lab.places.looks("p4")) == []
 
 
 def session(lab: Any) -> None:

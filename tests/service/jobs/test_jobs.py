@@ -88,14 +88,17 @@ def test_jobs_take_turns_and_the_queue_is_bounded(running: Running, tmp_path: Pa
         first = jobs.submit("gate", None, gate)
         assert gate.begun.wait(60)
         waiting = [jobs.submit("note", None, noting(number)) for number in range(2)]
-        for refused in (jobs.check_room, lambda: jobs.submit("note", None, lambda _: {})):
+        refusals: list[Callable[[], object]] = [lambda: jobs.submit("note", None, lambda _: {})]
+        if jobs._peers.alone:  # services that share a ledger count its jobs now and then
+            refusals.append(jobs.check_room)
+        for refused in refusals:
             with pytest.raises(JobQueueFull):
                 refused()
         assert [jobs.get(job.id).state for job in (first, *waiting)] == ["running", "queued", "queued"]
         token = ASKER.set(Asker("robot", "key-of-another"))
         jobs.check_room()
         waiting.append(jobs.submit("note", None, noting(2)))
-        for refused in (jobs.check_room, lambda: jobs.submit("note", None, lambda _: {})):
+        for refused in refusals:
             with pytest.raises(JobQueueFull):  # it has its half
                 refused()
         ASKER.reset(token)
