@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from core.belief import PlaceGraph, evidence_of
 from core.belief.evidence import believable_score
-from core.errors import PlacerecError, RepeatedLook, TooManyLooks, UnknownFrame, UnknownPlace
+from core.errors import PlacerecError, RepeatedLook, StorageFailure, TooManyLooks, UnknownFrame, UnknownPlace
 from core.judgement.background import GUARD_FACTOR
 from core.learning import (
     Lesson,
@@ -40,8 +40,8 @@ from core.recognition.recognition import describe, frame_digest, locate
 from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of, rank_places
 from service.engine.encoders import Encoded
 
-Encode = Callable[[Sequence[bytes]], list[Encoded | Exception]]
-"""Encodes files with their keypoints, after the requests that wait."""
+Encode = Callable[[Sequence[bytes], bool], list[Encoded | Exception]]
+"""Encodes files with their keypoints, after the requests that wait; with their pixels, or without."""
 
 PAGE = 100
 """Frames of review that are read at a time."""
@@ -97,7 +97,7 @@ class Adoption:
 
     def __init__(self, map_: Map, encoder: Encoder, graph: PlaceGraph, encode: Encode, most_looks: int) -> None:
         self.map, self.encoder, self.graph, self.encode, self.most_looks = map_, encoder, graph, encode, most_looks
-        self._encoded: dict[int, Encoded | None] = {}  # of frames under review, by number
+        self._encoded: dict[int, Encoding | None] = {}  # of frames under review, by number
 
     # How looks have served
 
@@ -171,28 +171,32 @@ class Adoption:
                 with suppress(PlacerecError):
                     data.append(self.map.review.picture(one.number))
                     missing.append(one.number)
-        for number, outcome in zip(missing, self.encode(data) if data else [], strict=True):
+        for number, outcome in zip(missing, self.encode(data, False) if data else [], strict=True):
             if not isinstance(outcome, Exception) and len(outcome.encoding.regions):
-                self._encoded[number] = outcome
-        return [None if (made := self._encoded[one.number]) is None else made.encoding for one in frames]
+                self._encoded[number] = outcome.encoding
+        return [self._encoded[one.number] for one in frames]
 
     def _adopt(self, one: WaitingFrame, row: int, grounds: str) -> bool:
         """Make a proposal a look of its place, unless the place keeps others instead."""
-        self._encodings([one])
-        if (made := self._encoded[one.number]) is None:
+        try:
+            data = self.map.review.picture(one.number)
+        except StorageFailure:  # it is damaged, and waits for a person
+            return False
+        (made,) = self.encode([data], True)
+        if isinstance(made, Exception) or not len(made.encoding.regions):
             return False
         staying, rows = self._kept(one.place, row, made.encoding)
         self.map.withdraw([rows[at - 1] for at in range(1, len(rows) + 1) if at not in staying])
         if len(rows) + 1 not in staying:
             return False
-        item = self._enrolment(one, made)
+        item = self._enrolment(one, data, made)
         self.map.enrol([item])
         said = {"label": {"place": one.place, "look": item.id.rpartition("/")[2]}, "by": f"learning ({grounds})"}
         self.map.review.label(one.number, {**said, "at": datetime.now(UTC).isoformat()})
         return True
 
-    def _enrolment(self, one: WaitingFrame, made: Encoded) -> Enrolment:
-        data, told = self.map.review.picture(one.number), one.told
+    def _enrolment(self, one: WaitingFrame, data: bytes, made: Encoded) -> Enrolment:
+        told = one.told
         camera = one.answer.get("camera")
         digest = frame_digest(self.map.review.find(one.number).digest, made.mask)
         taken = None if told["taken"] is None else datetime.fromisoformat(told["taken"])

@@ -109,8 +109,8 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     if setting.mode != "auto":
         return found
 
-    def encode(files: Sequence[bytes]) -> list[Encoded | Exception]:
-        return _encoded(engine, map_, files, camera, context, pixels=True)
+    def encode(files: Sequence[bytes], pixels: bool) -> list[Encoded | Exception]:
+        return _encoded(engine, map_, files, camera, context, pixels)
 
     adoption = Adoption(map_, encoder, graph, encode, setting.most_looks)
     withdrawn = adoption.observe(lesson, frames)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from threading import Lock
+from weakref import WeakSet
 
 from core.learning import RunFrame
 from core.maps import Map
@@ -15,6 +17,9 @@ from service.access.roles import Principal, covers
 
 MOST_FRAMES, MOST_BYTES = 600, 64 << 20
 """The most frames of a run, and bytes of their files, that are noted together; a longer run has several lessons."""
+
+MOST_OF_ALL = 256 << 20
+"""The most bytes of the files of all runs that a service has in memory, those that wait for their lesson included."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class NotedFrame:
     answer: dict[str, object]
 
 
-@dataclass
+@dataclass(eq=False)
 class RunNotes:
     """The frames of one session that are noted so far.
 
@@ -48,10 +53,17 @@ class RunNotes:
     frames: list[NotedFrame] = field(default_factory=list)
     bytes: int = 0
 
-    def add(self, noted: NotedFrame) -> None:
-        """Note the next frame."""
+    def __post_init__(self) -> None:
+        with _LOCK:
+            _NOTES.add(self)
+
+    def add(self, noted: NotedFrame) -> bool:
+        """Note the next frame; whether there was room beside the notes of all other runs."""
+        if noted_bytes() + len(noted.data) > MOST_OF_ALL:
+            return False
         self.frames.append(noted)
         self.bytes += len(noted.data)
+        return True
 
     @property
     def full(self) -> bool:
@@ -61,6 +73,16 @@ class RunNotes:
     def continued(self) -> RunNotes:
         """Empty notes of the same run."""
         return RunNotes(self.session, self.robot, self.source)
+
+
+_LOCK = Lock()
+_NOTES: WeakSet[RunNotes] = WeakSet()
+
+
+def noted_bytes() -> int:
+    """The bytes of the files of all runs that are noted, until nobody needs their notes any more."""
+    with _LOCK:
+        return sum(notes.bytes for notes in _NOTES)
 
 
 def new_notes(map_: Map, session_id: str, principal: Principal) -> RunNotes | None:

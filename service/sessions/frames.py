@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -41,6 +42,8 @@ from service.sessions.schemas import (
 from service.sessions.session import Session
 from service.sessions.sessions import SessionMoved, Sessions, alive_rows
 from service.worker_threads import in_thread
+
+log = logging.getLogger("placerec.sessions")
 
 
 async def process_frame(
@@ -238,8 +241,10 @@ def _note(
         seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None, options.odometry_pose(),
         run.sight,
     )  # fmt: skip
-    notes.add(NotedFrame(frame, data, options.timestamp, given.for_review(given.event(map_.record.id))))
-    if notes.full:
+    if not notes.add(NotedFrame(frame, data, options.timestamp, given.for_review(given.event(map_.record.id)))):
+        log.warning("session %s teaches its map nothing: the notes of runs have no room", session.id)
+        session.notes = None
+    elif notes.full:
         session.notes = notes.continued()
         sessions.on_run(session, notes)
 
