@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.belief import PlaceGraph, evidence_of
+from core.belief import PlaceGraph, evidence_of, place_graph
 from core.belief.evidence import believable_score
 from core.errors import PlacerecError, RepeatedLook, StorageFailure, TooManyLooks, UnknownFrame, UnknownPlace
 from core.judgement.background import GUARD_FACTOR
@@ -116,7 +116,8 @@ class Adoption:
     def rehearse(self, lesson: Lesson, frames: Sequence[RunFrame], encoded: Sequence[Encoded | Exception]) -> int:
         """Ask a run again, and withdraw looks that win frames which the run is certain to be elsewhere."""
         judged = list(self._judged(frames, encoded))
-        found, learnt = services(lesson, judged, self.graph), self.map.learnt_looks()
+        graph, learnt = graph_of(self.map), self.map.learnt_looks()  # with the looks that were taken since
+        found = services(lesson, judged, graph)
         return self.map.withdraw([row for row, one in found.items() if row in learnt and one.wrong > one.right])
 
     def _judged(self, frames: Sequence[RunFrame], encoded: Sequence[Encoded | Exception]) -> Iterator[RunFrame]:
@@ -211,11 +212,9 @@ class Adoption:
 
         Number 0 is its first look, then come the learnt ones, and the new one last.
         """
-        learnt = {
-            at: look
-            for at, look in self.map.learnt_looks().items()
-            if place_of(self.graph, at) == place_of(self.graph, row)
-        }
+        looks = [look for look in self.map.looks(place) if look.run is not None]
+        found = zip(self.map.rows_of([look_address(place, look.name) for look in looks]), looks, strict=True)
+        learnt = {at: look for at, look in found if at is not None}
         rows, snapshot = list(learnt), self.map.snapshot()
         stored = np.array([row, *rows], np.int64)
         descriptors = np.concatenate([snapshot.descriptors_at(stored), encoding.descriptor[np.newaxis]])
@@ -234,6 +233,12 @@ class Adoption:
         falling = np.sort(found.scores[compared].astype(np.float64))[::-1]
         calibration = calibration_of(self.map, self.encoder)
         return believable_score(falling, int(compared.sum()), calibration, found.scores[apart].astype(np.float64))[1]
+
+
+def graph_of(map_: Map) -> PlaceGraph:
+    """The graph of all places that a map has now."""
+    snapshot = map_.snapshot()
+    return place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood_of(map_))
 
 
 def served(look: Look) -> LookStatistics:

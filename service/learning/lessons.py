@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.belief import PlaceGraph, place_graph
+from core.belief import PlaceGraph
 from core.errors import PlacerecError, UnknownCamera
 from core.frames.masks import Mask
 from core.learning import LessonOptions, Proposal, Trail, cohort_of, least_score, lesson_of
@@ -26,14 +26,14 @@ from core.maps import Map, ReviewSetting
 from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
 from core.method.encoder import Encoder
-from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of
+from core.recognition.stages import calibration_of, likeness_of_first
 from service.access.audit import ASKER
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.jobs.context import JobContext, run_after_requests
 from service.jobs.jobs import Jobs
-from service.learning.adoption import Adoption
+from service.learning.adoption import Adoption, graph_of
 from service.learning.run_notes import RunNotes
 from service.places.place_events import tell_change
 
@@ -90,8 +90,7 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
         replace(noted.frame, keypoints=None if isinstance(one, Exception) else one.keypoints)
         for noted, one in zip(notes.frames, encoded, strict=True)
     ]
-    snapshot = map_.snapshot()
-    graph = place_graph(snapshot.whereabouts, map_.scope().living_rows(), snapshot.rows, neighborhood_of(map_))
+    graph = graph_of(map_)
     lesson = lesson_of(frames, graph, LessonOptions(least_probability=setting.least_probability))
     scores = _Scores(encoder, encoded)
     count = 0
