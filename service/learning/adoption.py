@@ -40,8 +40,8 @@ from core.recognition.recognition import describe, frame_digest, locate
 from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of, rank_places
 from service.engine.encoders import Encoded
 
-Encode = Callable[[Sequence[bytes], bool], list[Encoded | Exception]]
-"""Encodes files with their keypoints, after the requests that wait; with their pixels, or without."""
+Encode = Callable[[Sequence[bytes], Sequence[str | None], bool], list[Encoded | Exception]]
+"""Encodes files of cameras with their keypoints, after the requests that wait; with their pixels, or without."""
 
 PAGE = 100
 """Frames of review that are read at a time."""
@@ -165,14 +165,15 @@ class Adoption:
 
     def _encodings(self, frames: Sequence[WaitingFrame]) -> list[Encoding | None]:
         """The encodings of frames under review; None for one that is gone or damaged."""
-        missing, data = [], []
+        missing, data, cameras = [], [], []
         for one in frames:
             if one.number not in self._encoded:
                 self._encoded[one.number] = None
                 with suppress(PlacerecError):
                     data.append(self.map.review.picture(one.number))
                     missing.append(one.number)
-        for number, outcome in zip(missing, self.encode(data, False) if data else [], strict=True):
+                    cameras.append(one.answer.get("camera"))
+        for number, outcome in zip(missing, self.encode(data, cameras, False) if data else [], strict=True):
             if not isinstance(outcome, Exception) and len(outcome.encoding.regions):
                 self._encoded[number] = outcome.encoding
         return [self._encoded[one.number] for one in frames]
@@ -183,15 +184,15 @@ class Adoption:
             data = self.map.review.picture(one.number)
         except StorageFailure:  # it is damaged, and waits for a person
             return False
-        (made,) = self.encode([data], True)
+        (made,) = self.encode([data], [one.answer.get("camera")], True)
         if isinstance(made, Exception) or not len(made.encoding.regions):
             return False
         staying, rows = self._kept(one.place, row, made.encoding)
-        self.map.withdraw([rows[at - 1] for at in range(1, len(rows) + 1) if at not in staying])
-        if len(rows) + 1 not in staying:
-            return False
+        if len(rows) + 1 not in staying or self.map.review.find(one.number).label is not None:
+            return False  # it repeats others, or a person was faster
         item = self._enrolment(one, data, made)
         self.map.enrol([item])
+        self.map.withdraw([rows[at - 1] for at in range(1, len(rows) + 1) if at not in staying])
         said = {"label": {"place": one.place, "look": item.id.rpartition("/")[2]}, "by": f"learning ({grounds})"}
         self.map.review.label(one.number, {**said, "at": datetime.now(UTC).isoformat()})
         return True

@@ -85,7 +85,7 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     if setting.mode == "off":
         return found | {"contradiction": "off"}
     encoder = engine.load_encoder(map_)
-    encoded = _encoded(engine, map_, [noted.data for noted in notes.frames], camera, context)
+    encoded = _encoded(engine, map_, [noted.data for noted in notes.frames], [camera] * len(notes.frames), context)
     frames = [
         replace(noted.frame, keypoints=None if isinstance(one, Exception) else one.keypoints)
         for noted, one in zip(notes.frames, encoded, strict=True)
@@ -108,8 +108,8 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     if setting.mode != "auto":
         return found
 
-    def encode(files: Sequence[bytes], pixels: bool) -> list[Encoded | Exception]:
-        return _encoded(engine, map_, files, camera, context, pixels)
+    def encode(files: Sequence[bytes], cameras: Sequence[str | None], pixels: bool) -> list[Encoded | Exception]:
+        return _encoded(engine, map_, files, cameras, context, pixels)
 
     adoption = Adoption(map_, encoder, graph, encode, setting.most_looks)
     withdrawn = adoption.observe(lesson, frames)
@@ -150,24 +150,27 @@ def _encoded(
     engine: Engine,
     map_: Map,
     files: Sequence[bytes],
-    camera: str | None,
+    cameras: Sequence[str | None],
     context: JobContext,
     pixels: bool = False,
 ) -> list[Encoded | Exception]:
     """Frames with their keypoints, encoded after the requests that wait.
 
     Args:
+        cameras: of the frames, whose masks are applied.
         pixels: keep their pixels, too.
     """
-    mask = _mask(map_, camera)
+    masks = {camera: _mask(map_, camera) for camera in set(cameras)}
     found: list[Encoded | Exception] = []
     for first in range(0, len(files), TOGETHER):
         some = files[first : first + TOGETHER]
+        ignored = [masks[camera] for camera in cameras[first : first + TOGETHER]]
 
-        async def encode(deadline: RequestDeadline, some: Sequence[bytes] = some) -> dict[int, Encoded | Exception]:
+        async def encode(
+            deadline: RequestDeadline, some: Sequence[bytes] = some, ignored: Sequence[Mask | None] = ignored
+        ) -> dict[int, Encoded | Exception]:
             made: dict[int, Encoded | Exception] = {}
-            masks = [mask] * len(some)
-            many = engine.queue.encode_many(map_.record.encoder, some, deadline, masks, keypoints=True)
+            many = engine.queue.encode_many(map_.record.encoder, some, deadline, ignored, keypoints=True)
             async with aclosing(many) as outcomes:
                 async for done in outcomes:
                     for index, one in done:

@@ -13,6 +13,9 @@ from core.method.encoder import Encoding
 from core.places import look_address
 from service.engine.encoders import Encoded
 
+LEARNING = "learning ("
+"""The beginning of who gave a label that a map has given itself; no key has such a name."""
+
 TOGETHER = 32
 """Number of frames that are read and encoded at a time."""
 
@@ -41,6 +44,8 @@ def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
     """
     found = []
     for frame in map_.review.labelled():
+        if str((frame.label or {}).get("by")).startswith(LEARNING):
+            continue  # a map is not calibrated by its own conclusions
         label = (frame.label or {})["label"]
         camera, place = frame.answer.get("camera"), label.get("place") or label.get("new")
         own = label.get("new")

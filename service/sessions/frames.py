@@ -101,7 +101,8 @@ async def process_frame(
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
         if session.notes is not None:
-            _note(sessions, session, run, map_, data, options, answered.answer, seen, GivenAnswer.of(single, queried))
+            given = GivenAnswer.of(single, queried)
+            await in_thread(_note, sessions, session, run, map_, data, options, answered.answer, seen, given)
     total = {"total": answer.milliseconds["total"]}
     follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total)
     tell_belief(engine, map_, session, answer)

@@ -169,7 +169,8 @@ class Sessions:
             held = self._held.pop(session_id, None)
             self._graphs.drop_unused(self._held.values())
         if held is not None and held.notes is not None:
-            self.on_run(held, held.notes)
+            notes, held.notes = held.notes, None
+            self.on_run(held, notes)
         return held is not None
 
     def _begun_before(self, map_: Map, session: Session) -> Session | None:

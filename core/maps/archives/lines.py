@@ -97,6 +97,8 @@ class PlaceLine(_Line):
     def _whole(self) -> Self:
         if (self.track is None) != (self.station is None):
             raise ValueError("a track needs a station, and a station a track")
+        if "/" not in self.id and (self.seen, self.run, self.least) != (None, None, None):
+            raise ValueError("a place that is no look has neither seen nor run nor least")
         if self.pose_of is not None and self.pose is None:
             raise ValueError("a place without a pose has no pose of another")
         return self
