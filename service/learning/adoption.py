@@ -160,7 +160,7 @@ class Adoption:
         first, usable = encodings[0], [at for at, other in enumerate(encodings[1:]) if other is not None]
         if first is not None and usable:
             some = [first, *(other for other in encodings[1:] if other is not None)]
-            found[usable] = _likeness(self.encoder, some)
+            found[usable] = likeness_of_encodings(self.encoder, some)
         return found
 
     def _encodings(self, frames: Sequence[WaitingFrame]) -> list[Encoding | None]:
@@ -247,7 +247,8 @@ def served(look: Look) -> LookStatistics:
     return LookStatistics(look.right, look.wrong, look.passed)
 
 
-def _likeness(encoder: Encoder, encodings: Sequence[Encoding]) -> NDArray[np.float32]:
+def likeness_of_encodings(encoder: Encoder, encodings: Sequence[Encoding]) -> NDArray[np.float32]:
+    """The scores of both stages of the first of n frames, as if it were the query, at the others; float32 [n - 1]."""
     descriptors, local = (np.stack([getattr(one, name) for one in encodings]) for name in ("descriptor", "local"))
     return likeness_of_first(encoder, descriptors, local)
 

@@ -26,14 +26,14 @@ from core.maps import Map, ReviewSetting
 from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
 from core.method.encoder import Encoder
-from core.recognition.stages import calibration_of, likeness_of_first
+from core.recognition.stages import calibration_of
 from service.access.audit import ASKER
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.jobs.context import JobContext, run_after_requests
 from service.jobs.jobs import Jobs
-from service.learning.adoption import Adoption, graph_of
+from service.learning.adoption import Adoption, graph_of, likeness_of_encodings
 from service.learning.run_notes import RunNotes
 from service.places.place_events import tell_change
 
@@ -93,10 +93,10 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     graph = graph_of(map_)
     lesson = lesson_of(frames, graph, LessonOptions(least_probability=setting.least_probability))
     scores = _Scores(encoder, encoded)
-    count = 0
+    count, trail = 0, Trail.of(frames)
     for proposal in best_of_places(lesson.proposals):
         context.check_cancelled()
-        least = _least(proposal, Trail.of(frames), graph, scores, map_, encoder)
+        least = _least(proposal, trail, graph, scores, map_, encoder)
         if least is not None and _propose(map_, notes, proposal, least):
             count += 1
     found |= {
@@ -142,8 +142,7 @@ class _Scores:
         usable = [one.encoding for one in chosen if not isinstance(one, Exception)]
         if isinstance(chosen[0], Exception) or len(usable) < 2:
             return np.zeros(0, np.float32)
-        descriptors, local = (np.stack([getattr(one, name) for one in usable]) for name in ("descriptor", "local"))
-        return likeness_of_first(self._encoder, descriptors, local)
+        return likeness_of_encodings(self._encoder, usable)
 
 
 def _encoded(

@@ -193,12 +193,11 @@ class Write(ABC):
         seen = item.fields.timestamp
         look = places.placed(
             item.id, fields, place.sequence, place.ordinal, number=self.state.numbers, revision=self._revision,
-            created_at=now, updated_at=now, track=place.track, station=place.station, pose_of=place.place.pose_of,
-            look_of=place.number, seen=None if seen is None else moment_text(seen), run=item.run,
+            created_at=now, updated_at=now, seen=None if seen is None else moment_text(seen), run=item.run,
             least=None if item.least is None else item.least + 0.0,
             **values,
         )  # fmt: skip
-        return self.insert_look(place, look)
+        return self.insert_look(place, places.as_look(look, place))
 
     def insert_look(self, place: StoredPlace, look: StoredPlace) -> StoredPlace:
         """Store a new look of a place, whose row counts already."""
