@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
 
 from benchmarks.report import report, verdict
@@ -20,7 +19,7 @@ from core.frames.preprocessing import contrast, prepare
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.vlad import aggregate
-from core.threads import cores, share_cores, use_threads
+from core.threads import allowed_threads, cores, share_cores, use_threads
 from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import jpeg, sample_frame
 from service.commands.timing.stages import better_forward, encoding_runs, medians
@@ -35,7 +34,7 @@ def one_thread_runs(passes: dict[str, Callable[[], object]]) -> dict[str, Callab
 
     def alone(run: Callable[[], object]) -> Callable[[], object]:
         def work() -> None:
-            threads = torch.get_num_threads()
+            threads = allowed_threads()
             use_threads(1)
             run()
             use_threads(threads)
@@ -49,20 +48,16 @@ def stage_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], object]]
     """Each stage of an encoding by itself, in order."""
     extractor, definition = encoder.extractor, encoder.definition
     pixels, stage = decode(data), definition.agreement
-    image = torch.from_numpy(prepare(pixels, extractor.backbone.input)[None]).permute(0, 3, 1, 2)
+    image = prepare(pixels, extractor.backbone.input)[None]
     maps = extractor.activations([pixels])[0]
     products = extractor.products(maps)
     features, words = extractor.regions(maps, products).features, encoder.centers
-
-    def forward() -> object:
-        with torch.inference_mode():
-            return extractor.forward(image)
 
     runs: dict[str, Callable[[], object]] = {
         "· decode": lambda: decode(data),
         "· resize and scale": lambda: prepare(pixels, extractor.backbone.input),
         "· contrast": lambda: contrast(pixels),
-        "· forward": forward,
+        "· forward": lambda: extractor.forward(image),
         "· products": lambda: extractor.products(maps),
         "· regions": lambda: extractor.regions(maps, products),
         "· VLAD": lambda: aggregate(features, words, definition.gamma, definition.normalization),
@@ -99,7 +94,7 @@ def main(
         for name, spent in times.items()
     ]
     figures = {"encoder": chosen.identity, "milliseconds": times, "forward": forward, "ratio": ratio}
-    report("encode", f"{chosen.name}, {torch.get_num_threads()} threads", ["", "ms", "of forward", ""], rows, figures)
+    report("encode", f"{chosen.name}, {allowed_threads()} threads", ["", "ms", "of forward", ""], rows, figures)
 
 
 if __name__ == "__main__":

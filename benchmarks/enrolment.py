@@ -17,7 +17,6 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 
 from benchmarks.frames import camera_frames
@@ -25,7 +24,7 @@ from benchmarks.process import ROOT, median, peak_memory, service
 from benchmarks.report import report, verdict
 from benchmarks.service import BATCH, SETTLE, encode_in_batches
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.threads import share_cores
+from core.threads import allowed_threads, share_cores
 from service.commands.malloc import configure_malloc
 
 LIMIT = 0.7
@@ -63,7 +62,7 @@ def main(
     starts: list[float] = []
     memory: dict[str, float] = {}
     configure_malloc()  # as the service does
-    share_cores(torch.get_num_threads())
+    share_cores(allowed_threads())
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         for name, part in (("all", data), ("one", data[:1])):

@@ -14,6 +14,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from core.threads import allowed_threads
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -40,7 +42,7 @@ def report(
         "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[0],
-        "threads": torch.get_num_threads(),
+        "threads": allowed_threads(),
         "python": platform.python_version(),
         "torch": torch.__version__,
     }

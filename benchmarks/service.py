@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 
 from benchmarks.frames import camera_frames
@@ -33,7 +32,7 @@ from core.method.encoder import Encoder
 from core.recognition.question import Query
 from core.recognition.recognition import locate
 from core.storage import Atlas, Map
-from core.threads import cores, share_cores
+from core.threads import allowed_threads, cores, share_cores
 from service.commands.load import measure
 from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import fill_map
@@ -99,7 +98,7 @@ def main(
 ) -> None:
     """Take turns and compare."""
     configure_malloc()  # as the service does
-    share_cores(threads or torch.get_num_threads())
+    share_cores(threads or allowed_threads())
     chosen = EncoderCatalogue().get(encoder)
     frames, content = camera_frames(64)
     numbers = robots or [1, 4, 16, 64]

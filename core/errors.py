@@ -112,6 +112,10 @@ class UnknownPlace(PlacerecError):
     """The map has no place with this id."""
 
 
+class UnknownStretch(PlacerecError):
+    """No stretch of this id waits for review."""
+
+
 class UnknownLook(PlacerecError):
     """The place has no look of this name."""
 
@@ -120,12 +124,20 @@ class RepeatedLook(PlacerecError):
     """The frame of a look is the one with which its place was enrolled."""
 
 
+class LookNameTaken(PlacerecError):
+    """Another frame of the place has the name of a look: the first digits of their SHA-256 are the same."""
+
+
 class TooManyLooks(PlacerecError):
     """The place has as many looks as it may have."""
 
 
 class TooManyToDelete(PlacerecError):
     """More places fulfil the conditions than may be forgotten at once; none was."""
+
+
+class MapBusy(PlacerecError):
+    """Places that are to be erased are still being read."""
 
 
 class UnknownSequence(PlacerecError):

@@ -107,6 +107,8 @@ def check_sequence(text: str) -> str:
 class Pose(BaseModel):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84).
 
+    ``z`` is in metres: in the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude.
+    There it is a statement that is handed on; distances on the Earth are those along the ground.
     ``heading`` is in degrees: counter-clockwise from +x beside x and y, clockwise from north beside
     latitude and longitude.  It is normalized to [0, 360).
     """
@@ -126,12 +128,12 @@ class Pose(BaseModel):
     def _one_frame(self) -> Pose:
         metric = (self.x is not None, self.y is not None)
         geographic = (self.latitude is not None, self.longitude is not None)
-        if any(metric) != all(metric) or (self.z is not None and not all(metric)):
+        if any(metric) != all(metric) or (self.z is not None and not any(metric + geographic)):
             raise ValueError("a pose in metres needs x and y (z is optional)")
         if any(geographic) != all(geographic):
             raise ValueError("a pose in degrees needs latitude and longitude")
         if all(metric) == all(geographic):
-            raise ValueError("a pose is either x, y[, z] or latitude, longitude")
+            raise ValueError("a pose is either x, y[, z] or latitude, longitude[, z]")
         return self
 
     def position(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""How the threads of torch, ONNX Runtime, FAISS, OpenCV and NumPy share the cores.
+"""How the threads of ONNX Runtime, torch, FAISS, OpenCV and NumPy share the cores.
 
 The forward pass of a single frame uses all cores; everything else that is done for a frame takes so little time that
 a second thread would cost more than it saves.  Of several frames, each core takes whole ones (:func:`each`).
@@ -8,20 +8,38 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, MutableMapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
-from typing import TypeVar
+from math import ceil
+from pathlib import Path
+from typing import Any, TypeVar
 
 from threadpoolctl import LibController, ThreadpoolController
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
+CGROUP = Path("/sys/fs/cgroup/cpu.max")
+"""The quota of the container in which this process runs, where Linux shows it one (cgroup 2)."""
+
 SPINS = "1000"
 """How often an idle OpenMP thread polls for work before it sleeps: about ten microseconds."""
+
+
+_shared = 0
+"""Threads that a thread may use which was told nothing; 0: one for each core."""
+
+_own = threading.local()
+
+
+def allowed_threads() -> int:
+    """With how many threads, itself among them, the calling thread may compute: what it was told, or what is shared."""
+    told: int | None = getattr(_own, "threads", None)
+    return told or _shared or cores()
 
 
 def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
@@ -35,8 +53,23 @@ def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """How many cores' time this process may use: of its processors, and of its container's quota, rounded up."""
+    return max(1, min(processors(), ceil(_quota(CGROUP))))
+
+
+def processors() -> int:
+    """On how many processors this process may run."""
     return len(os.sched_getaffinity(os.getpid())) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+@cache
+def _quota(file: Path) -> float:
+    """The cores' time that a control group allows, by its ``cpu.max``, as "150000 100000"; or more than there are."""
+    try:
+        allowed, period = file.read_text().split()
+        return int(allowed) / int(period)
+    except (OSError, ValueError, ZeroDivisionError):  # no such file, or "max"
+        return float(sys.maxsize)
 
 
 @cache
@@ -53,7 +86,7 @@ def keep_numpy_single_threaded() -> None:
 
 
 def share_cores(threads: int) -> None:
-    """Let torch and FAISS use this many threads each, and OpenCV one, in this process; ONNX Runtime follows torch.
+    """Let ONNX Runtime, torch and FAISS use this many threads each, and OpenCV one, in this process.
 
     Encoding and searching take turns, so each may use all of the cores.  OpenCV would only divide work that takes a
     tenth of a millisecond.
@@ -63,10 +96,12 @@ def share_cores(threads: int) -> None:
     """
     import cv2
     import faiss
-    import torch
 
-    torch.set_num_threads(threads)
+    global _shared
+    _shared, _own.threads = threads, None
     faiss.omp_set_num_threads(threads)
+    if (torch := _torch()) is not None:
+        torch.set_num_threads(threads)
     cv2.setNumThreads(1)
     keep_numpy_single_threaded()
 
@@ -85,22 +120,27 @@ def keep_to(number: int | None) -> None:
             os.sched_setaffinity(0, every if number is None else [every[number % len(every)]])
 
 
-@cache
-def _openmp() -> list[LibController]:
-    """The OpenMP libraries of torch and FAISS."""
-    import faiss
-    import torch
+def _torch() -> Any:
+    """torch, if something has loaded it."""
+    found = sys.modules.get("torch")
+    return found if hasattr(found, "set_num_threads") else None  # another thread may be loading it
 
-    torch.get_num_threads(), faiss.omp_get_max_threads()
+
+@cache
+def _openmp(with_torch: bool) -> list[LibController]:
+    """The OpenMP libraries of FAISS, and of torch if it is loaded."""
+    import faiss
+
+    faiss.omp_get_max_threads()
     return [library for library in ThreadpoolController().lib_controllers if library.user_api == "openmp"]
 
 
 def use_threads(threads: int) -> None:
     """Set the number of threads, itself among them, that this thread computes with from now on; others keep theirs."""
-    import torch
-
-    torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following
-    for library in _openmp():
+    _own.threads = threads
+    if (torch := _torch()) is not None:
+        torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following
+    for library in _openmp(torch is not None):
         library.set_num_threads(threads)  # OpenMP keeps this number for each thread
 
 

@@ -1,15 +1,15 @@
 """Install the packages of a lock file into the environment of the Python that runs this.
 
-    .venv/bin/python scripts/packages.py service|lab|development
+    .venv/bin/python scripts/packages.py service|bags|lab|replica|development
     .venv-ros/bin/python scripts/packages.py ros        # without torch
     .venv-cluster/bin/python scripts/packages.py cluster
     .venv/bin/python scripts/packages.py --settings     # prints uv's variables for pip's configuration
 
 uv does it in seconds; requirements/installer.lock pins it.  Where uv cannot be had, or fails, pip does it.  Both look
-where pip is configured to look.  All profiles but ``ros`` and ``cluster`` have torch.  TORCH_BACKEND names the
-build of torch: ``cpu`` (the default), ``auto`` (CUDA if this machine has a driver for it), or any other that ``uv pip
-install --torch-backend`` knows.  uv looks for it in PyTorch's own indexes; where these cannot be reached, torch is the
-build that pip's indexes have.
+where pip is configured to look.  All profiles but ``ros`` and ``cluster`` have torch.  TORCH_BACKEND names the build of
+torch: ``cpu`` (the default), ``auto`` (CUDA if this machine has a driver for it), any other that ``uv pip install
+--torch-backend`` knows, or ``none``: the service does without torch.  uv looks for it in PyTorch's own indexes; where
+these cannot be reached, torch is the build that pip's indexes have.
 """
 
 from __future__ import annotations
@@ -130,7 +130,8 @@ def main(profile: str) -> int:
     if profile == "--settings":
         print("\n".join(f"{name}={value}" for name, value in uv_settings(pip_settings()).items()))
         return 0
-    lock, torch = REQUIREMENTS / f"{profile}.lock", profile not in ("ros", "cluster")
+    lock = REQUIREMENTS / f"{profile}.lock"
+    torch = profile not in ("ros", "cluster") and os.environ.get("TORCH_BACKEND") != "none"
     try:
         try:
             with tempfile.TemporaryDirectory() as folder:

@@ -16,6 +16,7 @@ from core.method import DEFAULT_ENCODER
 PREFIX = "PLACEREC_"
 MIB = 1024 * 1024
 
+Days = Annotated[float, Field(ge=0, le=36_500, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
@@ -34,6 +35,13 @@ class Settings(BaseSettings):
         default=False,
         description="Serve other machines although no key was ever created, so that everybody who reaches the port may "
         "do everything. It has no effect once there are keys.",
+    )
+    allowed_hosts: str = Field(
+        default="",
+        max_length=4000,
+        pattern=r"^([A-Za-z0-9_.-]+(,[A-Za-z0-9_.-]+)*)?$",
+        description="Names, separated by commas, under which a service without keys is reached, besides addresses and "
+        "names without a dot (on loopback: besides localhost); requests to others are refused.",
     )
     rate_per_key: float = Field(
         default=0.0,
@@ -113,6 +121,11 @@ class Settings(BaseSettings):
         description="File with the certificate of the authority that the object store's certificate is checked by, "
         "besides those of the system.",
     )
+    backup_dir: Path | None = Field(
+        default=None,
+        description="Folder in which the service itself saves all maps, at intervals that an operator chooses; on "
+        "another disk than the maps. None by default, and no backups.",
+    )
     models_dir: Path | None = Field(
         default=None,
         description="Directory of encoders besides the packaged ones; default: 'models' beside the data directory.",
@@ -130,8 +143,8 @@ class Settings(BaseSettings):
     )
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto",
-        description="Precision of the forward pass. auto: a lower precision only if the descriptors stay the same, as "
-        "measured at the start; bfloat16, float16: refuse to start if they do not.",
+        description="Precision of the forward pass. auto: float32, and float16 on a GPU if the descriptors stay the "
+        "same, as measured at the start; bfloat16, float16: refuse to start if they do not.",
     )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu",
@@ -265,6 +278,11 @@ class Settings(BaseSettings):
     max_staged_bytes: int = Field(
         default=16384 * MIB, ge=1024, description="Most bytes on disk that wait for such jobs; then 503."
     )
+    max_recording_bytes: int = Field(
+        default=65536 * MIB,
+        ge=1024,
+        description="Most bytes on disk of bags that are uploaded or wait to be enrolled, of all together; then 503.",
+    )
     bulk_timeout: Seconds = Field(
         default=3600.0, description="Seconds within which a whole request that a job enrols has to arrive."
     )
@@ -297,6 +315,27 @@ class Settings(BaseSettings):
         le=7 * 24 * 3600,
         allow_inf_nan=False,
         description="Seconds after its last use for which an export stays, so that its download can continue.",
+    )
+    review_days: Days = Field(
+        default=90, description="Days after which a frame stored for review is discarded, with its label; 0: never."
+    )
+    picture_days: Days = Field(
+        default=0, description="Days after which the picture of a place is deleted, and the place stays; 0: never."
+    )
+    answer_days: Days = Field(
+        default=7, description="Days after which an answer is not among the latest ones any more; 0: never."
+    )
+    event_days: Days = Field(
+        default=1, description="Days after which an event is not sent any more to listeners that resume; 0: never."
+    )
+    audit_days: Days = Field(
+        default=365, description="Days after which a line of the audit trail is deleted where it is; 0: never."
+    )
+    disk_reserve_bytes: int = Field(
+        default=16 * MIB,
+        ge=0,
+        le=1 << 40,
+        description="Bytes of the disk that are held back, so that something can be deleted when it is full.",
     )
     thumbnail_side: int = Field(default=320, ge=16, le=2048, description="Longer side of a thumbnail, in pixels.")
     job_workers: int = Field(
@@ -346,6 +385,12 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
+    def _backups_have_a_folder(self) -> Settings:
+        if self.backup_dir is not None and self.backup_dir.exists() and not self.backup_dir.is_dir():
+            raise ValueError(f"{PREFIX}BACKUP_DIR is no folder: {self.backup_dir}")
+        return self
+
+    @model_validator(mode="after")
     def _database_is_an_address(self) -> Settings:
         if self.database is not None and not re.match(r"postgres(ql)?://|\w+ *=", self.database.get_secret_value()):
             raise ValueError(f"{PREFIX}DATABASE is not an address such as postgresql://placerec:password@db/placerec")
@@ -374,6 +419,10 @@ class Settings(BaseSettings):
     def models_directory(self) -> Path:
         """The directory of encoders besides the packaged ones; it need not exist."""
         return self.models_dir if self.models_dir is not None else self.data_dir.absolute().parent / "models"
+
+    def host_names(self) -> frozenset[str]:
+        """The names of ``allowed_hosts``, in lower case."""
+        return frozenset(name for name in self.allowed_hosts.lower().split(",") if name)
 
     def is_loopback(self) -> bool:
         """Whether only this machine can reach the address that the service listens on."""

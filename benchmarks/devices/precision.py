@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.report import report
 from core.frames.images import decode
 from core.method.catalogue import EncoderCatalogue
-from core.networks.forward import Precision
+from core.networks.backbone import Precision
 
 ENCODERS = ("m-region-vlad", "m-region-vlad-thesis")
 

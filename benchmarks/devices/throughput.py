@@ -24,7 +24,7 @@ from core.frames.images import decode
 from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from core.networks.forward import Device
+from core.networks.backbone import Device
 from core.threads import cores, share_cores
 from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import sample_frame

@@ -15,7 +15,6 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-import torch
 import typer
 
 from benchmarks.report import report, verdict
@@ -28,7 +27,7 @@ from core.geometry.matching import mutual_matches
 from core.geometry.verification import fitting_plane, fitting_scene, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
-from core.threads import cores, each, share_cores
+from core.threads import allowed_threads, cores, each, share_cores
 from service.commands.timing.samples import sample_frame
 
 CANDIDATES = 10
@@ -78,7 +77,7 @@ def main(
     ours, theirs = (keypoints.descriptors.astype(np.float32) for keypoints in (query, candidates[0]))
     matches = mutual_matches(ours, theirs)
     points = query.pixels()[matches[:, 0]], candidates[0].pixels()[matches[:, 1]]
-    used = torch.get_num_threads()
+    used = allowed_threads()
 
     times = measured(
         {

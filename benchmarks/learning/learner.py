@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from core.learning import (
     PendingProposal,
     RunFrame,
     Trail,
+    Witness,
     cohort_of,
     corroborated,
     kept,
@@ -32,6 +34,8 @@ from core.learning.proposals import Refusal
 
 Mode = Literal["off", "propose", "auto"]
 """The map stays; a perfect reviewer takes every right proposal; or what independent evidence agrees on is taken."""
+
+FIRST_DAY = datetime(2026, 1, 1, tzinfo=UTC)
 
 REMEMBERED = 8
 """Proposals wait for this many runs for a witness."""
@@ -190,7 +194,7 @@ class Learner:
         for proposal in lesson.proposals:
             moment, place = run.moments[proposal.frame], self.map.place[proposal.row]
             right, name = self._shows(moment, place), str(run.plan.number)
-            source = f"{run.plan.robot} {run.plan.number}"  # every run is of another day
+            source = Witness(run.plan.robot, FIRST_DAY + timedelta(days=run.plan.number))  # a run a day
             believable = answers[proposal.frame].believable
             frame = run.frames[proposal.frame]
             cohort = cohort_of(trail, proposal.frame, graph)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -25,6 +26,9 @@ from core.frames.images import decode
 from core.frames.preprocessing import Pixels
 from lab.training.photographs import MIXED_CAMERAS, find_photographs, read
 from lab.training.validation import DAYLIGHT
+
+DaysAndNights: TypeAlias = tuple[list[Pixels], list[Pixels]]
+"""The pictures of a fixed camera by day, and those by night."""
 
 CUTS, WINDOW = 8, 0.4
 """Places that are cut from each fixed camera, and the share of its picture's width and height that each shows."""
@@ -80,18 +84,35 @@ def lip6(datasets: Path) -> RobotWorld:
     return _walked(lip6_walk(datasets), _strangers(datasets / "train/camvid"))
 
 
-def cameras(datasets: Path) -> RobotWorld:
-    """Fixed cameras by day and by night."""
+def _day_night(datasets: Path) -> list[DaysAndNights]:
     folders = [one for one in sorted((datasets / "train/day_night").iterdir()) if one.is_dir()]
     folders = [one for one in folders if one.name not in MIXED_CAMERAS]
-    shown = [
+    return [
         (list(map(read, sorted(one.glob("day_*")))), list(map(read, sorted(one.glob("night_*"))))) for one in folders
     ]
+
+
+def _webcams(datasets: Path) -> list[DaysAndNights]:
+    shown = []
     for folder in sorted(one for one in (datasets / "eval/webcams").iterdir() if one.is_dir()):
         pictures = [read(path) for path in find_photographs(folder)]
         shown.append(
             ([one for one in pictures if one.mean() > DAYLIGHT], [one for one in pictures if one.mean() <= DAYLIGHT])
         )
+    return shown
+
+
+def cameras(datasets: Path) -> RobotWorld:
+    """Fixed cameras by day and by night."""
+    return _of_cameras(_day_night(datasets) + _webcams(datasets), datasets)
+
+
+def training_cameras(datasets: Path) -> RobotWorld:
+    """The fixed cameras of the training data by day and by night."""
+    return _of_cameras(_day_night(datasets), datasets)
+
+
+def _of_cameras(shown: list[DaysAndNights], datasets: Path) -> RobotWorld:
     shown = [(days, nights) for days, nights in shown if len(days) > 4 and len(nights) > 4]
     count = CUTS * len(shown)
 

@@ -22,7 +22,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.report import report
+from benchmarks.report import report, verdict
 from core.frames.images import decode
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
@@ -37,6 +37,9 @@ from core.storage import Atlas
 
 LOOKS = (0, 1, 3, 10)
 """How many looks a place has besides its first."""
+
+BAR = 0.03
+"""At most this share of the strangers may be recognized; ``benchmarks.learning.strangers`` has other sets."""
 
 LEAST_FRAMES = 14
 """A webcam with fewer is left out."""
@@ -168,9 +171,9 @@ def main(
         places = list(webcams(loaded, datasets / name))
         found = [measured(loaded, places, looks) for looks in LOOKS]
         figures[name] = found
-        rows += [[name, len(places), *shown(one)] for one in found]
-    columns = ["webcams", "places", "looks", "rows", "queries", "recall@1", "right", "wrong", "strangers", "ms"]
-    report("looks", "Places with several looks", columns, rows, {"encoder": loaded.identity, **figures})
+        rows += [[name, len(places), *shown(one), verdict(one["strangers recognized"], BAR)] for one in found]
+    columns = ["webcams", "places", "looks", "rows", "queries", "recall@1", "right", "wrong", "strangers", "ms", "bar"]
+    report("looks", "Places with several looks", columns, rows, {"encoder": loaded.identity, "bar": BAR, **figures})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ leaves some thirteen thousand, as the thesis's networks do at a step of 1.
 
 from __future__ import annotations
 
-import copy
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,6 +24,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.regions import extract_regions
 from core.method.vlad import aggregate
+from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from service.commands.timing.samples import jpeg, sample_frame
 from service.commands.timing.stages import medians
 
@@ -44,10 +45,10 @@ def literal(encoder: Encoder, data: bytes, step: float) -> NDArray[np.float32]:
 _PLAIN: dict[int, torch.nn.Module] = {}
 
 
-def _plain(backbone: torch.nn.Module) -> torch.nn.Module:
+def _plain(backbone: ShallowNetwork) -> torch.nn.Module:
     """The network as torch builds it, maps after maps in memory, as frames come from the literal pipeline."""
     if id(backbone) not in _PLAIN:
-        _PLAIN[id(backbone)] = copy.deepcopy(backbone).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        _PLAIN[id(backbone)] = TorchNetwork.of(backbone).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     return _PLAIN[id(backbone)]
 
 

@@ -6,7 +6,7 @@ shows anything new, ``motion`` how far a robot gets, and ``odometry`` how far it
 serializes a run.
 """
 
-from core.belief.estimate import Candidate, Estimate
+from core.belief.estimate import Candidate, Estimate, agreement
 from core.belief.evidence import NOTHING, Evidence, Sighting, evidence, evidence_of, sighted
 from core.belief.graph import PlaceGraph, place_graph
 from core.belief.motion import Odometry, Step, Stride
@@ -32,6 +32,7 @@ __all__ = [
     "Step",
     "Stride",
     "View",
+    "agreement",
     "evidence",
     "evidence_of",
     "freshness",

@@ -71,6 +71,23 @@ def estimate(
     return Estimate(_verdict(candidates, unknown, graph), tuple(candidates[:count]), unknown)
 
 
+def agreement(found: Estimate, row: int, graph: PlaceGraph) -> float:
+    """The probability, if the robot sees the map, that it is at or beside a place; 1 unless a place is recognized.
+
+    Args:
+        found: where the robot is.
+        row: of the map, the place that the frame alone matches best.
+    """
+    (place,) = graph.places_at(np.array([row])).tolist()
+    if found.verdict != "recognized" or found.unknown >= 1:
+        return 1.0
+    if place < 0:
+        return 0.0
+    near = _near(row, found.candidates, graph, GUARD_FACTOR)
+    there = sum(one.probability for one, same in zip(found.candidates, near, strict=True) if same)
+    return min(1.0, there / (1 - found.unknown))
+
+
 def _verdict(candidates: Sequence[Candidate], unknown: float, graph: PlaceGraph) -> Verdict:
     if unknown >= RECOGNIZED or not candidates:
         return "unknown"

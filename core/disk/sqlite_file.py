@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -89,6 +90,31 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
         raise
+
+
+_REWRITING = threading.Lock()  # the folder for temporary files is one for all connections of the process
+
+
+def rewrite(connection: sqlite3.Connection, folder: Path) -> None:
+    """Rewrite a file so that nothing is left in it of what was deleted; its log has yet to be emptied.
+
+    Deleted content is overwritten where it was (``secure_delete``), but a page that was split may still have a copy.
+    The connection's ``temp_store`` is FILE afterwards.
+
+    Args:
+        folder: for the copy that SQLite makes meanwhile, a file that has no name.
+
+    Raises:
+        sqlite3.Error: the disk refuses, or has too little room; the file is as it was.
+    """
+    quoted = str(folder.absolute()).replace("'", "''")
+    with _REWRITING:
+        connection.execute("PRAGMA temp_store = FILE")
+        connection.execute(f"PRAGMA temp_store_directory = '{quoted}'")
+        try:
+            connection.execute("VACUUM")
+        finally:
+            connection.execute("PRAGMA temp_store_directory = ''")
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ from math import sqrt
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn import functional as F
 
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.geometry.keypoints import MOST, RESOLUTION, SHARES, Keypoints
+from core.kernels.sampling import interpolated
 from core.networks.xfeat import CELL, MULTIPLE, XFeat
 
 AREA = 320 * 240
@@ -99,10 +98,9 @@ def _descriptors_at(maps: NDArray[np.float32], x: NDArray[np.int64], y: NDArray[
 
     As in the authors' code the first pixel and the last one lie on the borders of the map.
     """
-    rows, columns = maps.shape[0] * CELL, maps.shape[1] * CELL
-    where = np.stack([2 * x / (columns - 1) - 1, 2 * y / (rows - 1) - 1], axis=1).astype(np.float32)
-    cells, grid = torch.from_numpy(maps).permute(2, 0, 1)[None], torch.from_numpy(where)[None, None]
-    with torch.inference_mode():
-        sampled = F.grid_sample(cells, grid, mode="bicubic", align_corners=False)[0, :, 0].T
-        steps = (F.normalize(sampled, dim=1) * RESOLUTION).round().clamp(-127, 127)
-        return steps.to(torch.int8).contiguous().numpy()
+    rows, columns = maps.shape[:2]
+    across = x.astype(np.float32) * np.float32(columns / (columns * CELL - 1)) - np.float32(0.5)
+    down = y.astype(np.float32) * np.float32(rows / (rows * CELL - 1)) - np.float32(0.5)
+    found = interpolated(maps, down, across)
+    lengths = np.maximum(np.linalg.norm(found, axis=1, keepdims=True), np.float32(1e-12))
+    return np.clip(np.rint(found * (RESOLUTION / lengths)), -127, 127).astype(np.int8)

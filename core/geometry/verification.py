@@ -37,13 +37,12 @@ from math import comb, hypot, log
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from core.geometry.detection import shown_scale
 from core.geometry.keypoints import Keypoints
 from core.geometry.matching import mutual_matches
-from core.threads import each
+from core.threads import allowed_threads, each
 
 THRESHOLD = 1.0
 """Pixels by which an inlier may miss its epipolar line, of the picture as the network of keypoints sees it."""
@@ -76,6 +75,11 @@ class Verification:
     spread: float
 
     @property
+    def match_share(self) -> float:
+        """Matches by the number of keypoints of the picture that has fewer, in [0, 1]."""
+        return len(self.matches) / max(1, min(self.keypoints))
+
+    @property
     def inlier_count(self) -> int:
         """How many matches fit."""
         return int(self.inliers.sum())
@@ -89,11 +93,30 @@ class Verification:
 def verify(query: Keypoints, candidates: Sequence[Keypoints]) -> list[Verification]:
     """Verify each candidate of a query; the same input gives the same result.
 
-    The candidates are shared out among as many threads as torch has in the calling thread.
+    The candidates are shared out among as many threads as the calling thread may use.
+    """
+    found = verify_promising(query, candidates, [0.0] * len(candidates))
+    return [one for one in found if one is not None]
+
+
+def verify_promising(
+    query: Keypoints, candidates: Sequence[Keypoints], least: Sequence[float]
+) -> list[Verification | None]:
+    """Verify each candidate of a query that has enough matches; matching takes a third of the time of the whole.
+
+    Args:
+        least: of each candidate the share of matches, by the keypoints of the picture that has fewer, that are enough.
+
+    Returns:
+        None for a candidate that has fewer.
     """
     queried = query.descriptors.astype(np.float32)
     shown = points_of(query)
-    return each(lambda candidate: _verify(query, queried, shown, candidate), candidates, torch.get_num_threads())
+
+    def verified(asked: tuple[Keypoints, float]) -> Verification | None:
+        return _verify(query, queried, shown, *asked)
+
+    return each(verified, list(zip(candidates, least, strict=True)), allowed_threads())
 
 
 def fitting(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -171,9 +194,11 @@ def evidence(matches: int, inliers: int, chance: float) -> float:
 
 
 def _verify(
-    query: Keypoints, queried: NDArray[np.float32], shown: NDArray[np.float64], candidate: Keypoints
-) -> Verification:
+    query: Keypoints, queried: NDArray[np.float32], shown: NDArray[np.float64], candidate: Keypoints, least: float
+) -> Verification | None:
     matches = mutual_matches(queried, candidate.descriptors.astype(np.float32))
+    if len(matches) < least * min(len(query), len(candidate)):
+        return None
     ours, theirs = shown[matches[:, 0]], points_of(candidate)[matches[:, 1]]
     inliers = fitting(ours, theirs)
     chance = max(chance_of(query), chance_of(candidate))

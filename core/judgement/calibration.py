@@ -13,8 +13,8 @@ influences its own judgement.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
 from core.judgement.curves import auc_pr, auc_roc, falling
-from core.judgement.geometry import TERMS
-from core.judgement.probability import Curve, fit_curve, moved_curve
+from core.judgement.geometry import TERMS, GeometryTerms
+from core.judgement.probability import Curve, fit_curve, moved_curve, movement
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import Flags, Trial, Trials, Values, gathered, joined
-from core.judgement.verdict import Calibration, Judgement, judge
+from core.judgement.trials import Flags, StagedTrials, Trial, Trials, Values, gathered, joined
+from core.judgement.verdict import Calibration, Judgement, judge, share_of_leads
 from core.places import Neighborhood, Whereabouts
 
 Scores = NDArray[np.float32]
@@ -48,6 +48,9 @@ LEAST_AREA = 0.6
 
 BLOCKS = 5
 """Blocks of the cross-validation."""
+
+LOWEST, HIGHEST, THRESHOLDS = 0.3, 0.99, 50
+"""The probabilities that a threshold demands, and how many thresholds are tried for a target."""
 
 MOST_POINTS = 101
 """A reported curve has at most this many points."""
@@ -148,7 +151,7 @@ class Target(BaseModel):
 
 
 class Point(BaseModel):
-    """The effect of one threshold on the decision value, on all frames; the margin is not applied."""
+    """The effect of one threshold on the decision value of two stages, on all frames; the margin is not applied."""
 
     threshold: float
     precision: float = Field(description="Right ones among the answers believed.")
@@ -236,13 +239,18 @@ class FittedCalibration:
     trials: Trials
 
 
-def fit_map_calibration(trials: Trials, base: Calibration, target: Target, source: str) -> FittedCalibration:
+def fit_map_calibration(
+    trials: Trials | StagedTrials, base: Calibration, target: Target, source: str
+) -> FittedCalibration:
     """Fit a calibration to the trials on one map.
 
+    Curve and margin are fitted to answers of two stages.  Those of three then move the terms of geometric evidence, as
+    far as they demand it (:func:`core.judgement.probability.movement`), and the threshold is the lowest that reaches
+    the target where doubtful answers are verified.
+
     Args:
-        trials: judged with ``base``, whose background and kind of decision value stay, and whose terms of geometric
-            evidence, which were not measured on this map.  Curve, margin and threshold are of two stages; what is
-            reported of trials that were verified is of three.
+        trials: judged with ``base``, whose background and kind of decision value stay; of two stages alone, the terms
+            of evidence stay, too.
         target: the target of the threshold.
         source: recorded in the calibration.
 
@@ -250,62 +258,193 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
         CalibrationImpossible: there are too few trials, the decision value hardly separates right from wrong
             answers, or no threshold reaches the target; the text says which.
     """
-    _check(trials, target)
-    calibration = _fitted(trials, base, target)
-    return _measured(trials, calibration, source, lambda some: _fitted(some, base, target))
+    staged = StagedTrials.of(trials)
+    _check(staged.two, target)
+
+    def fit(chosen: Flags) -> Calibration:
+        return _of_stages(staged.take(chosen), base, target, len(staged) / int(chosen.sum()))
+
+    return _measured(staged, fit, source)
 
 
-def adjust_calibration(trials: Trials, base: Calibration, source: str) -> FittedCalibration:
-    """Adjust a calibration to few trials on one map, which may be the doubtful ones.
-
-    The curve is moved only as far as the trials demand (:func:`core.judgement.probability.moved_curve`).  It tells how
-    probable an answer is given its decision value; so it does not matter that frames were chosen by their answers.  The
-    threshold goes to the decision value that is as probable as the old one was, and the margin stays.
+def _of_stages(trials: StagedTrials, base: Calibration, target: Target, times: float) -> Calibration:
+    """Fit curve, margin, terms of evidence and threshold.
 
     Args:
-        trials: judged with ``base``, each frame once, in the map as it is.
+        times: how many times as many trials there are in all, of which these are a part.
+    """
+    if base.geometry is None or np.isnan(trials.three.evidence).all() or target.rule == "mean_of_negatives":
+        return _fitted(trials.two, base, target)
+    curve, margin = _curve_and_margin(trials.two)
+    margin = min(margin, _margin(trials.three.margin[trials.three.right], "lower"))  # leads in another order
+    found = base.model_copy(update={"curve": curve, "margin": margin})
+    found = found.model_copy(update={"geometry": _adjusted_terms(trials.three, found, curve)})
+    reached = _reaching(trials, found, target, LOWEST, times=times)
+    if not reached.target:
+        raise _out_of_reach(target, reached.precision, len(trials))
+    return reached.calibration
+
+
+def adjust_calibration(
+    trials: Trials | StagedTrials, base: Calibration, source: str, target: Target | None = None
+) -> FittedCalibration:
+    """Adjust a calibration to few trials on one map, which may be the doubtful ones.
+
+    The curve is moved only as far as the trials demand (:func:`core.judgement.probability.movement`), and then the log
+    odds of three stages by those trials that were verified.  Both tell how probable an answer is given its decision
+    value and evidence; so it does not matter that frames were chosen by their answers.  The threshold goes to the
+    decision value that is as probable as the old one was, or higher, and the margin stays.
+
+    In no case more answers are recognized in the map without their place, or off the map, than before; with fewer than
+    ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.  Known places alone make every answer
+    likelier, and say nothing of strangers.
+
+    Args:
+        trials: judged with ``base``, each frame in the map as it is, and perhaps in the map without its place, too.
         source: recorded in the calibration.
+        target: a precision, for which the threshold rises if it has to; None: none.  Only for trials that were not
+            chosen by their answers.
 
     Raises:
         CalibrationImpossible: there are too few trials, or the calibration has no curve.
     """
-    if len(trials) < FEWEST_OUTCOMES or base.curve is None:
+    staged = StagedTrials.of(trials)
+    frames = len(np.unique(staged.two.frame))
+    if frames < FEWEST_OUTCOMES or base.curve is None:
         raise CalibrationImpossible(
-            f"A calibration is adjusted to at least {FEWEST_OUTCOMES} labelled frames; here are {len(trials)}."
+            f"A calibration is adjusted to at least {FEWEST_OUTCOMES} frames whose place is known; here are {frames}."
             if base.curve is not None
             else "The encoder's calibration has no curve that could be adjusted."
         )
-    return _measured(trials, _adjusted(trials, base), source, lambda some: _adjusted(some, base))
+    return _measured(staged, lambda chosen: _adjusted(staged.take(chosen), base, target), source)
 
 
-def _adjusted(trials: Trials, base: Calibration) -> Calibration:
+def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None) -> Calibration:
     assert base.curve is not None
-    clear = np.minimum(1.0, trials.margin / base.margin) if base.margin else (trials.margin > 0).astype(np.float64)
-    curve = moved_curve(base.curve, trials.decision, trials.imagined, trials.right, (1 + clear) / 2)
-    threshold = curve.decision(base.curve.probability(base.threshold))
-    return base.model_copy(update={"curve": curve, "threshold": threshold})
+    two = trials.two
+    curve = moved_curve(base.curve, two.decision, two.imagined, two.right, share_of_leads(two.margin, base))
+    moved = base.model_copy(update={"curve": curve})
+    moved = moved.model_copy(update={"geometry": _adjusted_terms(trials.three, moved, curve)})
+    strangers = ~two.known
+    lowest = base.threshold if int(strangers.sum()) < FEWEST_OUTCOMES else -np.inf
+    before = int(trials.answered(base).recognized(base)[strangers].sum())
+    least = base.curve.probability(base.threshold)
+    return _reaching(trials, moved, target, least, lowest, before).calibration
 
 
-def _measured(
-    trials: Trials, calibration: Calibration, source: str, fit: Callable[[Trials], Calibration]
-) -> FittedCalibration:
-    """A calibration with what was measured of it; ``fit`` makes one of a part of the trials."""
-    frames = len(np.unique(trials.frame))
-    known, right = trials.known, trials.right
-    points = curve_points(trials.decision, known, right)
+def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve) -> GeometryTerms | None:
+    """The terms of evidence, moved as far as the trials that were verified demand.
+
+    Args:
+        curve: of two stages.
+    """
+    verified = ~np.isnan(trials.evidence)
+    if base.geometry is None or not verified.any():
+        return base.geometry
+    some = trials.take(verified)
+    odds = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence)
+    stretch, shift = movement(odds, some.right, share_of_leads(some.margin, base))
+    return GeometryTerms(
+        support=stretch * base.geometry.support,
+        slope=stretch * base.geometry.slope,
+        intercept=stretch * base.geometry.intercept + shift,
+    )
+
+
+class _Reached(NamedTuple):
+    """A threshold that was looked for.
+
+    calibration: with the lowest one that reaches the target or, if none does, with the highest that was tried.
+    target: whether it reaches the target.
+    precision: the best that any of them promises.
+    """
+
+    calibration: Calibration
+    target: bool
+    precision: float
+
+
+def _reaching(
+    trials: StagedTrials,
+    fitted: Calibration,
+    target: Target | None,
+    least: float,
+    lowest: float = -np.inf,
+    strangers: int | None = None,
+    times: float = 1.0,
+) -> _Reached:
+    """The calibration with the lowest threshold that reaches a target where doubtful answers are verified.
+
+    Args:
+        fitted: with curve, margin and terms of evidence.
+        target: of any rule but that of the thesis; None: none.
+        least: the lowest probability that the threshold may demand.
+        lowest: the lowest decision value that it may have.
+        strangers: the most that may be recognized of places that the map lacks; None: any number.
+        times: as of :func:`_precision`.
+    """
+    assert fitted.curve is not None
+    best, tried, unknown = 0.0, fitted, ~trials.two.known
+    for probability in np.linspace(least, max(least, HIGHEST), THRESHOLDS):
+        tried = fitted.model_copy(update={"threshold": max(lowest, fitted.curve.decision(float(probability)))})
+        answers = trials.answered(tried)
+        believed = answers.recognized(tried)
+        if not believed.any():
+            break
+        if strangers is not None and int(believed[unknown].sum()) > strangers:
+            continue
+        if target is None:
+            return _Reached(tried, True, best)
+        if target.rule == "false_accept_rate":
+            if float(believed[unknown].mean()) <= (target.value or 0):
+                return _Reached(tried, True, best)
+            continue
+        best = max(best, _precision(answers, believed, answers.probabilities(tried), times))
+        if best >= (target.value or 0):
+            return _Reached(tried, True, best)
+    return _Reached(tried, False, best)
+
+
+def _precision(trials: Trials, believed: Flags, expected: Values, times: float) -> float:
+    """The precision that answers which are believed, bool [n], at least one, promise.
+
+    It is the least of that which was counted, of that which the calibration expects, and of (n + 1) / (n + 2), what n
+    right answers promise by the rule of succession.  Of a part of the trials, n is what all of them have by it: a block
+    that is held out for measuring takes nothing from what the others promise.
+
+    Args:
+        expected: float64 [n], the probabilities that the calibration states.
+        times: how many times as many trials there are in all, of which these are a part.
+    """
+    count = times * int(believed.sum())
+    return min(float(expected[believed].mean()), float(trials.right[believed].mean()), (count + 1) / (count + 2))
+
+
+def _measured(trials: StagedTrials, fit: Callable[[Flags], Calibration], source: str) -> FittedCalibration:
+    """A calibration with what was measured of it.
+
+    Args:
+        fit: makes a calibration of a part of the trials, bool [n].
+    """
+    calibration = fit(np.ones(len(trials), np.bool_))
+    two = trials.two
+    frames = len(np.unique(two.frame))
+    known, right = two.known, two.right
+    points = curve_points(two.decision, known, right)
     measurement = Measurement(
         frames=frames,
-        trials=len(trials),
+        trials=len(two),
         known=int(known.sum()),
         unknown=int((~known).sum()),
         right=int(right.sum()),
-        auc_pr=auc_pr(trials.decision, right),
-        auc_roc=auc_roc(trials.decision, known),
-        auc_roc_right=auc_roc(trials.decision, right) or 0.0,
+        auc_pr=auc_pr(two.decision, right),
+        auc_roc=auc_roc(two.decision, known),
+        auc_roc_right=auc_roc(two.decision, right) or 0.0,
         cross_validated=_cross_validated(trials, fit),
         points=_thinned(points),
     )
-    return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement, trials)
+    named = calibration.model_copy(update={"source": source, "frames": frames})
+    return FittedCalibration(named, measurement, trials.answered(calibration))
 
 
 def blocks_of(frame: NDArray[np.int64], count: int = BLOCKS) -> list[Flags]:
@@ -321,16 +460,17 @@ def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
     Raises:
         CalibrationImpossible: the blocks besides one do not suffice for a calibration.
     """
-    return _cross_validated(trials, lambda some: _fitted(some, base, target))
+    return _cross_validated(StagedTrials.of(trials), lambda chosen: _fitted(trials.take(chosen), base, target))
 
 
-def _cross_validated(trials: Trials, fit: Callable[[Trials], Calibration]) -> Held:
-    recognized, probabilities = np.zeros(len(trials), np.bool_), np.zeros(len(trials))
-    for block in blocks_of(trials.frame):
-        calibration = fit(trials.take(~block))
-        held = trials.take(block)
+def _cross_validated(trials: StagedTrials, fit: Callable[[Flags], Calibration]) -> Held:
+    recognized, right, probabilities = (np.zeros(len(trials)) for _ in range(3))
+    for block in blocks_of(trials.two.frame):
+        calibration = fit(~block)
+        held = trials.take(block).answered(calibration)
         recognized[block], probabilities[block] = held.recognized(calibration), held.probabilities(calibration)
-    return held_figures(trials, recognized, probabilities)
+        right[block] = held.right
+    return held_figures(replace(trials.two, right=right > 0), recognized > 0, probabilities)
 
 
 def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> Held:
@@ -388,12 +528,16 @@ def _check(trials: Trials, target: Target) -> None:
 
 def _fitted(trials: Trials, base: Calibration, target: Target) -> Calibration:
     """Fit curve, margin and threshold."""
+    curve, margin = _curve_and_margin(trials)
+    return base.model_copy(update={"curve": curve, "margin": margin, "threshold": _threshold(trials, curve, target)})
+
+
+def _curve_and_margin(trials: Trials) -> tuple[Curve, float]:
     try:
         curve = fit_curve(trials.decision, trials.right)
     except ValueError as error:
         raise CalibrationImpossible(f"No curve of probabilities can be fitted: {error}.") from error
-    margin, threshold = _margin(trials.margin[trials.right], "lower"), _threshold(trials, curve, target)
-    return base.model_copy(update={"curve": curve, "margin": margin, "threshold": threshold})
+    return curve, _margin(trials.margin[trials.right], "lower")
 
 
 def _threshold(trials: Trials, curve: Curve, target: Target) -> float:
@@ -422,12 +566,28 @@ def _for_precision(trials: Trials, curve: Curve, wanted: float) -> float:
     last = np.append(np.diff(trials.decision[order]) != 0, True)
     reached = np.flatnonzero((counted >= wanted) & (expected >= wanted) & last)
     if not len(reached):
-        best = float(np.minimum(counted, expected)[last].max())
-        raise CalibrationImpossible(
-            f"No threshold lets {wanted:.1%} of the answers believed be right: the best that {len(trials)} answers "
-            f"can promise is {best:.1%}. More frames promise more, where all that is believed is right."
+        raise _out_of_reach(
+            Target(rule="precision", value=wanted), float(np.minimum(counted, expected)[last].max()), len(trials)
         )
     return float(trials.decision[order][reached[-1]])
+
+
+def _out_of_reach(target: Target, best: float, answers: int) -> CalibrationImpossible:
+    """The error where no threshold reaches a target.
+
+    Args:
+        best: the precision that the answers can promise.
+    """
+    if target.rule == "false_accept_rate":
+        return CalibrationImpossible(
+            f"No threshold accepts at most {target.value:.1%} of the unknown places. "
+            "Look whether the map has some of them after all, or allow a larger share."
+        )
+    return CalibrationImpossible(
+        f"No threshold lets {target.value:.1%} of the answers believed be right: the best that {answers} answers "
+        f"can promise is {best:.1%}. Ask for less, or give more frames: they promise more, where all that is believed "
+        "is right."
+    )
 
 
 def _thinned(points: list[Point]) -> list[Point]:

@@ -8,7 +8,8 @@ was taken.  With the probability e it says nothing at all, so that it contribute
     log((1 - e) · exp(x) + e)  >=  log e,
 
 and the log odds of a place are the sum over the cameras.  Where a camera's candidates were verified, x has the evidence
-of the place as well (``geometry.py``), which is 0 of a place that was left out as one that could not win.  Cameras are
+of the place as well (``geometry.py``), which is 0 of a place that was left out as one that could not win; so the
+candidates of all cameras are verified where those of one are (``core.recognition.rigs``).  Cameras are
 assumed to be independent given the place, which is not quite true, since they share the light and the weather.  A rig
 of one camera is a plain query.
 
@@ -40,8 +41,8 @@ LISTED = 50
 """Without a second stage, this many places of each camera's ranking count."""
 
 ALIKE = float(np.log(4))
-"""If the log odds of two maps' places differ by less than this (a factor of four in the odds), the answer is
-ambiguous."""
+"""If the log odds of two maps' places, or of two verified places of a rig, differ by less than this (a factor of four
+in the odds), the answer is ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,9 @@ def _judged(
 ) -> Judgement:
     """Judge the first of the ranked places; ``near`` says which of them are the same place, bool [n, n].
 
-    The verdict is ambiguous if the margin is too small, and also if the best rival alone would be recognized.
+    The verdict is ambiguous if the margin is too small, and also if the best rival alone would be recognized.  Where
+    the first was verified, each place that shares its view fits and would be; the rival is then close if its odds are
+    within a factor of four.
     """
     best = float(log_odds_of_places[0])
     others = np.flatnonzero(~near[0])
@@ -204,7 +207,9 @@ def _judged(
     if evidence is not None:
         least = max(0.0, least)
     # Of places that the cameras prefer each alone is close, or would be believed.
-    close = (log_odds_of_places >= least) | (best - log_odds_of_places < calibration.margin * steepness)
+    weighed = evidence is not None and calibration.geometry is not None
+    likely = best - log_odds_of_places < ALIKE if weighed else log_odds_of_places >= least
+    close = likely | (best - log_odds_of_places < calibration.margin * steepness)
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
     if best < least:

@@ -62,6 +62,9 @@ APART = 0.2
 """Metres that they are apart at least: looks from one position say nothing of distances."""
 BUNDLE_HEADING = float(np.radians(0.5))
 """Deviation of the errors of places' headings, where several places show them."""
+HEIGHT_SLOPE = 0.2
+"""Slope of the ground by which the height of a frame differs from that of its place on the Earth: few roads are
+steeper."""
 SLOPE = float(np.radians(4))
 """Deviation of the slope of the ground, by which heights of places that poses do not give are off."""
 
@@ -94,6 +97,14 @@ class PoseEstimate:
     heading_offset: float | None = None
     offset_spread: float | None = None
     source: PoseSource = "places"
+
+    def at_height(self, height: float | None) -> PoseEstimate:
+        """The same at the height of a place, which is known as well as the ground is level; None: it is not known."""
+        found = self.without_height()
+        if height is None:
+            return found
+        found.covariance[2, 2] = PLACE_POSITION**2 + (HEIGHT_SLOPE * self.spread) ** 2
+        return replace(found, pose=found.pose.model_copy(update={"z": height}))
 
     def without_height(self) -> PoseEstimate:
         """The same where places have no height: the pose has none, and its variance is that of one not known."""

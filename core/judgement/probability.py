@@ -132,19 +132,33 @@ def _loss(
 def moved_curve(curve: Curve, decisions: ArrayLike, imagined: ArrayLike, right: ArrayLike, factors: ArrayLike) -> Curve:
     """A curve whose log odds are stretched and shifted as far as outcomes demand it, but no farther.
 
-    The most probable stretch a and shift b of the log odds, a · odds + b, given the outcomes, where before them log a
-    and b are normal about 0 with the deviations ``STRETCH`` and ``SHIFT``.  So few outcomes move it little, and even
-    outcomes of one kind only give a curve.
-
     Args:
         decisions: [n], decision values; imagined: [n], shares of imagined places.
+        right, factors: as of :func:`movement`.
+    """
+    stretch, shift = movement(curve.log_odds(decisions, imagined), right, factors)
+    return Curve(
+        slope=stretch * curve.slope,
+        intercept=stretch * curve.intercept + shift,
+        imagined_slope=stretch * curve.imagined_slope,
+        imagined_intercept=stretch * curve.imagined_intercept,
+    )
+
+
+def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike) -> tuple[float, float]:
+    """The most probable stretch a and shift b of log odds, a · odds + b, given the outcomes.
+
+    Before them log a and b are normal about 0 with the deviations ``STRETCH`` and ``SHIFT``.  So few outcomes move log
+    odds little, and even outcomes of one kind only are enough.
+
+    Args:
+        log_odds: [n], that an answer is right, its rivals left out of account.
         right: bool [n], whether the best match was right.
-        factors: [n], in (0, 1], by which the probability of the curve is multiplied to be that of the answer.
+        factors: [n], in (0, 1], by which the probability of the log odds is multiplied to be that of the answer.
     """
     from scipy.optimize import minimize  # here, because it takes long to import
 
-    odds, y = curve.log_odds(decisions, imagined), np.asarray(right, np.bool_)
-    share = np.asarray(factors, np.float64)
+    odds, y, share = np.asarray(log_odds, np.float64), np.asarray(right, np.bool_), np.asarray(factors, np.float64)
 
     def loss(moved: NDArray[np.float64]) -> float:
         stated = share * sigmoid(np.exp(moved[0]) * odds + moved[1])
@@ -152,10 +166,4 @@ def moved_curve(curve: Curve, decisions: ArrayLike, imagined: ArrayLike, right: 
         return float((moved[0] / STRETCH) ** 2 / 2 + (moved[1] / SHIFT) ** 2 / 2 - likelihood)
 
     found = minimize(loss, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000})
-    stretch, shift = float(np.exp(found.x[0])), float(found.x[1])
-    return Curve(
-        slope=stretch * curve.slope,
-        intercept=stretch * curve.intercept + shift,
-        imagined_slope=stretch * curve.imagined_slope,
-        imagined_intercept=stretch * curve.imagined_intercept,
-    )
+    return float(np.exp(found.x[0])), float(found.x[1])

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import Calibration, Judgement, probability_of, stands_out
+from core.judgement.verdict import (
+    DOUBT,
+    MOSTLY_IMAGINED,
+    Calibration,
+    Judgement,
+    most_doubtful,
+    probability_of,
+    stands_out,
+)
 
 _STORED: Mapping[str, tuple[Any, float]] = {
     "decision": (np.float64, 0.0),
@@ -64,8 +72,7 @@ class Trials:
 
     def standing_out(self, calibration: Calibration) -> Flags:
         """Which of them are believed by a calibration if their lead is large enough, bool [n]."""
-        believed = [stands_out(d, calibration, share, found) for d, _, share, found in self._rows()]
-        return np.array(believed, np.bool_)
+        return stands_out(self.decision, calibration, self.imagined, self.evidence)
 
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
@@ -73,8 +80,10 @@ class Trials:
 
     def probabilities(self, calibration: Calibration) -> Values:
         """The probability that each is right, by a calibration with a curve, float64 [n]."""
-        stated = [probability_of(d, margin, calibration, share, found) for d, margin, share, found in self._rows()]
-        return np.array(stated, np.float64)
+        stated = probability_of(self.decision, self.margin, calibration, self.imagined, self.evidence)
+        if stated is None:
+            raise ValueError("a calibration without a curve states no probabilities")
+        return stated
 
     def record(self) -> dict[str, list[float | None]]:
         """The trials as lists for JSON, by the names of the fields; null stands for infinite and missing values."""
@@ -98,11 +107,60 @@ class Trials:
             raise ValueError("the lists are of different lengths")
         return cls(**found)
 
-    def _rows(self) -> Iterator[tuple[float, float, float, float | None]]:
-        """Decision value, margin, imagined share and evidence of each."""
-        columns = (self.decision, self.margin, self.imagined, self.evidence)
-        for decision, margin, share, found in zip(*(column.tolist() for column in columns), strict=True):
-            yield decision, margin, share, None if np.isnan(found) else found
+
+@dataclass(frozen=True)
+class StagedTrials:
+    """The outcomes of the same queries, in the same order, by two stages and by three.
+
+    three: with every query verified of which keypoints are known; of the others as by two stages.
+    """
+
+    two: Trials
+    three: Trials
+
+    @classmethod
+    def of(cls, trials: Trials | StagedTrials) -> StagedTrials:
+        """Trials whose answers stay what they are, whatever the calibration: by two stages, or as robots had them."""
+        return trials if isinstance(trials, StagedTrials) else cls(trials, trials)
+
+    def __len__(self) -> int:
+        return len(self.two)
+
+    def take(self, chosen: Flags) -> StagedTrials:
+        """The trials that are chosen, bool [n]."""
+        return StagedTrials(self.two.take(chosen), self.three.take(chosen))
+
+    def record(self) -> dict[str, dict[str, list[float | None]]]:
+        """The trials of either kind as lists for JSON (:meth:`Trials.record`)."""
+        return {"two": self.two.record(), "three": self.three.record()}
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> StagedTrials:
+        """The trials of what :meth:`record` made, or of the lists of trials whose answers stay what they are.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is something else.
+        """
+        if "two" not in record:
+            return cls.of(Trials.of_record(record))
+        found = cls(Trials.of_record(record["two"]), Trials.of_record(record["three"]))
+        if len(found.two) != len(found.three):
+            raise ValueError("the lists are of different lengths")
+        return found
+
+    def answered(self, calibration: Calibration) -> Trials:
+        """The outcomes with ``verify=auto``: by three stages where two leave doubt, by a calibration with a curve.
+
+        A best match whose own evidence would settle the doubt is here verified with all others.
+        """
+        two = self.two
+        if calibration.geometry is None or calibration.curve is None:
+            return two
+        stated, believed = two.probabilities(calibration), two.standing_out(calibration)
+        doubtful = (stated > DOUBT[0]) & (stated < most_doubtful(calibration))
+        doubtful |= (believed & (two.margin < calibration.margin)) | (two.imagined > MOSTLY_IMAGINED)
+        columns = {one.name: (getattr(two, one.name), getattr(self.three, one.name)) for one in fields(two)}
+        return Trials(**{name: np.where(doubtful, three, of_two) for name, (of_two, three) in columns.items()})
 
 
 @dataclass(frozen=True)
@@ -151,3 +209,8 @@ def joined(parts: Sequence[Trials], same_frames: bool = False) -> Trials:
             first += int(part.frame.max()) + 1
     columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _NUMBERS}
     return Trials(frame=np.concatenate(shifted), **columns)
+
+
+def joined_stages(parts: Sequence[StagedTrials]) -> StagedTrials:
+    """Join several sets of trials; their frames are numbered consecutively."""
+    return StagedTrials(joined([one.two for one in parts]), joined([one.three for one in parts]))

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.background import FULL, GUARD_FACTOR, TOP_PLACES, Background, Environment, background, unrelated
@@ -46,6 +46,7 @@ __all__ = ["TOP_PLACES", "Calibration", "Environment", "Judgement", "Rivals", "V
 
 Verdict = Literal["recognized", "ambiguous", "unknown"]
 Positions = NDArray[np.int64]
+Values = NDArray[np.float64]
 Likeness = Callable[[Positions], NDArray[np.float32]]
 """Returns what the best match scores, as if it were the query, at positions in a ranking; int64 [k] to float32 [k]."""
 
@@ -61,8 +62,8 @@ MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
 
 DOUBT = (0.1, 0.5)
-"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, queried in the whole other
-traverse, two stages leave 0.27 and 0.23 there."""
+"""Between these probabilities an answer is in doubt, or up to that of the threshold, if that is stricter.  Of the
+frames of corridor and lip6, queried in the whole other traverse, two stages leave 0.27 and 0.23 there."""
 
 
 class Calibration(BaseModel):
@@ -152,60 +153,78 @@ class Judgement:
 
 
 def log_odds_of(
-    decision: float, calibration: Calibration, imagined: float = 0.0, evidence: float | None = None
-) -> float | None:
-    """The log odds that the best match is right, its rivals left out of account; None without a curve.
+    decision: ArrayLike, calibration: Calibration, imagined: ArrayLike = 0.0, evidence: ArrayLike | None = None
+) -> Values | None:
+    """The log odds that best matches are right, their rivals left out of account, float64 of any shape.
 
     Args:
-        decision: the decision value.
-        imagined: the share of the background that was imagined.
-        evidence: of the best match; None if it was not verified.
+        decision: the decision values.
+        imagined: the shares of the background that were imagined.
+        evidence: of the best matches; NaN for one that was not verified, None: none was.
+
+    Returns:
+        None if the calibration has no curve.
     """
     if calibration.curve is None:
         return None
     two_stages = calibration.curve.log_odds(decision, imagined)
     if evidence is None or calibration.geometry is None:
-        return float(two_stages)
-    return float(calibration.geometry.log_odds(two_stages, evidence))
+        return two_stages
+    found = np.asarray(evidence, np.float64)
+    return np.where(np.isnan(found), two_stages, calibration.geometry.log_odds(two_stages, found))
+
+
+def share_of_leads(margin: ArrayLike, calibration: Calibration) -> Values:
+    """The part of a probability that the lead over the best rival leaves, ½ + ½ min(1, m / m₀), float64 of any shape.
+
+    Args:
+        margin: the leads, at least 0; infinite without a rival.
+    """
+    leads = np.maximum(0.0, np.asarray(margin, np.float64))
+    return (1 + (np.minimum(1.0, leads / calibration.margin) if calibration.margin else leads > 0)) / 2
 
 
 def probability_of(
-    decision: float,
-    margin: float | None,
+    decision: ArrayLike,
+    margin: ArrayLike,
     calibration: Calibration,
-    imagined: float = 0.0,
-    evidence: float | None = None,
-) -> float | None:
-    """The probability that the best match is right, by the calibration's curve and the lead over the best rival.
+    imagined: ArrayLike = 0.0,
+    evidence: ArrayLike | None = None,
+) -> Values | None:
+    """The probabilities that best matches are right, by the calibration's curve and the leads over the best rivals.
 
     Args:
-        decision: the decision value.
-        margin: the lead over the best rival, at least 0; None without a rival.
-        imagined: the share of the background that was imagined.
-        evidence: of the best match; None if it was not verified.
+        decision, imagined, evidence: as of :func:`log_odds_of`.
+        margin: as of :func:`share_of_leads`.
 
     Returns:
-        In (0, 1); None if the calibration has no curve.
+        Float64 of any shape, each in (0, 1); None if the calibration has no curve.
     """
     odds = log_odds_of(decision, calibration, imagined, evidence)
-    if odds is None:
-        return None
-    clear = 1.0
-    if margin is not None:
-        clear = min(1.0, max(0.0, margin) / calibration.margin) if calibration.margin else float(margin > 0)
-    return float(sigmoid(np.array([odds]))[0]) * (1 + clear) / 2
+    return None if odds is None else np.asarray(sigmoid(odds) * share_of_leads(margin, calibration), np.float64)
 
 
-def stands_out(decision: float, calibration: Calibration, imagined: float = 0.0, evidence: float | None = None) -> bool:
-    """Whether a best match is believed if its lead is large enough.
+def stands_out(
+    decision: ArrayLike, calibration: Calibration, imagined: ArrayLike = 0.0, evidence: ArrayLike | None = None
+) -> NDArray[np.bool_]:
+    """Whether best matches are believed if their leads are large enough, bool of any shape.
 
-    By the decision value; or, if it was verified, by the probability of three stages, which has to be a half at least
-    and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
+    By the decision value; or, where one was verified, by the probability of three stages, which has to be a half at
+    least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
     """
-    if evidence is None or calibration.geometry is None or calibration.curve is None:
-        return decision >= calibration.threshold
+    believed = np.asarray(decision, np.float64) >= calibration.threshold
     odds = log_odds_of(decision, calibration, imagined, evidence)
-    return odds is not None and odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
+    if odds is None or evidence is None or calibration.geometry is None or calibration.curve is None:
+        return np.asarray(believed)
+    surely = odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
+    return np.where(np.isnan(np.asarray(evidence, np.float64)), believed, surely)
+
+
+def most_doubtful(calibration: Calibration) -> float:
+    """The probability from which on an answer leaves no doubt: a half, or that of a strict calibration's threshold."""
+    if calibration.curve is None:
+        return DOUBT[1]
+    return max(DOUBT[1], calibration.curve.probability(calibration.threshold))
 
 
 def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
@@ -223,7 +242,7 @@ def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
     """
     if calibration.geometry is None or judgement.probability is None:
         return False
-    doubtful = DOUBT[0] < judgement.probability < DOUBT[1]
+    doubtful = DOUBT[0] < judgement.probability < most_doubtful(calibration)
     if judgement.evidence is not None:
         return doubtful
     return doubtful or judgement.verdict == "ambiguous" or judgement.imagined > MOSTLY_IMAGINED
@@ -275,7 +294,9 @@ def judge(
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
-    probability = probability_of(decision, margin, calibration, behind.imagined, evidence)
+    lead = np.inf if margin is None else margin
+    stated = probability_of(decision, lead, calibration, behind.imagined, evidence)
+    probability = None if stated is None else float(stated)
     return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence)
 
 
@@ -362,7 +383,7 @@ class _Ranking:
     def would_stand_out(self, behind: Background) -> bool:
         """Whether the best match would stand out of another background."""
         decision = behind.decision(float(self.scores[0]))
-        return stands_out(decision, self.calibration, behind.imagined, self.evidence)
+        return bool(stands_out(decision, self.calibration, behind.imagined, self.evidence))
 
     def heads(self) -> Positions:
         """The best few of the other places, without neighbours of a better one; int64 [k]."""

@@ -220,12 +220,9 @@ class Way:
         gone = trail.points[frames]
         middle, shown = gone.mean(), there.mean()
         spread = graph.neighborhood.radius or graph.spacing or 1.0
-        turn = np.sum((there - shown) * np.conj(gone - middle)) / spread**2
-        apart = graph.heading[places] - trail.headings[frames]
-        turn += np.sum(np.exp(1j * apart[~np.isnan(apart)])) / HEADING_SPREAD**2
-        if abs(turn) < 1e-9:
+        turn = turn_of(there - shown, gone - middle, graph.heading[places] - trail.headings[frames], spread)
+        if turn is None:
             return None, np.zeros(len(around))
-        turn /= abs(turn)
         missed = np.abs(shown + turn * (gone - middle) - there)
         point = complex(shown + turn * (trail.points[number] - middle))
         heading = float(trail.headings[number] + np.angle(turn))
@@ -262,6 +259,21 @@ class Way:
         """Radians between the heading of a place and that of the robot, from 0 to π; 0 where one is not known."""
         apart = self.graph.heading[place] - fit.heading
         return 0.0 if math.isnan(apart) else abs(math.remainder(apart, 2 * math.pi))
+
+
+def turn_of(
+    there: NDArray[np.complex128], gone: NDArray[np.complex128], apart: NDArray[np.floating], spread: float
+) -> complex | None:
+    """The turn of the plane, of length 1, that lays points of odometry onto those of a map best; None: any is as good.
+
+    Args:
+        there, gone: points of the map and of odometry, x + iy from their means, complex128 [k], metres.
+        apart: by how much headings of the map differ from those of odometry, radians, float [k]; NaN: not known.
+        spread: standard deviation of the points, metres.
+    """
+    turn = complex(np.sum(there * np.conj(gone)) / spread**2)
+    turn += complex(np.sum(np.exp(1j * apart[~np.isnan(apart)])) / HEADING_SPREAD**2)
+    return None if abs(turn) < 1e-9 else turn / abs(turn)
 
 
 def relative(graph: PlaceGraph, places: NDArray[np.integer], origin: int) -> NDArray[np.complex128]:

@@ -1,6 +1,6 @@
 """When a proposal may be taken without a person: where evidence agrees that is independent of the run that made it.
 
-Two runs, of different robots or days, propose the same place with frames that show the same; or keypoints of the frame
+Two independent runs (``witnesses.py``) propose the same place with frames that show the same; or keypoints of the frame
 fit those of a recognized frame beside it, which shows part of the same.  Two frames show the same if one would be
 recognized at the other in a map made of the proposals of that other run alone: frames of one night look alike, so that
 they must be told apart from one another, and not from those of the day.
@@ -19,6 +19,7 @@ from core.belief import PlaceGraph
 from core.judgement.verdict import Calibration, judge
 from core.learning.anchors import place_of
 from core.learning.proposals import FITTING, Proposal
+from core.learning.witnesses import Witness
 
 Scores = Callable[[int, Sequence[int]], NDArray[np.float32]]
 """Returns the scores of both stages of a proposal against others, by their numbers; float32 [k]."""
@@ -32,12 +33,12 @@ class PendingProposal:
     """A proposal that waits.
 
     run: a name for the run that made it.
-    source: a name for its robot and day; runs of one source are one witness.
+    source: the robot of the run, and when the run began.
     """
 
     proposal: Proposal
     run: str
-    source: str
+    source: Witness
 
 
 def corroborated(
@@ -74,7 +75,7 @@ def _witnesses(
     same = graph.same_place(int(places[number]))
     runs: dict[str, list[int]] = {}
     for other, one in enumerate(pending):
-        if one.source != own.source and one.run != own.run and places[other] >= 0:
+        if one.run != own.run and one.source.independent_of(own.source) and places[other] >= 0:
             runs.setdefault(one.run, []).append(other)
     return [np.array(run, np.int64) for run in runs.values() if np.isin(places[run], same).any()]
 

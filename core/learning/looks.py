@@ -29,24 +29,27 @@ def kept(
     believable: float,
     most_looks: int = MOST_LOOKS,
     services: Sequence[LookStatistics] | None = None,
+    fixed: int = 1,
 ) -> NDArray[np.int64]:
-    """The looks of a place that stay, int64 [m], 1 <= m <= most_looks, in the order of the given ones.
+    """The looks of a place that stay, int64 [m], fixed <= m <= most_looks, in the order of the given ones.
 
     Args:
         scores: float32 [k, k], of both stages, of every look against every other; the first is that of the map.
         believable: the score at which a frame of this place would just be recognized.
         services: how each has served; None: nothing is known.
+        fixed: how many of the first stay whatever they are, also if they are more than ``most_looks``: that of the map,
+            and those that people added.
 
     Raises:
         ValueError: there is no look, or none may stay.
     """
     count = len(scores)
-    if not count or most_looks < 1:
+    if not 1 <= fixed <= count or most_looks < 1:
         raise ValueError("a place keeps its first look")
     alike = np.maximum(scores, scores.T).astype(np.float64)
     served = [LookStatistics()] * count if services is None else list(services)
-    left = [number for number in range(1, count) if not (served[number].idle or served[number].misleads)]
-    chosen = [0]
+    left = [number for number in range(fixed, count) if not (served[number].idle or served[number].misleads)]
+    chosen = list(range(fixed))
     while left and len(chosen) < most_looks:
         nearest = alike[np.ix_(left, chosen)].max(axis=1)
         farthest = min(range(len(left)), key=lambda at: (nearest[at], -served[left[at]].right, left[at]))

@@ -121,6 +121,10 @@ class Lesson:
     contradicted: int64 [c], those that were sure of themselves at a place that the run denies.
     rows: int64 [n], the place of each frame that the rest of the run is certain of, as a row of the map; -1: none.
     refused: why frames are no proposals, and how many.
+    places: int64 [a], those of the anchors, in the graph.
+    certainties: float64 [n], the probability of the likeliest place of each frame and those that are the same, by the
+        rest of the run; empty if the run teaches nothing.
+    away: float64 [n], the probability by the rest of the run that the robot was at no place of the map; empty likewise.
     """
 
     proposals: tuple[Proposal, ...]
@@ -129,6 +133,9 @@ class Lesson:
     contradicted: NDArray[np.int64]
     rows: NDArray[np.int64]
     refused: Mapping[Refusal, int] = field(default_factory=dict)
+    places: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    certainties: NDArray[np.float64] = field(default_factory=lambda: np.empty(0, np.float64))
+    away: NDArray[np.float64] = field(default_factory=lambda: np.empty(0, np.float64))
 
 
 def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOptions | None = None) -> Lesson:
@@ -163,7 +170,14 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
             found.append(outcome)
         else:
             refused[outcome] += 1
-    return Lesson(tuple(found), None, anchors.frames, anchors.contradicted, rows, dict(refused))
+    best = [one.best for one in posteriors]
+    certainties = np.array(
+        [0.0 if at is None else one.at(graph.same_place(at)) for at, one in zip(best, posteriors, strict=True)]
+    )
+    return Lesson(
+        tuple(found), None, anchors.frames, anchors.contradicted, rows, dict(refused), anchors.places, certainties,
+        np.array([one.away for one in posteriors]),
+    )  # fmt: skip
 
 
 def _contradiction(anchors: Anchors, scale: float | None, options: LessonOptions) -> Contradiction | None:
@@ -293,4 +307,6 @@ def _reason(frame: RunFrame, certainty: float, fit: Fit, distance: float, geomet
         f"Alone the frame was {alone}; the rest of the run puts it here with {certainty:.3f}. Odometry from the "
         f"recognized frames {fit.before} and {fit.after} leads within {distance:.1f} {unit}."
     )
-    return text if geometry is None else f"{text} Its keypoints fit a recognized frame beside it with {geometry:.0f}."
+    if geometry is None:
+        return text
+    return f"{text} Its keypoints fit a recognized frame beside it, with an evidence of {geometry:.0f}."

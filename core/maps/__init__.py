@@ -3,6 +3,9 @@
 from core.maps.counterparts import Correspondence, own_poses
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
+    AlarmLimit,
+    AlarmName,
+    AlarmSetting,
     Change,
     Enrolment,
     History,
@@ -12,22 +15,27 @@ from core.maps.records import (
     MapSettings,
     PicturedPlace,
     Precision,
+    RejectedGround,
     ReviewSetting,
     SameFrame,
     SequenceSummary,
     TierSetting,
     VerifyReport,
 )
-from core.maps.review import ReviewFrame
+from core.maps.review import ReviewFrame, stored_frames
 from core.maps.selection import Selection
-from core.maps.status import IndexStatus, Recall, StorageStatus
+from core.maps.status import ErasureReport, IndexStatus, Recall, StorageStatus
 from core.maps.store import Map, Ranking, Scope, Snapshot, Store
 
 __all__ = [
     "EVERY_PLACE",
+    "AlarmLimit",
+    "AlarmName",
+    "AlarmSetting",
     "Change",
     "Correspondence",
     "Enrolment",
+    "ErasureReport",
     "History",
     "IndexStatus",
     "Keep",
@@ -40,6 +48,7 @@ __all__ = [
     "Precision",
     "Ranking",
     "Recall",
+    "RejectedGround",
     "ReviewFrame",
     "ReviewSetting",
     "SameFrame",
@@ -52,4 +61,5 @@ __all__ = [
     "TierSetting",
     "VerifyReport",
     "own_poses",
+    "stored_frames",
 ]

@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, ValidationError
 
 from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
-from core.places import PlaceFields, Timestamp, place_and_look
+from core.names import texts
+from core.places import PlaceFields, Pose, Timestamp, place_and_look
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -53,6 +54,27 @@ LearningMode = Literal["off", "propose", "auto"]
 on which independent evidence agrees, and the others wait for a person."""
 
 
+MOST_REJECTED, MOST_POSES = 16, 64
+"""Stretches whose rejection a map remembers, the latest ones; and poses that outline each."""
+
+
+OutlinePose = Annotated[Pose, PlainSerializer(lambda pose: pose.model_dump(exclude_none=True))]
+"""A pose without the coordinates that it does not have."""
+
+
+class RejectedGround(BaseModel):
+    """A stretch of new ground that a person has rejected."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stretch: Annotated[str, texts("a stretch")] = Field(description="Its id.")
+    run: Annotated[str, texts("a run")] = Field(description="The run that proposed it.")
+    at: Timestamp = Field(description="When it was rejected.")
+    poses: Annotated[tuple[OutlinePose, ...], Field(min_length=1, max_length=MOST_POSES)] = Field(
+        description="Where it is, in the order of the run."
+    )
+
+
 class LearningSetting(BaseModel):
     """The setting by which a map learns from the runs of its robots."""
 
@@ -72,8 +94,50 @@ class LearningSetting(BaseModel):
         description="How sure the rest of a run must be of a frame's place for the frame to be proposed.",
     )
     most_looks: Annotated[int, Field(strict=True, ge=2, le=33)] = Field(
-        default=3, description="Looks that a place has at most by what it learns, its first included."
+        default=3,
+        description="Looks that a place has at most by what it learns, its first and those that people added included.",
     )
+    most_places: Annotated[int, Field(strict=True, ge=1, le=2**31)] | None = Field(
+        default=None,
+        description="Places with learnt looks, and places of new ground, that the map has at most together: then it "
+        "takes no look for a further place by itself, and no stretch; null: no limit.",
+    )
+    new_ground: bool = Field(
+        strict=True,
+        default=False,
+        description="Whether stretches of runs that leave the map and come back are stored for review, too. A person "
+        "accepts them, whatever the mode; with the mode off there are none.",
+    )
+    calibration: LearningMode = Field(
+        default="propose",
+        description="Whether the map calibrates itself: by a traverse, as soon as it is aligned with others, and by "
+        "frames whose place a run knows beyond doubt (with the mode off there are none). propose: what they would "
+        "change is measured, as by a dry run of `calibrate`. auto: it is stored, by runs once those of two robots, "
+        "or two half a day apart, tell it, unless a person has calibrated the map. off: neither.",
+    )
+    rejected_ground: Annotated[tuple[RejectedGround, ...], Field(max_length=MOST_REJECTED)] = Field(
+        default=(),
+        description="Stretches that a person has rejected: no run proposes this ground again. One that is taken out of "
+        "the list may be proposed again.",
+    )
+
+
+AlarmName = Literal["worse_places", "changed_places", "quiet_stretches"]
+"""A trend of a map that may raise an alarm."""
+
+AlarmLimit = Annotated[int, Field(strict=True, ge=1, le=1_000_000)] | None
+
+
+class AlarmSetting(BaseModel):
+    """From which numbers on the trends of a map raise an alarm; null: never."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    worse_places: AlarmLimit = Field(default=None, description="Places that get worse.")
+    changed_places: AlarmLimit = Field(
+        default=None, description="Places that have changed: runs pass them, while single frames fail."
+    )
+    quiet_stretches: AlarmLimit = Field(default=None, description="Stretches that nobody drives any more.")
 
 
 class MapSettings(BaseModel):
@@ -112,6 +176,9 @@ class MapSettings(BaseModel):
     )
     learning: LearningSetting = Field(
         default=LearningSetting(), description="How the map learns from the runs of its robots."
+    )
+    alarms: AlarmSetting = Field(
+        default=AlarmSetting(), description="From which numbers on trends of the health report become events."
     )
 
 
@@ -196,8 +263,8 @@ class Enrolment:
     digest: SHA-256 of the image's bytes, 32 bytes.
     thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
     keypoints: of the frame; stored if the map's setting ``verification`` says so.  None: they were not looked for.
-    run: the run from which a look was learnt; None: it was not.
-    least: the score of two stages from which a match with the look is believed; None: from any.
+    run: the run from which a look or a place was learnt; None: it was not.
+    least: the score of two stages from which a match with the frame is believed; None: from any.
     """
 
     id: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,6 +21,7 @@ class ReviewFrame:
     size: of the file, in bytes.
     answer: how the map answered it; a JSON object.
     label: the place that it shows, who said so, and when; a JSON object.  None: it has no label.
+    replaced: the label that its new label has replaced; None: it had none, or this is not known.
     """
 
     number: int
@@ -29,6 +30,7 @@ class ReviewFrame:
     size: int
     answer: Mapping[str, Any]
     label: Mapping[str, Any] | None = None
+    replaced: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,12 @@ class Review(Protocol):
 
     def shrink(self, setting: ReviewSetting) -> None:
         """Drop the oldest frames beyond new limits, and give back the room."""
+
+    def drop_before(self, moment: datetime) -> int:
+        """Drop the frames that were asked before a moment, with their labels; returns how many.
+
+        A map that is not open yet is not opened for this.
+        """
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
         """The latest frames, newest first, and how many are stored in all, as of one moment.
@@ -100,6 +108,13 @@ class Review(Protocol):
             UnknownFrame: it is not stored.
         """
 
+    def label_first(self, number: int, label: Mapping[str, Any]) -> bool:
+        """Label a frame that has no label, whoever else labels it at the same time; whether it had none.
+
+        Raises:
+            UnknownFrame: it is not stored.
+        """
+
     def discard(self, number: int) -> None:
         """Throw a frame away.
 
@@ -125,3 +140,26 @@ def frames_to_drop(
             going.append(number)
             count, size = count - 1, size - bytes_
     return going
+
+
+PAGE = 500
+"""Frames that are read at a time."""
+
+
+def stored_frames(
+    review: Review, labelled: bool | None = None, look: Callable[[], None] = lambda: None
+) -> Iterator[ReviewFrame]:
+    """All frames that a map has stored for review, the newest first; those that are read may be discarded meanwhile.
+
+    Args:
+        labelled: only frames with a label, or without one; None: all.
+        look: is called before each page.
+    """
+    before: int | None = None
+    while True:
+        look()
+        page = review.page(before, PAGE, labelled).frames
+        yield from page
+        if len(page) < PAGE:
+            return
+        before = page[-1].number

@@ -53,6 +53,15 @@ class IndexStatus(BaseModel):
     )
 
 
+class ErasureReport(BaseModel):
+    """The leftovers of deleted places, and of former frames, that were overwritten or removed."""
+
+    model_config = ConfigDict(frozen=True)
+
+    rows: int = Field(ge=0, description="Descriptors that were overwritten, or whose files or rows were removed.")
+    bytes: int = Field(ge=0, description="Bytes of the descriptors, and those by which databases became smaller.")
+
+
 class KeypointsStatus(BaseModel):
     """The keypoints that a map keeps."""
 

@@ -10,6 +10,7 @@ never used again.  A search returns rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol, overload
 
@@ -36,7 +37,7 @@ from core.maps.records import (
 )
 from core.maps.review import Review
 from core.maps.selection import Selection
-from core.maps.status import IndexStatus, Progress, StorageStatus, no_progress
+from core.maps.status import ErasureReport, IndexStatus, Progress, StorageStatus, no_progress
 from core.maps.transfer import Transfer
 from core.places import Look, Neighborhood, Place, PlaceFields, Whereabouts
 
@@ -325,6 +326,26 @@ class Map(Protocol):
             progress: called with the number of rows that are done and of all; if it raises, nothing changes.
         """
 
+    def drop_pictures(self, before: datetime, most: int) -> int:
+        """Delete the pictures of up to ``most`` places that were enrolled before a moment; returns how many there were.
+
+        The places stay, and so do their keypoints.
+        """
+
+    def erase(self, progress: Progress = no_progress) -> ErasureReport:
+        """Overwrite or remove what places that were deleted, and former frames, have left where the map is stored.
+
+        Afterwards no file of the map has bytes of their pictures, descriptors or keypoints.  In PostgreSQL and Milvus
+        the rows are gone, and it is theirs to use their room again.
+
+        Args:
+            progress: called with the number of rows done and of all; its exceptions end the work, which can be done
+                again.
+
+        Raises:
+            MapBusy: what was deleted is still being read; try again.
+        """
+
     def storage_status(self) -> StorageStatus:
         """How much room the map takes."""
 
@@ -348,7 +369,8 @@ class Map(Protocol):
 
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
-            UnknownPlace, RepeatedLook, TooManyLooks: a look is of no place, or of one that cannot have it.
+            UnknownPlace, RepeatedLook, LookNameTaken, TooManyLooks: a look is of no place, or of one that cannot have
+                it.
             NoRegions: a descriptor is all zero.
             ValueError: descriptors or a digest of the wrong kind.
         """
@@ -410,8 +432,14 @@ class Map(Protocol):
             UnknownPlace, UnknownLook.
         """
 
+    def forget_looks(self, addresses: Sequence[str]) -> int:
+        """Delete looks by address, all that there are or, if this raises, none; returns how many there were."""
+
     def learnt_looks(self) -> dict[int, Look]:
         """The looks that were learnt from runs, by row."""
+
+    def count_learnt(self) -> int:
+        """How many places were learnt from runs, or have looks that were."""
 
     def count_served(self, counts: Mapping[int, tuple[int, int, int]]) -> None:
         """Add to how looks have served, by row: frames won rightly, won wrongly, and passed; in one write.
@@ -422,8 +450,34 @@ class Map(Protocol):
     def withdraw(self, rows: Sequence[int]) -> int:
         """Delete learnt looks by row, all or, if this raises, none; returns how many were there."""
 
-    def forget_learnt(self, run: str) -> int:
-        """Delete the looks that were learnt from a run, all or, if this raises, none; returns how many there were."""
+    def learn(self, look: Enrolment, instead: Sequence[int], most_places: int | None = None) -> tuple[Change, int]:
+        """Add a learnt look to a place, and delete learnt looks to make room for it, all or, if this raises, nothing.
+
+        Args:
+            instead: the rows of the looks that go.
+            most_places: how many places of the map may be learnt, or have learnt looks; None: all.
+
+        Returns:
+            What changed, and how many looks were deleted; none if the place has the look.
+
+        Raises:
+            UnknownPlace, RepeatedLook, LookNameTaken, NoRegions, ValueError: as of :meth:`enrol`.
+            TooManyLooks: the place, or the map, may not have it.
+        """
+
+    def forget_learnt(self, run: str | None, since: datetime | None = None, until: datetime | None = None) -> int:
+        """Delete the looks that were learnt from a run or in a period, all or, if this raises, none.
+
+        Args:
+            run: None: any.
+            since, until: when they were added, the end apart; None: there is no bound.
+
+        Returns:
+            How many there were.
+        """
+
+    def forget_new_ground(self, run: str) -> int:
+        """Delete the places that were learnt from a run, all or, if this raises, none; returns how many there were."""
 
     def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
         """Delete the places that fulfil some conditions, all or none; returns their ids.

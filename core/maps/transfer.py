@@ -32,8 +32,11 @@ class Transfer(Protocol):
         Of the address of a look it is its place, with the camera, the time and the picture of its own frame.
         """
 
-    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
+    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> list[str]:
         """Store places of another map with their history, all of them or, if this raises, none.
+
+        Returns:
+            The addresses of the looks that were left out, because their places are gone or cannot have them.
 
         Raises:
             ValueError: a descriptor is of the wrong kind.

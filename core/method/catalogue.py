@@ -25,13 +25,13 @@ from core.errors import InvalidIdentifier, InvalidModel, UnknownEncoder
 from core.judgement.verdict import Calibration
 from core.method import DEFAULT_ENCODER as DEFAULT_ENCODER
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
-from core.method.features import FeatureExtractor, projection_tensors
+from core.method.features import FeatureExtractor, projection_arrays
 from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
 from core.names import file_names
+from core.networks.backbone import Device, Precision
 from core.networks.files import open_network
-from core.networks.forward import Device, Precision
 from core.networks.identity import canonical_json
 from core.networks.network import NAMES as NETWORK_NAMES
 
@@ -108,12 +108,12 @@ def save_encoder(
         "golden": canary.descriptor.astype(np.float16),
         "golden_local": canary.local,
     }
-    for name, tensor in projection_tensors(encoder.extractor.projections).items():
-        tensors[f"{PROJECTION}{name}"] = tensor.numpy()
-    for name, tensor in projection_tensors(encoder.extractor.cells).items():
-        tensors[f"{CELLS}{name}"] = tensor.numpy()
+    for name, array in projection_arrays(encoder.extractor.projections).items():
+        tensors[f"{PROJECTION}{name}"] = array
+    for name, array in projection_arrays(encoder.extractor.cells).items():
+        tensors[f"{CELLS}{name}"] = array
     if encoder.whitening is not None:
-        tensors |= {f"{WHITENING}{name}": tensor.numpy() for name, tensor in encoder.whitening.tensors().items()}
+        tensors |= {f"{WHITENING}{name}": array for name, array in encoder.whitening.arrays().items()}
     path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
     _write(path, tensors, header)
     return path

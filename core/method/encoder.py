@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -18,21 +17,25 @@ from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
 from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors, promise
 from core.method.equations import Normalization
-from core.method.features import FeatureDefinition, FeatureExtractor, content_of, projection_tensors
+from core.method.features import FeatureDefinition, FeatureExtractor, content_of, projection_arrays
 from core.method.projection import Projection
 from core.method.regions import Regions
 from core.method.vlad import aggregate, are_normalized, scores
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
-from core.networks.forward import Device, Precision, has_bfloat16
-from core.networks.identity import json_digest, tensors_digest
-from core.networks.network import ShallowNetwork
-from core.threads import each
+from core.networks.backbone import Device, Precision
+from core.networks.identity import arrays_digest, json_digest
+from core.threads import allowed_threads, each
 
 Array = NDArray[np.float32]
 
 GOLDEN_COSINE = 0.999
 """Least cosine of the descriptors of a machine, or of a lower precision, to the golden ones."""
+
+
+LOWER: dict[Device, Precision] = {"cpu": "float32", "cuda": "float16"}
+"""The precision that is worth a trial by itself.  On the processor no packaged encoder keeps its descriptors in
+bfloat16, and a trial would load torch for it at every start."""
 
 
 class EncoderDefinition(FeatureDefinition):
@@ -204,7 +207,7 @@ class Encoder:
         if len(hidden) != len(frames):
             raise ValueError(f"{len(hidden)} masks for {len(frames)} frames")
         shown = list(zip(frames, hidden, strict=True))
-        return each(lambda frame: self.encode(*frame), shown, torch.get_num_threads())
+        return each(lambda frame: self.encode(*frame), shown, allowed_threads())
 
     def describe(self, activations: Sequence[Array], forward: float = 0.0) -> Encoding:
         """Encode a frame whose activations are known.
@@ -260,8 +263,8 @@ class Encoder:
         with each other, whichever machine made them.
 
         Args:
-            precision: "auto" takes bfloat16 if the processor multiplies it, or float16 on a GPU, if the descriptors of
-                a few frames have a cosine of at least ``GOLDEN_COSINE`` to those of float32.
+            precision: "auto" takes float16 on a GPU if the descriptors of a few frames have a cosine of at least
+                ``GOLDEN_COSINE`` to those of float32, and is float32 on the processor.
             device: of the forward pass.
 
         Returns:
@@ -272,7 +275,7 @@ class Encoder:
             GoldenMismatch: a lower precision was requested, and it changes the descriptors too much.
         """
         self.extractor.compute("float32", device)
-        lower = self._lower_precision(device) if precision == "auto" else precision
+        lower = LOWER[device] if precision == "auto" else precision
         if lower == "float32":
             return lower
         frames = [canary_frame(), canary_frame()[:, ::-1].copy(), 255 - canary_frame()]
@@ -287,14 +290,6 @@ class Encoder:
                 raise
             return "float32"
         return lower
-
-    def _lower_precision(self, device: Device) -> Precision:
-        """The precision that is worth a trial on a device."""
-        if not isinstance(self.extractor.backbone, ShallowNetwork):
-            return "float32"
-        if device == "cuda":
-            return "float16"
-        return "bfloat16" if has_bfloat16() else "float32"
 
     def _hold_against(self, made: Encoding, descriptor: NDArray[Any], local: Cells, what: str) -> None:
         for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
@@ -332,16 +327,16 @@ def encoder_identity(
     cells: Mapping[str, Projection] | None = None,
 ) -> str:
     """``<name>@<sha256>`` over everything that can change a descriptor, tensors by content."""
-    centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
+    centers = arrays_digest({"centers": vocabulary.centers})
     fields: dict[str, Any] = {
         "features": vocabulary.origin,
         "vocabulary": centers,
         "definition": content_of(definition),
     }
     if whitening is not None:
-        fields["whitening"] = tensors_digest(whitening.tensors())
+        fields["whitening"] = arrays_digest(whitening.arrays())
     if cells:
-        fields["cells"] = tensors_digest(projection_tensors(cells))
+        fields["cells"] = arrays_digest(projection_arrays(cells))
     return f"{name}@{json_digest(fields)}"
 
 

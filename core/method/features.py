@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from torch import Tensor
 
 from core.errors import InvalidModel
 from core.frames.masks import Mask
@@ -19,13 +16,11 @@ from core.method.equations import unit_length
 from core.method.parts import cells, pooled
 from core.method.projection import Projection
 from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
-from core.networks.backbone import Backbone
-from core.networks.forward import Device, GraphPass, Precision, TorchPass, cuda_pass
-from core.networks.identity import json_digest, tensors_digest
+from core.networks.backbone import Array, Device, OwnPass, Precision
+from core.networks.forward import forward_pass
+from core.networks.identity import arrays_digest, json_digest
 from core.networks.network import ShallowNetwork
 from core.threads import keep_numpy_single_threaded
-
-Array = NDArray[np.float32]
 
 
 class FeatureDefinition(BaseModel):
@@ -91,7 +86,7 @@ class FeatureExtractor:
 
     def __init__(
         self,
-        backbone: Backbone,
+        backbone: ShallowNetwork | OwnPass,
         definition: FeatureDefinition,
         projections: Mapping[str, Projection] | None = None,
         cells: Mapping[str, Projection] | None = None,
@@ -100,6 +95,7 @@ class FeatureExtractor:
             raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
         keep_numpy_single_threaded()
         self.backbone, self.definition = backbone, definition
+        self._computed: tuple[Precision, Device] | None = None
         self.compute()
         self.projections, self.cells = dict(projections or {}), dict(cells or {})
         for layer, values in definition.projected().items():
@@ -107,11 +103,11 @@ class FeatureExtractor:
                 raise InvalidModel(f"the encoder needs a projection of {layer} to {values} values.")
         parts: dict[str, Any] = {
             "network": backbone.describe(),
-            "weights": tensors_digest(backbone.weights()),
+            "weights": arrays_digest(backbone.weights()),
             "features": content_of(definition, set(FeatureDefinition.model_fields)),
         }
         if definition.projected():
-            parts["projections"] = tensors_digest(projection_tensors(self.projections))
+            parts["projections"] = arrays_digest(projection_arrays(self.projections))
         self.origin = json_digest(parts)
         """The identity of the features; a vocabulary must have been trained on features of the same identity."""
 
@@ -121,18 +117,10 @@ class FeatureExtractor:
         Raises:
             InvalidModel: this machine or this network cannot compute so.
         """
-        network, plain = self.backbone, (precision, device) == ("float32", "cpu")
-        self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
-        """The forward pass in use: float32 [B, 3, H, W] to one float32 [B, K, X, Y] for each output."""
-        if isinstance(network, ShallowNetwork):
-            if device == "cuda":
-                self.forward = cuda_pass(network, precision)
-            else:
-                self.forward = GraphPass(network) if plain else TorchPass(network, precision)
-        elif not plain:
-            raise InvalidModel(
-                "a plugged or imported network runs on the CPU in float32, unless it moves itself to another device."
-            )
+        if (precision, device) != self._computed:
+            self.forward = forward_pass(self.backbone, precision, device)
+            """The forward pass in use: float32 [B, H, W, 3] to one float32 [B, X, Y, K] for each output."""
+            self._computed = precision, device
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
         """Of each frame the rectified maps of each output, float32 [X, Y, K]; see :meth:`maps`."""
@@ -155,9 +143,7 @@ class FeatureExtractor:
             if mask is not None:
                 image[mask.covered(shown.height, shown.width)] = 0
             blank.append(contrast(frame, mask) < self.definition.least_contrast)
-        with torch.inference_mode():
-            outputs = self.forward(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
-        maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
+        maps = list(self.forward(batch))
         for index, mask in enumerate(hidden):
             for layer in maps:
                 if blank[index]:
@@ -242,10 +228,9 @@ def content_of(definition: BaseModel, fields: set[str] | None = None) -> dict[st
     return definition.model_dump(mode="json", include=fields, exclude_none=True)
 
 
-def projection_tensors(projections: Mapping[str, Projection]) -> dict[str, torch.Tensor]:
-    """The tensors of projections by name: ``<layer>.mean`` and ``<layer>.matrix``."""
-    tensors: dict[str, torch.Tensor] = {}
+def projection_arrays(projections: Mapping[str, Projection]) -> dict[str, Array]:
+    """The arrays of projections by name: ``<layer>.mean`` and ``<layer>.matrix``."""
+    arrays: dict[str, Array] = {}
     for layer, projection in projections.items():
-        tensors[f"{layer}.mean"] = torch.from_numpy(projection.mean)
-        tensors[f"{layer}.matrix"] = torch.from_numpy(projection.matrix)
-    return tensors
+        arrays[f"{layer}.mean"], arrays[f"{layer}.matrix"] = projection.mean, projection.matrix
+    return arrays

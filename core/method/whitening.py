@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from core.errors import InvalidModel
@@ -44,9 +43,9 @@ class Whitening:
         whitened[~descriptors.any(axis=1)] = 0
         return np.asarray(whitened, np.float32)
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def arrays(self) -> dict[str, Array]:
         """Its arrays by name."""
-        return {"mean": torch.from_numpy(self.mean), "matrix": torch.from_numpy(self.matrix)}
+        return {"mean": self.mean, "matrix": self.matrix}
 
 
 def fit_whitening(descriptors: Array, values: int) -> Whitening:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from core.errors import InvalidModel
-from core.networks.backbone import Backbone
-from core.networks.network import load_network, read_definition
+from core.networks.backbone import OwnPass
+from core.networks.network import ShallowNetwork, load_network, read_definition
 from core.networks.onnx_network import is_onnx_network, load_onnx_network, read_onnx_description
 
 
-def open_network(path: Path, outputs: tuple[str, ...]) -> Backbone:
+def open_network(path: Path, outputs: tuple[str, ...]) -> ShallowNetwork | OwnPass:
     """Load a network that returns the given layers.
 
     Raises:

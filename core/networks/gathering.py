@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 
-import torch
-from torch import Tensor
+import numpy as np
 
-Pass = Callable[[Tensor], tuple[Tensor, ...]]
+from core.networks.backbone import Array, Pass
 
 
 @dataclass(eq=False)
 class _Call:
     """The images of one caller; ``taken`` says that a thread computes them or has done so."""
 
-    images: Tensor
+    images: Array
     taken: bool = False
-    result: Future[tuple[Tensor, ...]] = field(default_factory=Future)
+    result: Future[tuple[Array, ...]] = field(default_factory=Future)
 
 
 class GatheredPass:
@@ -43,8 +42,8 @@ class GatheredPass:
         for lane in lanes:
             self._lanes.put(lane)
 
-    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
-        """B x 3 x H x W to one B x K x X x Y tensor for each output.
+    def __call__(self, images: Array) -> tuple[Array, ...]:
+        """float32 [B, H, W, 3] to one float32 [B, X, Y, K] for each output.
 
         Raises:
             Exception: the error that the pass raised on the batch that these images were in.
@@ -80,8 +79,9 @@ class GatheredPass:
 
 def _compute(lane: Pass, calls: Sequence[_Call]) -> None:
     try:
-        outputs = lane(torch.cat([call.images for call in calls]))
-        parts = [torch.split(output, [len(call.images) for call in calls]) for output in outputs]
+        outputs = lane(np.concatenate([call.images for call in calls]))
+        ends = np.cumsum([len(call.images) for call in calls])[:-1]
+        parts = [np.split(output, ends) for output in outputs]
     except Exception as error:
         for call in calls:
             call.result.set_exception(error)

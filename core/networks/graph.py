@@ -19,7 +19,7 @@ def onnx_graph(network: ShallowNetwork) -> ModelProto:
     """The layers and weights of a network.
 
     The graph's input ``IMAGES`` is float32 [B, H, W, 3].  It has one output for each of the network's, in that order:
-    float32 [B, X, Y, K], rectified as :meth:`ShallowNetwork.forward` gives it.
+    float32 [B, X, Y, K], rectified.
     """
     nodes = [helper.make_node("Transpose", [IMAGES], [CHANNELS_FIRST], perm=[0, 3, 1, 2])]
     values, rectified, found = CHANNELS_FIRST, "", {}
@@ -37,10 +37,7 @@ def onnx_graph(network: ShallowNetwork) -> ModelProto:
         network.definition.name,
         [helper.make_tensor_value_info(IMAGES, TensorProto.FLOAT, ["frames", "height", "width", 3])],
         [helper.make_tensor_value_info(output, TensorProto.FLOAT, None) for output in outputs],
-        [
-            numpy_helper.from_array(tensor.detach().contiguous().numpy(), name)
-            for name, tensor in network.weights().items()
-        ],
+        [numpy_helper.from_array(array, name) for name, array in network.weights().items()],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
 

@@ -1,4 +1,4 @@
-"""Identities: SHA-256 over canonical JSON and over the contents of tensors."""
+"""Identities: SHA-256 over canonical JSON and over the contents of arrays."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 
 def canonical_json(value: Any) -> str:
@@ -21,11 +21,11 @@ def json_digest(value: Any) -> str:
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
-def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
-    """The SHA-256 over names, dtypes, shapes and values, in the order of names; hexadecimal."""
+def arrays_digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """The SHA-256 over names, dtypes (as torch writes them), shapes and values, in the order of names; hexadecimal."""
     digest = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name].detach().cpu().contiguous()
-        digest.update(canonical_json([name, str(tensor.dtype), list(tensor.shape)]).encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name], order="C")
+        digest.update(canonical_json([name, f"torch.{array.dtype.name}", list(array.shape)]).encode())
+        digest.update(array.tobytes())
     return digest.hexdigest()

@@ -1,8 +1,8 @@
-"""The shallow CaffeNet-family backbone: its definition, its layers, its forward pass.
+"""The shallow CaffeNet-family backbone as data: its layers, its weights, its file.
 
 A network is described by data (:class:`NetworkDefinition`), so that HybridNet, AMOSNet, CaffeNet, AlexNet365 and the
-packaged distilled network are five descriptions of one module.  Only the layers up to the deepest one in use are built,
-and only their weights are loaded (thesis, section 4.3).
+packaged distilled network are five descriptions of one thing.  Only the weights up to the deepest layer in use are
+loaded (thesis, section 4.3).  ``forward.py`` computes it, and ``torch_network.py`` where torch is needed.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor, nn
+from safetensors.numpy import save_file
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
 from core.names import file_names
+from core.networks.backbone import Array
 
 FORMAT = "placerec-network/1"
 NAMES = file_names("a network")
@@ -114,6 +115,25 @@ class NetworkDefinition(BaseModel):
             last += 1
         return self.model_copy(update={"layers": self.layers[: last + 1]})
 
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``<layer>.weight``, [K, K before / groups, side, side], and ``<layer>.bias``, [K].
+
+        Raises:
+            InvalidModel: a convolution's channels, or those before it, are not shared out evenly among its groups.
+        """
+        shapes: dict[str, tuple[int, ...]] = {}
+        before = 3
+        for layer in self.convolutions():
+            if before % layer.groups or layer.channels % layer.groups:
+                raise InvalidModel(
+                    f"layer {layer.name} of {self.name!r} cannot be built: {before} and {layer.channels} channels "
+                    f"do not divide into {layer.groups} groups"
+                )
+            shapes[f"{layer.name}.weight"] = layer.channels, before // layer.groups, layer.kernel, layer.kernel
+            shapes[f"{layer.name}.bias"] = (layer.channels,)
+            before = layer.channels
+        return shapes
+
 
 def caffenet_definition(
     name: str,
@@ -150,75 +170,26 @@ def caffenet_definition(
     return NetworkDefinition(name=name, input=shown, layers=tuple(layers))
 
 
-class LocalResponseNormalization(nn.Module):
-    """x / (k + α/n · Σ x²)^β over n neighbouring channels, as both Caffe and torch compute it."""
-
-    def __init__(self, layer: Normalization) -> None:
-        super().__init__()
-        self.layer = layer
-
-    def forward(self, x: Tensor) -> Tensor:
-        layer = self.layer
-        wide = x.float() if x.dtype == torch.bfloat16 else x  # which torch's pooling of channels lacks
-        return nn.functional.local_response_norm(wide, layer.size, layer.alpha, layer.beta, layer.k).to(x.dtype)
-
-
-def build_layer(layer: Layer, channels: int) -> nn.Module:
-    """The torch module of one layer that receives ``channels`` input channels."""
-    match layer:
-        case Convolution():
-            return nn.Conv2d(channels, layer.channels, layer.kernel, layer.stride, layer.pad, groups=layer.groups)
-        case Relu(negative_slope=0.0):
-            return nn.ReLU(inplace=True)
-        case Relu():
-            return nn.LeakyReLU(layer.negative_slope, inplace=True)
-        case Pooling(method="max"):
-            return nn.MaxPool2d(layer.kernel, layer.stride, layer.pad, ceil_mode=layer.ceil)
-        case Pooling():
-            return nn.AvgPool2d(layer.kernel, layer.stride, layer.pad, ceil_mode=layer.ceil)
-        case Normalization():
-            return LocalResponseNormalization(layer)
-
-
-class ShallowNetwork(nn.Module):
+class ShallowNetwork:
     """A sequential network whose rectified convolutions and poolings can be read by name.
 
     Args:
         definition: the layers; those after the deepest output are left out.
         outputs: the convolutions and poolings to return, in this order.
+        weights: ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use; deeper ones are ignored.
 
     Raises:
-        InvalidModel: an output is not a convolution or pooling of the definition.
+        InvalidModel: an output is not a convolution or pooling of the definition; weights are missing, have another
+            shape, or are not finite.
     """
 
-    def __init__(self, definition: NetworkDefinition, outputs: Iterable[str]) -> None:
-        super().__init__()
+    def __init__(self, definition: NetworkDefinition, outputs: Iterable[str], weights: Mapping[str, Array]) -> None:
         self.outputs = tuple(outputs)
         self.definition = definition.truncated(self.outputs)
-        self.stages = nn.ModuleDict()
-        channels = 3
-        try:
-            for layer in self.definition.layers:
-                self.stages[layer.name] = build_layer(layer, channels)
-                channels = layer.channels if isinstance(layer, Convolution) else channels
-        except (KeyError, ValueError) as error:
-            raise InvalidModel(f"layer {layer.name} of {self.definition.name!r} cannot be built: {error}") from error
-
-    def forward(self, images: Tensor) -> tuple[Tensor, ...]:  # B x 3 x H x W
-        """The activations of the outputs (convolutions after their rectifier, and poolings), each [B, K, X, Y]."""
-        found: dict[str, Tensor] = {}
-        x, open_name = images, ""
-        for layer in self.definition.layers:
-            if open_name and not isinstance(layer, Relu):
-                found[open_name], open_name = x, ""
-            x = self.stages[layer.name](x)
-            if isinstance(layer, Convolution):
-                open_name = layer.name
-            elif isinstance(layer, Pooling) and layer.name in self.outputs:
-                found[layer.name] = x
-        if open_name:
-            found[open_name] = x
-        return tuple(found[name] for name in self.outputs)
+        self._weights = {
+            name: _checked(self.definition.name, name, shape, weights)
+            for name, shape in self.definition.weight_shapes().items()
+        }
 
     @property
     def input(self) -> InputDefinition:
@@ -229,38 +200,27 @@ class ShallowNetwork(nn.Module):
         """Everything besides the weights that can change an activation, as values for JSON; not the name."""
         return self.definition.model_dump(mode="json", exclude={"name"}) | {"outputs": list(self.outputs)}
 
-    def weights(self) -> dict[str, Tensor]:
-        """The tensors ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use."""
-        return {key.removeprefix("stages."): tensor for key, tensor in self.state_dict().items()}
-
-    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Load ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use; deeper ones are ignored.
-
-        Raises:
-            InvalidModel: a tensor is missing, has another shape, or is not finite.
-        """
-        for layer in self.definition.convolutions():
-            module = self.stages[layer.name]
-            for kind in ("weight", "bias"):
-                key = f"{layer.name}.{kind}"
-                target: Tensor = getattr(module, kind)
-                if key not in weights:
-                    raise InvalidModel(f"the weights of {self.definition.name!r} lack {key}")
-                tensor = weights[key]
-                if tensor.shape != target.shape:
-                    raise InvalidModel(
-                        f"{key} has shape {tuple(tensor.shape)}, the network needs {tuple(target.shape)}"
-                    )
-                if not torch.isfinite(tensor).all():
-                    raise InvalidModel(f"{key} holds values that are not finite")
-                with torch.no_grad():
-                    target.copy_(tensor.to(target.dtype))
+    def weights(self) -> dict[str, Array]:
+        """``<layer>.weight`` and ``<layer>.bias`` of each convolution in use, float32."""
+        return dict(self._weights)
 
 
-def save_network(path: Path, definition: NetworkDefinition, weights: Mapping[str, Tensor]) -> None:
+def _checked(network: str, name: str, shape: tuple[int, ...], weights: Mapping[str, Array]) -> Array:
+    """The weights of one name, float32."""
+    if name not in weights:
+        raise InvalidModel(f"the weights of {network!r} lack {name}")
+    found = np.asarray(weights[name], np.float32, order="C")
+    if found.shape != shape:
+        raise InvalidModel(f"{name} has shape {found.shape}, the network needs {shape}")
+    if not np.isfinite(found).all():
+        raise InvalidModel(f"{name} holds values that are not finite")
+    return found
+
+
+def save_network(path: Path, definition: NetworkDefinition, weights: Mapping[str, Array]) -> None:
     """Write definition and weights to one safetensors file."""
     metadata = {"format": FORMAT, "definition": definition.model_dump_json()}
-    save_file({name: tensor.contiguous() for name, tensor in weights.items()}, path, metadata)
+    save_file({name: np.ascontiguousarray(array) for name, array in weights.items()}, path, metadata)
     path.chmod(0o644)
 
 
@@ -271,7 +231,7 @@ def read_definition(path: Path) -> NetworkDefinition:
         InvalidModel: the file is missing, damaged or of another format.
     """
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(path, "np") as file:
             metadata = file.metadata() or {}
         if metadata.get("format") != FORMAT:
             raise InvalidModel(f"{path.name} is not a {FORMAT} file.")
@@ -286,13 +246,12 @@ def load_network(path: Path, outputs: Iterable[str]) -> ShallowNetwork:
     Raises:
         InvalidModel: the file or an output name cannot be used.
     """
-    network = ShallowNetwork(read_definition(path), outputs)
+    outputs = tuple(outputs)
+    definition = read_definition(path).truncated(outputs)
     try:
-        with safe_open(path, "pt") as file:
-            wanted = {f"{c.name}.{kind}" for c in network.definition.convolutions() for kind in ("weight", "bias")}
-            weights = {name: file.get_tensor(name) for name in wanted & set(file.keys())}
-    except (OSError, SafetensorError) as error:
+        with safe_open(path, "np") as file:
+            wanted = definition.weight_shapes().keys() & set(file.keys())
+            weights: dict[str, NDArray[Any]] = {name: file.get_tensor(name) for name in wanted}
+    except (OSError, SafetensorError, TypeError) as error:  # the last of a type that NumPy lacks
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
-    network.load_weights(weights)
-    # The input is channels last in memory, and the region pass reads the maps in that layout.
-    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return ShallowNetwork(definition, outputs, weights)

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
-from torch import Tensor
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
+from core.networks.backbone import Array
 from core.networks.description import NetworkDescription
 from core.networks.forward import GraphRunner
 from core.networks.onnx_graph import as_maps, check_graph, graph_input, graph_output, read_graph
@@ -29,7 +29,7 @@ class OnnxNetwork:
     """The backbone; it computes one frame after the other, so that no frame has a part in another one's features.
 
     Some networks compare the pictures of a batch with each other (CricaVPR), and many files take only one.  A call has
-    as many threads as torch has in the thread that calls it.  Thread-safe.
+    as many threads as the thread that calls it may use.  Thread-safe.
 
     Args:
         name: by which errors call the network.
@@ -55,19 +55,19 @@ class OnnxNetwork:
     def describe(self) -> dict[str, Any]:
         return self.description.model_dump(mode="json", include={"input", "output"}, exclude_none=True)
 
-    def weights(self) -> Mapping[str, Tensor]:
+    def weights(self) -> Mapping[str, NDArray[Any]]:
         """The whole graph, operators and weights, as bytes."""
-        return {"graph": torch.from_numpy(np.frombuffer(self._graph, np.uint8).copy())}
+        return {"graph": np.frombuffer(self._graph, np.uint8)}
 
-    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
-        """float32 [B, 3, H, W] to one float32 [B, K, X, Y].
+    def __call__(self, images: Array) -> tuple[Array, ...]:
+        """float32 [B, H, W, 3] to one float32 [B, X, Y, K].
 
         Raises:
             InvalidModel: the graph's output is not as its description says, or is not finite.
         """
-        frames = images.contiguous().numpy()
+        frames = np.ascontiguousarray(images.transpose(0, 3, 1, 2))
         found = [as_maps(self._run({self._input: frame[np.newaxis]})[0], self.description) for frame in frames]
-        return (torch.from_numpy(np.concatenate(found)),)
+        return (np.ascontiguousarray(np.concatenate(found).transpose(0, 2, 3, 1)),)
 
 
 def save_onnx_network(path: Path, name: str, graph: bytes, description: NetworkDescription) -> None:

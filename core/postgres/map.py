@@ -11,20 +11,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from core.errors import StorageFailure
+from core.errors import MapBusy, StorageFailure
 from core.ledger.maps import frames, record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
-from core.ledger.postgres import PostgresConnection, PostgresLedger, postgres_errors
+from core.ledger.postgres import LONG_SECONDS, PostgresConnection, PostgresLedger, postgres_errors
 from core.maps import moment
 from core.maps.records import MapRecord
 from core.maps.selection import Selection
-from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
+from core.maps.status import ErasureReport, IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
 from core.maps.store import Scope, Snapshot
 from core.postgres import rows
 from core.postgres.exporter import PostgresExporter
 from core.postgres.review import PostgresReview
+from core.postgres.sweep import sweep_objects
+from core.postgres.tables import ERASED_TABLES
 from core.postgres.writing import PostgresWrite
 
 if TYPE_CHECKING:
@@ -122,6 +124,33 @@ class PostgresMap(LedgerMap):
             state = record.state_of(connection, self.record.id)
         self.note(state, now)
         return state
+
+    def erase(self, progress: Progress = no_progress) -> ErasureReport:
+        """Delete the rows that dead places have left (:meth:`core.maps.store.Map.erase`), and vacuum their tables.
+
+        A query may need them for a minute after the place died, so this takes as long.
+        """
+        before, end = self.storage_status().database, time.monotonic() + rows.LEFT_SECONDS + 60
+        total = self._uncleared()
+        while left := self._uncleared():
+            progress(total - min(left, total), total)
+            if time.monotonic() > end:
+                raise MapBusy("What was deleted is still being read: erase it later.")
+            with self.database.transaction("delete what no place names any more") as whole:
+                self._tidy(MapConnection(whole, self.number))
+            if self._uncleared():
+                threading.Event().wait(1)
+        if self.objects is not None:
+            sweep_objects(self.database, self.objects)
+        with self.database.connection("vacuum", LONG_SECONDS) as connection:
+            for table in ERASED_TABLES:
+                connection.execute(f"VACUUM {table}")
+        self._room = None
+        return ErasureReport(rows=total, bytes=max(0, before - self.storage_status().database))
+
+    def _uncleared(self) -> int:
+        with self._reading() as connection:
+            return rows.uncleared(connection)
 
     def storage_status(self) -> StorageStatus:
         """How much room the map takes in PostgreSQL."""

@@ -86,6 +86,7 @@ _OLD_ROWS = Statement(
     .limit(ORPHANS_AT_ONCE)
     .with_for_update(skip_locked=True)
 )
+_UNCLEARED = Statement(select(func.count()).where(_R.map == bindparam("map"), _R.cleared == 0))
 _CLEAR_ROWS = Statement(update(DEAD_ROWS).where(_R.map == bindparam("map"), among(_R.row, "rows")).values(cleared=1))
 _FORGET_ROWS = Statement(
     delete(DEAD_ROWS).where(_R.map == bindparam("map"), _R.cleared == 1, _R.since < seconds_now() - bindparam("age"))
@@ -181,6 +182,11 @@ def clear_rows(connection: MapConnection) -> int:
         connection.execute(_FORGET_ROWS, age=REMEMBERED_SECONDS)
         connection.execute(_FORGET_REVISIONS, age=REMEMBERED_SECONDS)
     return len(rows)
+
+
+def uncleared(connection: MapConnection) -> int:
+    """How many rows have died of which something is stored yet."""
+    return int(connection.execute(_UNCLEARED)[0][0])
 
 
 def dead_since(connection: MapConnection, revision: int) -> list[int]:

@@ -84,6 +84,9 @@ _MORE = [
     ),
 ]
 
+ERASED_TABLES = ("places", "tokens", "pictures", "keypoints", "descriptors", "review_frames", "review_pictures")
+"""The tables with what a frame shows, which are vacuumed when deleted places are erased."""
+
 TABLES = (
     Tables("maps", 3, schema.METADATA),
     Tables("review", 1, review.METADATA),

@@ -16,15 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
+from core.geometry.keypoints import Keypoints
 from core.judgement.background import GUARD_FACTOR
 from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
-from core.judgement.trials import Trial, Trials, gathered, joined
-from core.judgement.verdict import Calibration, judge
+from core.judgement.trials import StagedTrials, Trial, gathered, joined_stages
+from core.judgement.verdict import Calibration, Judgement, judge
 from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot, own_poses
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE
-from core.recognition.stages import agree, neighborhood_of
+from core.recognition.comparison import MapComparison
+from core.recognition.question import Verifier
+from core.recognition.stages import Candidates, agree, neighborhood_of
+from core.recognition.verification import verify_candidates
 
 Item = TypeVar("Item")
 Flags = NDArray[np.bool_]
@@ -44,6 +48,12 @@ FROM_ITSELF = (
 """The warning of a calibration from the map's own frames."""
 
 
+FROM_RUNS = (
+    "Which places the frames show is known from the frames before and after them, and from odometry: where a run errs, "
+    "these figures err with it."
+)
+"""The warning of a calibration from the runs of robots."""
+
 FROM_DOUBT = (
     "The labelled frames are those that were stored for review; without recognized ones among them they are harder "
     "than the frames that come."
@@ -60,6 +70,7 @@ class LabelledQuery:
     true: bool [rows], the rows of the snapshot that show the query's place; none, if the map lacks it.
     absent: bool [rows], rows that are always left out, such as the query's own.
     around: bool [rows], rows that are left out as well to make the place unknown.
+    keypoints: of its frame; None: they are not known, and nothing is verified.
     """
 
     descriptor: NDArray[np.float32]
@@ -67,6 +78,7 @@ class LabelledQuery:
     true: Flags
     absent: Flags
     around: Flags
+    keypoints: Keypoints | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,7 @@ def queries_from_labels(
     encodings: Sequence[Encoding],
     places: Sequence[str | None],
     own: Sequence[str | None] | None = None,
+    keypoints: Sequence[Keypoints | None] | None = None,
 ) -> LabelledQueries:
     """The queries of a calibration from labelled frames.
 
@@ -99,26 +112,48 @@ def queries_from_labels(
         places: for each frame the id of the place that it shows; None if the map lacks the place.
         own: for each frame the place, or the address of the look, whose frame it is itself, which is then left out;
             None: none is.
+        keypoints: of each frame, for maps that verify; None: not known.
 
     Raises:
         UnknownPlace: the map has no place of one of the ids.
     """
     rows = _rows_of(map_, snapshot, [place for place in places if place is not None])
     own_rows = [None if one is None else map_.rows_of([one])[0] for one in own or [None] * len(places)]
+    shown = [None if place is None else rows[place] for place in places]
+    return queries_from_rows(map_, snapshot, encodings, shown, own_rows, keypoints)
+
+
+def queries_from_rows(
+    map_: Map,
+    snapshot: Snapshot,
+    encodings: Sequence[Encoding],
+    rows: Sequence[int | None],
+    own: Sequence[int | None] | None = None,
+    keypoints: Sequence[Keypoints | None] | None = None,
+) -> LabelledQueries:
+    """The queries of a calibration from frames of which the places are known as rows of a snapshot.
+
+    Args:
+        encodings, keypoints: as of :func:`queries_from_labels`.
+        rows: for each frame the row of the place that it shows; None if the map lacks the place.
+        own: for each frame the row that it is itself; None: none is.
+    """
     near = _SamePlace(map_, snapshot)
     nothing = np.zeros(snapshot.rows, np.bool_)
+    itself = [None] * len(rows) if own is None else own
+    found = [None] * len(rows) if keypoints is None else keypoints
 
     def made() -> Iterator[LabelledQuery]:
-        for encoding, place, own_row in zip(encodings, places, own_rows, strict=True):
-            if place is None:
-                yield LabelledQuery(encoding.descriptor, encoding.local, nothing, nothing, nothing)
+        for encoding, row, own_row, points in zip(encodings, rows, itself, found, strict=True):
+            if row is None:
+                yield LabelledQuery(encoding.descriptor, encoding.local, nothing, nothing, nothing, points)
                 continue
-            row, absent = rows[place], nothing
+            absent = nothing
             if own_row is not None and own_row < snapshot.rows:
                 absent = nothing.copy()
                 absent[own_row] = True
             same, around = near(row) & ~absent, near(row, GUARD_FACTOR)
-            yield LabelledQuery(encoding.descriptor, encoding.local, same, absent, around)
+            yield LabelledQuery(encoding.descriptor, encoding.local, same, absent, around, points)
 
     return LabelledQueries(len(encodings), made())
 
@@ -152,7 +187,7 @@ def queries_from_traverse(
                 f"The frames of the sequence {sequence[:128]!r} have no poses: align the sequence with another one, or "
                 "state in pairs which places they show."
             )
-    queried = _spread(queried, most)
+    queried = spread(queried, most)
     nothing = np.zeros(snapshot.rows, np.bool_)
 
     def made() -> Iterator[LabelledQuery]:
@@ -161,7 +196,7 @@ def queries_from_traverse(
             partner = row if pairs is None else (None if (shown := pairs[place]) is None else rows[shown])
             true = nothing if partner is None else near(partner) & ~own
             around = nothing if partner is None else near(partner, GUARD_FACTOR)
-            yield LabelledQuery(*_stored(snapshot, row), true, own, around)
+            yield LabelledQuery(*_stored(snapshot, row), true, own, around, _keypoints(map_, row))
 
     aligned = 0 if pairs is not None else sum(not near.has_pose(rows[place]) for place in queried)
     return LabelledQueries(len(queried), made(), snapshot.alive & ~own, aligned)
@@ -177,7 +212,7 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
         most: the largest number of queries; they are spread evenly over the map.
     """
     near = _SamePlace(map_, snapshot)
-    queried = _spread(np.flatnonzero(snapshot.alive).tolist(), most)
+    queried = spread(np.flatnonzero(snapshot.alive).tolist(), most)
 
     def made() -> Iterator[LabelledQuery]:
         for row in queried:
@@ -185,7 +220,8 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
             itself[row] = True
             inner = near(row, 0.5)
             absent = inner if (same & ~inner).any() else itself
-            yield LabelledQuery(*_stored(snapshot, row), same & ~absent, absent, near(row, GUARD_FACTOR))
+            around = near(row, GUARD_FACTOR)
+            yield LabelledQuery(*_stored(snapshot, row), same & ~absent, absent, around, _keypoints(map_, row))
 
     return LabelledQueries(len(queried), made())
 
@@ -197,19 +233,22 @@ def run_trials(
     queries: LabelledQueries,
     base: Calibration,
     advance: ProgressCallback,
-    without_place: bool = True,
-) -> Trials:
-    """The answers to all queries, each with its place in the map and without it.
+    without_place: int = 1,
+) -> StagedTrials:
+    """The answers to all queries, with their places in the map and without them.
+
+    Those of which keypoints are known are verified, too.
 
     Args:
         base: the calibration by which the answers are judged.
-        without_place: whether the map is also queried without their place.
+        without_place: every so manieth query is one of the map without its place, too; 0: none.
 
     Raises:
         StorageFailure: the map's files cannot be read.
         Others: what ``advance`` raises.
     """
-    found: list[Trial] = []
+    two: list[Trial] = []
+    three: list[Trial] = []
     number = 0
     while batch := list(islice(queries.made, TOGETHER)):
         descriptors = np.stack([query.descriptor for query in batch])
@@ -218,7 +257,7 @@ def run_trials(
         for query, ranking in zip(batch, snapshot.among(living).search(descriptors), strict=True):
             there = query.true & snapshot.alive & ~query.absent
             cases = [query.absent]
-            if without_place and there.any():
+            if without_place and number % without_place == 0 and there.any():
                 cases.append(query.absent | query.around)
             for left_out in cases:
                 allowed = living & ~left_out
@@ -227,12 +266,15 @@ def run_trials(
                     (ranking,) = scope.search(query.descriptor[np.newaxis])
                 retained = allowed[ranking[0]]
                 known = bool((there & ~left_out).any())
-                found += _trial(
+                tried = _trial(
                     map_, encoder, scope, query, (ranking[0][retained], ranking[1][retained]), base, known, number
                 )
+                if tried is not None:
+                    two.append(tried[0])
+                    three.append(tried[1])
             number += 1
             advance(number, queries.count)
-    return gathered(found)
+    return StagedTrials(gathered(two), gathered(three))
 
 
 def calibrate_map(
@@ -260,16 +302,16 @@ def calibrate_map(
     base = encoder.calibration.model_copy(update={"decision": "leading"})
     sets = [queries] if beside is None else [beside, queries]
     done, total = 0, sum(one.count for one in sets)
-    trials = []
+    staged = []
     for one in sets:
         before = done
 
         def advanced(count: int, _of: int, before: int = before) -> None:
             advance(before + count, total)
 
-        trials.append(run_trials(map_, encoder, snapshot, one, base, advanced))
+        staged.append(run_trials(map_, encoder, snapshot, one, base, advanced))
         done += one.count
-    return fit_map_calibration(joined(trials), base, target, source)
+    return fit_map_calibration(joined_stages(staged), base, target, source)
 
 
 def adjust_to_labels(
@@ -288,8 +330,8 @@ def adjust_to_labels(
         Others: what ``advance`` raises.
     """
     base = encoder.calibration
-    trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=False)
-    return adjust_calibration(trials, base, source)
+    trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=0)
+    return adjust_calibration(trials.answered(base), base, source)
 
 
 def calibration_warnings(found: FittedCalibration, method: str, aligned: int = 0) -> list[str]:
@@ -298,7 +340,8 @@ def calibration_warnings(found: FittedCalibration, method: str, aligned: int = 0
     Args:
         aligned: as in :class:`LabelledQueries`.
     """
-    warnings = [{"map": FROM_ITSELF, "labels": FROM_DOUBT}[method]] if method in ("map", "labels") else []
+    warned = {"map": FROM_ITSELF, "labels": FROM_DOUBT, "runs": FROM_RUNS}
+    warnings = [warned[method]] if method in warned else []
     if aligned:
         warnings.append(
             f"Which place {aligned} of the frames show is known from an alignment alone, not from poses of their own: "
@@ -345,13 +388,36 @@ def _trial(
     base: Calibration,
     known: bool,
     number: int,
-) -> list[Trial]:
-    """The answer to one query in the map of the places of ``scope``, by their ranking; empty if there is none."""
+) -> tuple[Trial, Trial] | None:
+    """The answers to one query by two stages and by three, in the map of the places of ``scope``, by their ranking.
+
+    None if that map is empty.
+    """
     if not len(ranking[0]):
-        return []
+        return None
+
+    def judged(candidates: Candidates) -> Judgement:
+        return judge(
+            candidates.ordered,
+            candidates.whereabouts,
+            base,
+            neighborhood_of(map_),
+            candidates.examined,
+            None,
+            candidates.geometry,
+        )
+
+    def tried(candidates: Candidates, judgement: Judgement) -> Trial:
+        return Trial(judgement, known, known and bool(query.true[candidates.rows[0]]), number)
+
     candidates = agree(map_, encoder, scope, query.descriptor, query.local, ranking)
-    judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
-    return [Trial(judgement, known, known and bool(query.true[candidates.rows[0]]), number)]
+    before = tried(candidates, judged(candidates))
+    if (keypoints := query.keypoints) is None:
+        return before, before
+    verifier = Verifier("always", lambda: keypoints)
+    comparison = MapComparison(map_, encoder, query.local, verifier)
+    ranked, judgement, _ = verify_candidates(candidates, judged, verifier, base, comparison)
+    return before, tried(ranked, judgement)
 
 
 def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:
@@ -359,7 +425,12 @@ def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:
     return snapshot.descriptors_at(rows)[0], snapshot.locals_at(rows)[0]
 
 
-def _spread(values: list[Item], most: int) -> list[Item]:
+def _keypoints(map_: Map, row: int) -> Keypoints | None:
+    """The stored keypoints of a place; None where there are none, or the map does not verify."""
+    return map_.keypoints_at([row])[0] if map_.record.verification else None
+
+
+def spread(values: list[Item], most: int) -> list[Item]:
     """At most ``most`` of the values, evenly spread."""
     chosen = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
     return [values[index] for index in np.unique(chosen)]

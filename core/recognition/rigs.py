@@ -13,6 +13,7 @@ from core.geometry.verification import Verification
 from core.judgement.fusion import CameraRanking, Fused, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
+from core.judgement.verdict import Judgement
 from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.question import Query
@@ -31,7 +32,8 @@ def locate_rig(
     Args:
         encoder: the map's encoder.
         queries: the rig's frames that have regions, with one question; at least one.  With ``auto`` the candidates of
-            each camera are verified whose own scores leave doubt.
+            all cameras are verified if the scores of one leave doubt: a place that was verified for one camera alone
+            cannot be compared with those of another.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -50,6 +52,11 @@ def locate_rig(
             third_stage(map_, encoder, candidates, judged, query)
             for candidates, query in zip(ranked, queries, strict=True)
         ]
+        if any(stage.state == "verified" for *_, stage in verified):
+            verified = [
+                one if _is_verified(one[0]) else _later(one, third_stage(map_, encoder, candidates, judged, query))
+                for one, candidates, query in zip(verified, ranked, map(_all_of, queries), strict=True)
+            ]
         finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
         views = [
             CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry)
@@ -75,6 +82,28 @@ def locate_rig(
         candidates = candidates.take(np.append(retained, np.arange(len(places), len(candidates.rows))))
     milliseconds = 1e3 * (time.perf_counter() - began) - stage.milliseconds
     return Answer(judgement, matches, weights, calibration, milliseconds, pose, encodings[0], candidates, stage, rivals)
+
+
+Verified = tuple[Candidates, Judgement, ThirdStage]
+
+
+def _all_of(query: Query) -> Query:
+    """The query with its candidates to be verified in any case, and its keypoints, if they were found already."""
+    if (verifier := query.verifier) is None:
+        return query
+    question = replace(query.question, verify="always")
+    return replace(query, question=question, find_keypoints=lambda: verifier.keypoints)
+
+
+def _is_verified(candidates: Candidates) -> bool:
+    """Whether more than the best match was verified."""
+    return sum(one is not None for one in candidates.verifications) > 1
+
+
+def _later(before: Verified, after: Verified) -> Verified:
+    """The outcome of a second verification, which took the time of both."""
+    candidates, judgement, stage = after
+    return candidates, judgement, replace(stage, milliseconds=before[2].milliseconds + stage.milliseconds)
 
 
 def _joint_stage(stages: Sequence[ThirdStage]) -> ThirdStage:

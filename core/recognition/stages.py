@@ -214,7 +214,8 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
 
     for length in (HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])
-        found = examine(ordered[:length], places, neighborhood, *second_stage(encoder, local, local_at))
+        alone = scores[:length]
+        found = examine(ordered[:length], places, neighborhood, *second_stage(encoder, local, local_at), alone=alone)
         order = found.order
         candidates = Candidates(
             rows[order],
@@ -350,12 +351,13 @@ def examine(
     screened: int = 0,
     promise: Callable[[Positions], Array] | None = None,
     others: int = TOP_PLACES,
+    alone: Array | None = None,
 ) -> Examined:
     """Raise the scores of the best places of a ranking by the gains of the second stage.
 
     It examines the first ``candidates`` places or, if more are ``screened``, the most promising of these; of several
-    frames of one view first one.  As long as fewer than ``others`` of the examined places are other than the best
-    place, it then examines the next that are.
+    frames of one view first one, and another in the place of one that turns out not to be believed.  As long as fewer
+    than ``others`` of the examined places are other than the best place, it then examines the next that are.
 
     Args:
         scores: float32 [n], the scores of the first stage, best first.
@@ -363,6 +365,8 @@ def examine(
         neighborhood: which places count as the same place.
         candidates, gains, screened, promise: as of :class:`CellComparison`.
         others: how many of the examined places have to be other than the best place, if the map has that many.
+        alone: float32 [n], the scores of the first stage without a prior, by which frames are believed; None: there is
+            no prior.
     """
     raised = scores.copy()
     done = np.zeros(len(scores), np.bool_)
@@ -375,14 +379,30 @@ def examine(
     for _ in range(ROUNDS):
         if not len(ahead):
             break
-        raised[ahead] += gains(ahead)
-        done[ahead] = True
-        best = int(np.flatnonzero(done)[np.argmax(raised[done])])
+        while len(ahead):
+            raised[ahead] += gains(ahead)
+            done[ahead] = True
+            denied = done & ((raised if alone is None else alone + (raised - scores)) < whereabouts.least)
+            ahead = _instead(queue, whereabouts, done, denied)
+        counted = done if denied[done].all() else done & ~denied
+        best = int(np.flatnonzero(counted)[np.argmax(raised[counted])])
         elsewhere = whereabouts.others(best, neighborhood)
         missing = max(0, others - int((done & elsewhere).sum()))
         ahead = queue[(elsewhere & ~done)[queue]][:missing]
     order = np.argsort(-raised, kind="stable")
     return Examined(order, raised[order], done[order])
+
+
+def _instead(
+    queue: Positions, whereabouts: Whereabouts, done: NDArray[np.bool_], denied: NDArray[np.bool_]
+) -> Positions:
+    """The next frame of each view of which some frames were examined and none is believed."""
+    if not denied.any():
+        return queue[:0]
+    views = whereabouts.view_keys()
+    lacking = np.setdiff1d(views[denied], views[done & ~denied])
+    waiting = queue[~done[queue] & np.isin(views[queue], lacking)]
+    return waiting[~whereabouts.repeats(waiting)]
 
 
 def _views_first(whereabouts: Whereabouts, queue: Positions) -> Positions:

@@ -1,4 +1,4 @@
-"""Bags: rosbag2 (SQLite, MCAP) and ROS 1; their topics, the frames of one of them, and the path in another."""
+"""Bags: rosbag2 (SQLite, MCAP), ROS 1, and MCAP of Foxglove; their topics, the frames of one, the path in another."""
 
 from __future__ import annotations
 
@@ -15,14 +15,27 @@ from pathlib import Path
 import numpy as np
 
 from core.errors import InvalidRecording, InvalidTrajectory, UnknownTopic
+from core.frames.intrinsics import Intrinsics
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES, natural_key
 from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id, utc
 from core.recordings.mcap_storage import McapStorage
-from core.recordings.messages import FIX, POSE_TYPES, check_installed, picture_of, pose_of
+from core.recordings.messages import (
+    CAMERA_INFO,
+    FIXES,
+    POSE_TYPES,
+    TRANSFORM_TYPES,
+    check_installed,
+    frame_of,
+    intrinsics_of,
+    picture_of,
+    pose_of,
+    transforms_of,
+)
 from core.recordings.ros1_storage import Ros1Storage
 from core.recordings.sqlite_storage import SqliteStorage
 from core.recordings.storage import Entry, Storage, Topic
 from core.recordings.trajectory import Trajectory
+from core.recordings.transforms import TransformTree
 
 STORAGES: dict[str, type[SqliteStorage] | type[McapStorage] | type[Ros1Storage]] = {
     ".db3": SqliteStorage,
@@ -80,7 +93,7 @@ class Bag:
         check_installed()
         self.path, self.remarks = path, list[str]()
         self._lock = threading.Lock()  # of the files: frames may be loaded by any thread
-        self._unpacked = tempfile.TemporaryDirectory(prefix="placerec-")
+        self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[tuple[Path, Storage]] = []
         try:
             for file in bag_files(path):
@@ -102,6 +115,7 @@ class Bag:
         """The file that the recorder has compressed as a whole, unpacked into a folder that goes with this object."""
         import zstandard
 
+        self._unpacked = self._unpacked or tempfile.TemporaryDirectory(prefix="placerec-")
         unpacked = Path(self._unpacked.name) / file.name.removesuffix(PACKED)
         try:
             with file.open("rb") as packed, unpacked.open("wb") as plain:
@@ -114,7 +128,8 @@ class Bag:
         """Close the files."""
         for _, storage in self._files:
             storage.close()
-        self._unpacked.cleanup()
+        if self._unpacked is not None:
+            self._unpacked.cleanup()
 
     @property
     def topics(self) -> dict[str, Topic]:
@@ -122,8 +137,8 @@ class Bag:
         found: dict[str, Topic] = {}
         for _, storage in self._files:
             for name, topic in storage.topics.items():
-                before = found.get(name, Topic(topic.kind, 0, topic.coding))
-                found[name] = Topic(before.kind, before.messages + topic.messages, before.coding)
+                before = found.get(name, topic._replace(messages=0))
+                found[name] = before._replace(messages=before.messages + topic.messages)
         return found
 
     def choose(self, name: str | None, kinds: Sequence[str], what: str) -> str:
@@ -153,7 +168,7 @@ class Bag:
         if not topic.messages:
             raise UnknownTopic(f"The topic {name} of {self.path} has no messages. {there}")
         if topic.coding is None:
-            raise UnknownTopic(f"The messages of {name} in {self.path} are written neither by ROS 1 nor by ROS 2.")
+            raise UnknownTopic(f"The messages of {name} in {self.path} are not of ROS 1, ROS 2, protobuf or JSON.")
         return name
 
     def frames(self, name: str) -> list[RecordedFrame]:
@@ -214,7 +229,7 @@ class Bag:
         with self._lock:
             data = storage.read(entry.key)
         topic = storage.topics[name]
-        return picture_of(data, topic.kind, topic.coding or "cdr")
+        return picture_of(data, topic.kind, topic.coding or "cdr", topic.schema)
 
     def _entries(self, name: str) -> list[tuple[int, Entry]]:
         """The messages of a topic in the order of the bag, with the numbers of their files."""
@@ -252,21 +267,77 @@ class Bag:
             )
         return [found[number] for number in order]
 
-    def trajectory(self, name: str) -> Trajectory:
-        """The path by the poses of a topic.
+    def is_of_transforms(self, name: str) -> bool:
+        """Whether a topic has transforms."""
+        return name in self.topics and self.topics[name].kind in TRANSFORM_TYPES
+
+    def camera_frame(self, name: str) -> str:
+        """The frame that the first message of a topic of pictures names; empty if it names none."""
+        for file, entry in self._entries(name)[:1]:
+            storage = self._files[file][1]
+            topic = storage.topics[name]
+            with self._lock:
+                data = storage.read(entry.key)
+            return frame_of(data, topic.kind, topic.coding or "cdr", topic.schema).removeprefix("/")
+        return ""
+
+    def intrinsics(self, name: str) -> Intrinsics | None:
+        """The intrinsics of the camera of a topic of pictures, by the ``camera_info`` beside it; None without one.
+
+        One that cannot be used is named in the remarks.
+        """
+        parts = name.split("/")
+        for end in (-1, -2):  # /camera/image_raw, and /camera/image_raw/compressed
+            beside = "/".join([*parts[:end], "camera_info"])
+            topic = self.topics.get(beside)
+            if len(parts) < -end or topic is None or topic.kind != CAMERA_INFO or topic.coding not in ("cdr", "ros1"):
+                continue
+            for file, entry in self._entries(beside)[:1]:
+                with self._lock:
+                    data = self._files[file][1].read(entry.key)
+                try:
+                    return intrinsics_of(data, topic.coding, any(one.startswith("image_rect") for one in parts[end:]))
+                except (AttributeError, IndexError, TypeError, ValueError, InvalidRecording) as error:
+                    self.remarks.append(f"{beside} is not used: {error}")
+        return None
+
+    def transforms(self) -> TransformTree:
+        """The transforms of all topics, such as /tf and /tf_static.
+
+        Raises:
+            InvalidRecording: a message is damaged.
+        """
+        tree = TransformTree()
+        for name, topic in self.topics.items():
+            if topic.kind not in TRANSFORM_TYPES:
+                continue
+            for file, entry in self._entries(name):
+                with self._lock:
+                    data = self._files[file][1].read(entry.key)
+                tree.add(transforms_of(data, topic.kind, topic.coding or "cdr", topic.schema), entry.received)
+        return tree
+
+    def trajectory(self, name: str, fixed: str | None = None, moving: str | None = None) -> Trajectory:
+        """The path by the poses of a topic; of transforms, that of the frame ``moving`` in ``fixed``.
 
         Raises:
             UnknownTopic: the bag has no such topic of poses.
-            InvalidTrajectory: no message of it has a pose.
+            InvalidTrajectory: no message of it has a pose, or frames are named that it does not connect.
         """
         self.choose(name, POSE_TYPES, "poses")
+        if self.topics[name].kind in TRANSFORM_TYPES:
+            if not moving:
+                raise InvalidTrajectory("The pictures name no frame of a camera: name one with --moving-frame.")
+            return self.transforms().trajectory(fixed, moving)
+        if fixed is not None or moving is not None:
+            raise InvalidTrajectory(f"{name} has poses and no transforms: leave out --fixed-frame and --moving-frame.")
         times, places, turns, idle = [], [], [], 0
         for file, entry in self._entries(name):
             storage = self._files[file][1]
             topic = storage.topics[name]
             with self._lock:
                 data = storage.read(entry.key)
-            pose = pose_of(data, topic.kind, topic.coding or "cdr")
+            pose = pose_of(data, topic.kind, topic.coding or "cdr", topic.schema)
             if pose is None:
                 idle += 1
                 continue
@@ -277,7 +348,7 @@ class Bag:
             self.remarks.append(f"{idle} messages of {name} have no position (no fix) and are left out.")
         if not times:
             raise InvalidTrajectory(f"No message of {name} has a position.")
-        return Trajectory.of_samples(times, places, turns, self.topics[name].kind == FIX)
+        return Trajectory.of_samples(times, places, turns, self.topics[name].kind in FIXES)
 
     def all_remarks(self) -> list[str]:
         """All remarks, those about damaged files first."""

@@ -91,7 +91,11 @@ def keyframes(
 
 
 def moving(
-    frames: Sequence[RecordedFrame], look: Callable[[RecordedFrame], Look | None], same: Callable[[Look, Look], bool]
+    frames: Sequence[RecordedFrame],
+    look: Callable[[RecordedFrame], Look | None],
+    same: Callable[[Look, Look], bool],
+    begin: int = 0,
+    before: RecordedFrame | None = None,
 ) -> Iterator[RecordedFrame]:
     """The frames without those that show the same as the last frame before them that is not left out.
 
@@ -101,10 +105,14 @@ def moving(
     Args:
         look: gives what a frame shows; None: it cannot be read, and the frame stays.
         same: whether two frames show the same.
+        begin: the number of the first frame that is judged; those before it were judged already.
+        before: the last of these that was not left out; it is looked at again.
     """
     last: tuple[RecordedFrame, Look] | None = None
+    if before is not None and (shown_before := look(before)) is not None:
+        last = before, shown_before
     apart = max(STOP_METRES, NOISE * pose_noise(frames))
-    for frame in frames:
+    for frame in frames[begin:]:
         shown = look(frame)
         if (
             last is not None

@@ -1,4 +1,4 @@
-"""An MCAP file, of a rosbag2 or alone, with messages of ROS 2 or ROS 1; its records are parsed by mcap."""
+"""An MCAP file, of a rosbag2 or alone, with messages of ROS 2, ROS 1 or Foxglove; its records are parsed by mcap."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from core.errors import InvalidRecording
-from core.recordings.messages import STAMP_BYTES, Coding, type_name
+from core.recordings.messages import STAMP_BYTES, WHOLE, Coding, type_name
 from core.recordings.storage import ChunkedStorage, Key, Record, TopicConnection
 
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 _HEAD = 22
 """Bytes of a message's record before those of the message: its channel, number and times."""
 
-CODINGS: dict[str, Coding] = {"cdr": "cdr", "ros1": "ros1"}
+CODINGS: dict[str, Coding] = {"cdr": "cdr", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
 
 
 class McapStorage(ChunkedStorage):
@@ -24,7 +24,7 @@ class McapStorage(ChunkedStorage):
     NAME, MAGIC, CHUNK, LAST = "an MCAP file", b"\x89MCAP0\r\n", 6, 2
 
     def __init__(self, path: Path) -> None:
-        self._schemas: dict[int, str] = {}
+        self._schemas: dict[int, tuple[str, bytes]] = {}
         super().__init__(path)
 
     def _record(self, file: BinaryIO) -> Record | None:
@@ -40,20 +40,28 @@ class McapStorage(ChunkedStorage):
         size = record.end - record.start
         file.seek(record.start)
         data = file.read(min(size, _HEAD + STAMP_BYTES) if record.kind == _MESSAGE else size)
+        if record.kind == _MESSAGE and self._is_whole(int.from_bytes(data[:2], "little")):
+            data += file.read(size - len(data))
         try:
             self._learn(parsed(record.kind, data), key)
         except InvalidRecording as error:
             self.problem = self.problem or f"is damaged ({error})"
 
+    def _is_whole(self, channel: int) -> bool:
+        """Whether the stamp of a channel's messages may be anywhere in them, and is needed."""
+        known = self._connections.get(channel)
+        return known is not None and known.coding in WHOLE and self._wanted(channel)
+
     def _learn(self, record: Any, key: Key) -> None:
         from mcap.records import Channel, Schema
 
         if isinstance(record, Schema):
-            self._schemas[record.id] = type_name(record.name)
+            self._schemas[record.id] = type_name(record.name), record.data
         elif isinstance(record, Channel):
             coding = CODINGS.get(record.message_encoding)
+            kind, schema = self._schemas.get(record.schema_id, ("", b""))
             self._connections[record.id] = TopicConnection(
-                record.topic, self._schemas.get(record.schema_id, ""), coding
+                record.topic, kind, coding, schema if coding == "protobuf" else b""
             )
         else:
             channel = self._connections.get(record.channel_id)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from core.errors import InvalidRecording, InvalidTrajectory
+from core.frames.intrinsics import Intrinsics
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES
 from core.recordings.bag import Bag, bag_files
 from core.recordings.folder import folder_frames
@@ -27,6 +28,8 @@ class Poses:
     """Where the poses of a recording come from, if not from the recording's own list or EXIF data.
 
     topic: of the bag.
+    fixed, moving: of a topic of transforms: the frame in which poses are, and the one whose poses they are; None: map
+        or odom, and the frame that the pictures name, which is that of the camera.
     file: a trajectory in the form of TUM or KITTI.
     times: of the trajectory in the form of KITTI; None if it has a pose for each frame.
     largest_gap: seconds between two poses between which one is interpolated.
@@ -36,6 +39,8 @@ class Poses:
     file: Path | None = None
     times: Path | None = None
     largest_gap: float = LARGEST_GAP
+    fixed: str | None = None
+    moving: str | None = None
 
 
 @dataclass
@@ -44,6 +49,7 @@ class Recording:
 
     name: of its file or folder, without the suffix.
     remarks: sentences about its content that a user must know.
+    intrinsics: of the camera that took them, if a bag has them.
     continuous: whether its frames were taken by a clock, as those of a bag or a video, and not chosen by somebody.
     """
 
@@ -51,6 +57,7 @@ class Recording:
     frames: list[RecordedFrame]
     remarks: list[str] = field(default_factory=list)
     continuous: bool = False
+    intrinsics: Intrinsics | None = None
     _close: Callable[[], None] = lambda: None
 
     def close(self) -> None:
@@ -86,6 +93,8 @@ def open_recording(path: Path, topic: str | None = None, poses: Poses = Poses(),
         MissingExtra: the reader of bags is not installed.
     """
     of_bag = bool(bag_files(path))
+    if poses.topic is None and (poses.fixed is not None or poses.moving is not None):
+        raise InvalidRecording("--fixed-frame and --moving-frame go with a --pose-topic of transforms, such as /tf.")
     for option, value in (("--topic", topic), ("--pose-topic", poses.topic)):
         if value is not None and not of_bag:
             raise InvalidRecording(f"{path} is not a bag, so it has no topics: leave out {option}.")
@@ -123,14 +132,19 @@ def _prefixed(prefix: str, text: str) -> str:
 def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
     bag = Bag(path)
     try:
+        chosen = bag.choose(topic, IMAGE_TYPES, "pictures")
         recording = Recording(
             path.resolve().name if path.is_dir() else path.name.removesuffix(".zstd").rpartition(".")[0],
-            bag.frames(bag.choose(topic, IMAGE_TYPES, "pictures")),
+            bag.frames(chosen),
             continuous=True,
+            intrinsics=bag.intrinsics(chosen),
             _close=bag.close,
         )
         if poses.topic is not None:
-            _place(recording, bag.trajectory(poses.topic), False, poses.largest_gap)
+            moving = poses.moving
+            if moving is None and bag.is_of_transforms(poses.topic):
+                moving = bag.camera_frame(chosen)
+            _place(recording, bag.trajectory(poses.topic, poses.fixed, moving), False, poses.largest_gap)
         recording.remarks = bag.all_remarks() + recording.remarks
     except BaseException:
         bag.close()

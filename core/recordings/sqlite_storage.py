@@ -9,7 +9,7 @@ from typing import Any
 
 from core.errors import InvalidRecording
 from core.recordings.messages import STAMP_BYTES, Coding, type_name
-from core.recordings.storage import Key, Storage, TopicConnection, unpacked
+from core.recordings.storage import MOST_UNPACKED, Key, Storage, TopicConnection, unpacked
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """A message that the recorder has compressed begins so; one in CDR cannot."""
@@ -32,6 +32,9 @@ class SqliteStorage(Storage):
             try:
                 # Without this SQLite refuses a file that is shorter than its header says.
                 self._database.execute("PRAGMA writable_schema = ON")
+                # A file may have views, which can have any number of rows, and columns that compute values of any size.
+                self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_UNPACKED)
+                self._database.set_authorizer(_allowed)
                 self._read()
             except BaseException:
                 self._database.close()
@@ -82,3 +85,10 @@ class SqliteStorage(Storage):
 
     def close(self) -> None:
         self._database.close()
+
+
+def _allowed(action: int, first: str | None, second: str | None, _database: str | None, view: str | None) -> int:
+    """Let statements read the two tables, and no view."""
+    reads = action == sqlite3.SQLITE_READ and first in ("topics", "messages") and view is None
+    calls = action == sqlite3.SQLITE_FUNCTION and second in ("coalesce", "substr")
+    return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY

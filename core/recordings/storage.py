@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 from core.errors import InvalidRecording
-from core.recordings.messages import IMAGE_TYPES, POSE_TYPES, Coding, stamp_of
+from core.recordings.messages import CAMERA_INFO, IMAGE_TYPES, POSE_TYPES, Coding, stamp_of
 
 Key = tuple[int, int]
 """Where a message is in its file; each kind of file has keys of its own."""
@@ -30,6 +30,7 @@ MOST_UNPACKED = 1 << 30
 PART = 1 << 20
 """Bytes that are unpacked at a time."""
 
+WANTED = (*IMAGE_TYPES, *POSE_TYPES, CAMERA_INFO)
 LATEST = 2**63 - 1
 """Nanoseconds; a later time, which no clock gives, counts as this."""
 
@@ -39,12 +40,14 @@ class Topic(NamedTuple):
 
     kind: the type of its messages, as ROS 2 writes it.
     messages: how many there are.
-    coding: how they are written; None if neither by ROS 1 nor by ROS 2.
+    coding: how they are written; None if in no way that is read.
+    schema: of protobuf: the file descriptors that define them.
     """
 
     kind: str
     messages: int
     coding: Coding | None
+    schema: bytes = b""
 
 
 class Entry(NamedTuple):
@@ -61,6 +64,7 @@ class TopicConnection(NamedTuple):
     topic: str
     kind: str
     coding: Coding | None
+    schema: bytes = b""
 
 
 class Storage(ABC):
@@ -81,19 +85,21 @@ class Storage(ABC):
         """Topics by name, in the order of the file."""
         topics: dict[str, Topic] = {}
         for number, one in self._connections.items():
-            before = topics.get(one.topic, Topic(one.kind, 0, one.coding))
+            before = topics.get(one.topic, Topic(one.kind, 0, one.coding, one.schema))
             topics[one.topic] = before._replace(messages=before.messages + self._counts[number])
         return topics
 
     def _wanted(self, number: int) -> bool:
-        """Whether messages of a connection may be pictures or poses; one may be named behind them."""
-        return number not in self._connections or self._connections[number].kind in IMAGE_TYPES + POSE_TYPES
+        """Whether messages of a connection may be pictures, poses or intrinsics; one may be named behind them."""
+        return number not in self._connections or self._connections[number].kind in WANTED
 
     def _note(self, number: int, received: int, start: bytes, coding: Coding | None, key: Key) -> None:
-        """Note where a message is; ``start`` holds its first bytes."""
+        """Note where a message is; ``start`` holds its first bytes, or all that ``stamp_of`` needs."""
         self._counts[number] += 1
         if coding is not None and self._wanted(number):
-            self._found[number].extend((min(received, LATEST), stamp_of(start, coding), *key))
+            one = self._connections.get(number, TopicConnection("", "", coding))
+            stamp = stamp_of(start, coding, one.kind, one.schema)
+            self._found[number].extend((min(received, LATEST), max(-LATEST, min(stamp, LATEST)), *key))
 
     def entries(self, topic: str) -> list[Entry]:
         """The messages of a topic in the order of the file; those behind a damage are left out."""

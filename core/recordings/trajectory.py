@@ -25,7 +25,8 @@ class Trajectory:
     """Samples of a path, in order of time, each time once.
 
     nanoseconds: int64 [n].
-    positions: float64 [n, 3], metres, or latitude and longitude in degrees and 0.
+    positions: float64 [n, 3], metres, or latitude and longitude in degrees and the height above the ellipsoid, NaN if
+        it is not known.
     turns: float64 [n, 4], unit quaternions x, y, z, w; NaN where the orientation is not known.
     geographic: whether positions are in degrees.
     """
@@ -48,7 +49,8 @@ class Trajectory:
         places = np.asarray(positions, np.float64).reshape(-1, 3)
         if not len(times):
             raise InvalidTrajectory("The trajectory has no pose.")
-        if not (np.abs(places) <= LARGEST_COORDINATE).all():
+        needed = places[:, :2] if geographic and np.isnan(places[:, 2]).any() else places
+        if not (np.abs(needed) <= LARGEST_COORDINATE).all():
             raise InvalidTrajectory(f"The trajectory has a position beyond {LARGEST_COORDINATE:g} m, or none.")
         times, first = np.unique(times, return_index=True)
         return cls(times, places[first], np.asarray(turns, np.float64).reshape(-1, 4)[first], geographic)
@@ -110,7 +112,8 @@ class Trajectory:
 
     def _pose(self, place: NDArray[np.float64], heading: float) -> Pose:
         if self.geographic:
-            return Pose(latitude=float(place[0]), longitude=float(place[1]))
+            height = None if math.isnan(place[2]) else float(place[2])
+            return Pose(latitude=float(place[0]), longitude=float(place[1]), z=height)
         turn = None if math.isnan(heading) else float(heading)
         return Pose(x=float(place[0]), y=float(place[1]), z=float(place[2]), heading=turn)
 

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,13 @@ from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
 from core.maps.records import MapRecord, VerifyReport
 from core.maps.selection import Selection
-from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
+from core.maps.status import ErasureReport, IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
 from core.places import Place
 from core.storage.archives.exporter import Exporter
-from core.storage.database.connections import DatabaseClosed, at_one_moment, read_now
+from core.storage.database.connections import FILE, DatabaseClosed, at_one_moment, connect, read_now
+from core.storage.database.schema import connection_of
 from core.storage.database.segments import SegmentEntry, segment_entries
+from core.storage.erasing import DeadRows, dead_rows, erase_rows, wait_until
 from core.storage.opening import OpenMap, named_damage, open_map
 from core.storage.review import FILE as REVIEW_FILE
 from core.storage.review import ReviewFrames
@@ -96,6 +99,7 @@ class Map(LedgerMap):
         self._failed_writes = FailedWrites(folder)
         self._recent_places = RecentPlaces()
         self._keypoints_of: tuple[object, KeypointsStatus | None] = (None, None)  # in a state of the database
+        self._dead_rows: DeadRows | None = None  # of the last erasure
         self.indexer: Indexer | None = None
         super().__init__()
         self.review = ReviewFrames(folder / REVIEW_FILE, record.id, self._expect_open)
@@ -246,6 +250,38 @@ class Map(LedgerMap):
         self.open()  # raises if the map was closed meanwhile
         return self.index_status()
 
+    def erase(self, progress: Progress = no_progress) -> ErasureReport:
+        """Overwrite what deleted places have left (:meth:`core.maps.store.Map.erase`); writes wait for parts of it."""
+        with self._lock, self._guarded("erase deleted places of"):
+            opened, newest = self._expect_open(), self.snapshot()
+            self._failed_writes.repair(opened, newest.rows)
+            dead, self._snapshot = dead_rows(newest, self._dead_rows)
+            self._dead_rows = dead
+            del newest
+            removed = opened.removed_segments
+        total, done, count = len(dead), 0, 0
+        wait_until(lambda: not dead.are_read and not removed.in_use, lambda: progress(0, total))
+        for number, offsets in dead.offsets.items():
+            with self._lock, self._guarded("erase deleted places of"):
+                count += erase_rows(self._folder, opened.layout, self.snapshot(), number, offsets)
+            done += len(offsets)
+            progress(done, total)
+        wait_until(self._removed_are_gone, lambda: progress(done, total))
+        if self.indexer is not None:
+            with disk_errors(f"erase deleted places of map {self._record.id!r}"), suppress(Stopped):
+                self.indexer.forget_codes(list(dead.offsets), lambda: progress(done, total))
+        with self._lock, self._guarded("erase deleted places of"):
+            freed = self._expect_open().database.erase()
+        freed += self.review.erase()
+        return ErasureReport(rows=count, bytes=freed + count * opened.layout.record.itemsize)
+
+    def _removed_are_gone(self) -> bool:
+        """Delete the files of removed segments that nobody reads any more; whether that are all of them."""
+        with self._lock:
+            removed = self._expect_open().removed_segments
+            removed.clear(self.snapshot())
+            return not removed.waiting
+
     def storage_status(self) -> StorageStatus:
         with self._guarded("read"):
             return storage_of(self._folder, self._record.precision, self.count_places(), self._keypoints_status())
@@ -305,6 +341,17 @@ class Map(LedgerMap):
     def paused_writes(self) -> Iterator[None]:
         with self._lock:
             yield
+
+    def drop_pictures(self, before: datetime, most: int) -> int:
+        if not self.is_open:  # a map without such pictures is not opened for this
+            with self._lock, self._guarded("read"):
+                connection = connect(self._folder / FILE)
+                try:
+                    if not places.pictured_before(connection_of(connection), before, 1):
+                        return 0
+                finally:
+                    connection.close()
+        return super().drop_pictures(before, most)
 
     def enrol(self, items: Any) -> Any:
         found = super().enrol(items)

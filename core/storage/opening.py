@@ -162,13 +162,15 @@ def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: 
     """The descriptors of a segment, each of them checked; ``checksums`` are those that SQLite has of its rows."""
     index = flat_index(entry.rows, layout.dimension, layout.precision == HALF)
     local = np.zeros((entry.rows, *layout.local_shape), dtype=np.int8)
-    target, filled = vectors(index), 0
+    target, filled, first = vectors(index), 0, entry.number * layout.rows_per_segment
     for records in descriptors.read_checked(folder, layout, entry.number, entry.rows, entry.checksum):
         part = slice(filled, filled + len(records))
         foreign = (checksums[part] != 0) & (checksums[part] != records["checksum"])
         for offset in np.flatnonzero(foreign)[:1].tolist():
             row = int(records["row"][offset])
             raise Damage(f"{descriptors.segment_name(entry.number)}: row {row} is of another frame")
+        if found := [row for row in descriptors.erased_rows(records, first + filled) if checksums[row - first]]:
+            raise Damage(f"{descriptors.segment_name(entry.number)}: row {found[0]} has a place and is erased")
         target[part], local[part] = layout.descriptors_of(records), layout.locals_of(records)
         filled += len(records)
     return HeldRows(index, local)

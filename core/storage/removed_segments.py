@@ -49,6 +49,16 @@ class RemovedSegments:
             with self._lock:
                 self._keepers -= 1
 
+    @property
+    def in_use(self) -> bool:
+        """Whether files have to stay for a transaction that reads them."""
+        return self._keepers > 0
+
+    @property
+    def waiting(self) -> int:
+        """How many files of removed segments are still there."""
+        return len(self._waiting)
+
     def remove(self, connection: MapConnection, after: Snapshot, touched: Set[int] = frozenset()) -> Snapshot:
         """Record segments without a living row as removed; returns the snapshot to search after the COMMIT.
 

@@ -13,12 +13,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 from sqlalchemy import Column, MetaData, Table, bindparam, select
 
 from core.disk.files import Damage, disk_errors
-from core.disk.sqlite_file import DURABLE, UnreadVersion, transaction
+from core.disk.sqlite_file import DURABLE, UnreadVersion, rewrite, transaction
 from core.errors import StorageFailure
 from core.ledger import Tables
 from core.ledger.maps.connection import MapConnection
@@ -48,7 +49,7 @@ _READ_OWNER = Statement(select(_OWNER.c.id))
 _PUT_OWNER = Statement(
     lambda insert: insert(_OWNER).values(map=bindparam("map"), id=bindparam("id")).on_conflict_do_nothing()
 )
-_SETTINGS = {"auto_vacuum": "INCREMENTAL", **DURABLE, "journal_size_limit": 1 << 20}
+_SETTINGS = {"auto_vacuum": "INCREMENTAL", **DURABLE, "secure_delete": "ON", "journal_size_limit": 1 << 20}
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +87,32 @@ class ReviewFrames(ReviewTable):
         super().shrink(setting)
         with self._using() as connection:
             driver_of(connection).executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
+
+    def drop_before(self, moment: datetime) -> int:
+        if not self._file.path.exists():
+            return 0
+        with self._using(opening=False) as connection, transaction(driver_of(connection)):
+            return self._drop_before(connection, moment)
+
+    def erase(self) -> int:
+        """Rewrite the file without the frames that were dropped, and delete files that were put aside.
+
+        Returns:
+            The bytes by which the files got smaller.
+        """
+        path, gone = self._file.path, 0
+        with disk_errors(f"erase what is left in {FILE}", FILE):
+            for aside in path.parent.glob(f"{FILE}.damaged-*"):
+                gone += aside.stat().st_size
+                aside.unlink()
+            if not path.exists():
+                return gone
+            with self._using() as connection:
+                driver, before = driver_of(connection), path.stat().st_size
+                rewrite(driver, path.parent)
+                if driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]:
+                    raise StorageFailure(f"{FILE} is being read: try again.")
+                return gone + max(0, before - path.stat().st_size)
 
     def check(self) -> tuple[list[str], int]:
         """Problems of the file, which is left as it is, and the bytes of the pictures that were read."""
@@ -139,8 +166,9 @@ class ReviewFrames(ReviewTable):
             yield connection
 
     @contextmanager
-    def _using(self, create: bool = False) -> Iterator[MapConnection]:
-        self._expect_open()
+    def _using(self, create: bool = False, opening: bool = True) -> Iterator[MapConnection]:
+        if opening:
+            self._expect_open()
         with self._lock:
             if self._closed:
                 self._expect_open()  # raises the reason

@@ -226,6 +226,7 @@ def _check_segment(
     searched = None if snapshot is None else snapshot.segments[entry.number]
     for records in descriptors.read_records(folder, layout, entry.number, entry.rows):
         damaged += descriptors.damaged_rows(layout, records, row)
+        damaged += [one for one in descriptors.erased_rows(records, row) if one in places]
         running = descriptors.segment_checksum(records["checksum"], running)
         expected_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
         for offset, (expected_sum, record) in enumerate(zip(expected_sums, records, strict=True), start=row):
@@ -266,7 +267,7 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
     return [
         offset
         for offset, (there, here) in enumerate(zip(stored, held, strict=True))
-        if [part.tobytes() for part in there] != [part.tobytes() for part in here]
+        if segment.alive[start + offset] and [part.tobytes() for part in there] != [part.tobytes() for part in here]
     ]
 
 

@@ -6,14 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from core.judgement.alignment import LARGEST_STEP, SharedStretch, of_matrix, shared_stretches
 from core.maps import Snapshot
 from core.method.encoder import Encoder
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
-from core.threads import compute_alone, in_turns
+from core.threads import allowed_threads, compute_alone, in_turns
 
 Rows = NDArray[np.int64]
 
@@ -46,7 +45,7 @@ def score_pairs(snapshot: Snapshot, encoder: Encoder, queries: Rows, references:
     products = np.empty((len(queries), len(references)), np.float32)
     few, many = (queries, references) if len(queries) <= len(references) else (references, queries)
     across = products if few is queries else products.T
-    threads = torch.get_num_threads()
+    threads = allowed_threads()
     with ThreadPoolExecutor(threads, "scores", compute_alone) as helpers:
         for start in range(0, len(few), BLOCK):
             rows = few[start : start + BLOCK]

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
-from core.networks.network import Convolution, Layer, Normalization, Pooling, Relu, build_layer
+from core.networks.network import Convolution, Layer, Normalization, Pooling, Relu
+from core.networks.torch_network import build_layer
 from lab.baselines.system import About, Array, Constants, Resources, VectorSystem, unit
 from lab.conversion.caffemodel import CaffeLayer, read_caffemodel
 
@@ -93,7 +94,7 @@ class Calc(VectorSystem):
     """One vector a frame, of unit length; scores are cosines."""
 
     def __init__(self, about: About, network: nn.Sequential) -> None:
-        from core.networks.identity import tensors_digest
+        from core.networks.torch_network import tensors_digest
 
         super().__init__(about, weights=tensors_digest(network.state_dict()))
         self.network = network

@@ -24,7 +24,8 @@ from core.errors import InvalidModel, MissingWeights
 from core.frames.preprocessing import Pixels, prepare
 from core.method.catalogue import NETWORK_SUFFIX
 from core.method.features import FeatureDefinition, FeatureExtractor
-from core.networks.network import NetworkDefinition, Relu, ShallowNetwork, build_layer, load_network
+from core.networks.network import NetworkDefinition, Relu
+from core.networks.torch_network import TorchNetwork, build_layer, load_torch_network
 from lab.baselines.pooling import LEVELS, MapsSystem, PooledSystem, flatten, spatial_pyramid_pool
 from lab.baselines.system import (
     About,
@@ -85,12 +86,12 @@ def import_published(model: Path, published: PublishedMean, side: int) -> tuple[
     return import_caffe(model, mean, input_size=(side, side))
 
 
-def load_trunk(path: Path, layer: str, published: PublishedMean) -> ShallowNetwork:
+def load_trunk(path: Path, layer: str, published: PublishedMean) -> TorchNetwork:
     """The network of a ``.caffemodel``, or of a network file that was imported before, as deep as ``layer``."""
     if path.name.endswith(NETWORK_SUFFIX):
-        return load_network(path, (layer,))
+        return load_torch_network(path, (layer,))
     definition, weights = import_published(path, published, SIDE)
-    network = ShallowNetwork(definition, (layer,))
+    network = TorchNetwork(definition, (layer,))
     network.load_weights(weights)
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -98,7 +99,7 @@ def load_trunk(path: Path, layer: str, published: PublishedMean) -> ShallowNetwo
 def _extractor(path: Path, layer: str, published: PublishedMean) -> FeatureExtractor:
     # Only the maps are read, so what the definition says of regions is never used.
     definition = FeatureDefinition(layers=(layer,), regions=1, steps=(1.0,), unit_features=False)
-    return FeatureExtractor(load_trunk(path, layer, published), definition)
+    return FeatureExtractor(load_trunk(path, layer, published).as_data(), definition)
 
 
 # AlexNet
@@ -196,13 +197,14 @@ class Places365(VectorSystem):
     """The rectified fc7 of one frame, of unit length; scores are cosines."""
 
     def __init__(self, about: About, path: Path) -> None:
-        from core.networks.identity import json_digest, tensors_digest
+        from core.networks.identity import json_digest
+        from core.networks.torch_network import tensors_digest
 
         layers = {layer.name: layer for layer in read_caffemodel(path).layers}
         side = VGG_SIDE if "conv5_3" in layers else SIDE
         definition, weights = import_published(path, PublishedMean(("places365CNN_mean.binaryproto",)), side)
         trunk = definition.convolutions()[-1].name
-        self._trunk = ShallowNetwork(definition, (trunk,))
+        self._trunk = TorchNetwork(definition, (trunk,))
         self._trunk.load_weights(weights)
         self._trunk.eval().requires_grad_(False)
         self._head = _head(definition, layers, path.name)

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition, Pixels
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.baselines.system import (
     About,
     Constants,
@@ -166,12 +166,13 @@ class NetVlad:
     sequential = False
 
     def __init__(
-        self, about: About, network: ShallowNetwork, layer: NetVladLayer, whitening: PcaWhitening | None
+        self, about: About, network: TorchNetwork, layer: NetVladLayer, whitening: PcaWhitening | None
     ) -> None:
-        from core.networks.identity import json_digest, tensors_digest
+        from core.networks.identity import json_digest
+        from core.networks.torch_network import tensors_digest
 
         self.about, self.network, self.layer, self.whitening = about, network, layer, whitening
-        tensors = network.weights() | layer.tensors() | ({} if whitening is None else whitening.tensors())
+        tensors = network.tensors() | layer.tensors() | ({} if whitening is None else whitening.tensors())
         digests = {"network": json_digest(network.describe()), "weights": tensors_digest(tensors)}
         self.identity = system_identity(about, **digests)
 
@@ -197,7 +198,7 @@ def build(about: About, resources: Resources) -> NetVlad:
 # Reading the published files
 
 
-Parts = tuple[ShallowNetwork, NetVladLayer, PcaWhitening | None]
+Parts = tuple[TorchNetwork, NetVladLayer, PcaWhitening | None]
 
 
 def load_netvlad(path: Path) -> Parts:
@@ -218,7 +219,7 @@ def _shown(mean: Means, scale: Means = (1.0, 1.0, 1.0)) -> InputDefinition:
     return InputDefinition(height=HEIGHT, width=WIDTH, channel_order="rgb", mean=mean, scale=scale)
 
 
-def _check_centers(network: ShallowNetwork, layer: NetVladLayer) -> None:
+def _check_centers(network: TorchNetwork, layer: NetVladLayer) -> None:
     depth = network.definition.convolutions()[-1].channels
     if layer.centers.shape[1] != depth:
         raise InvalidModel(f"its centres have {layer.centers.shape[1]} values, its maps {depth} channels.")

@@ -26,7 +26,8 @@ from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder
 from core.method.features import FeatureExtractor
 from core.method.vocabulary import Vocabulary
-from core.networks.backbone import Backbone
+from core.networks.backbone import OwnPass
+from core.networks.network import ShallowNetwork
 from core.networks.xfeat import load_xfeat
 from core.recognition.question import Verifier, Verify
 from core.recognition.stages import Candidates, Positions, likeness_of_first, traverse_candidates, traverse_neighborhood
@@ -47,7 +48,7 @@ def about_first_stage(about: About) -> About:
     return replace(about, name=about.name + FIRST_STAGE, title=title, configuration=configuration)
 
 
-def first_stage(encoder: Encoder, network: Backbone) -> Encoder:
+def first_stage(encoder: Encoder, network: ShallowNetwork | OwnPass) -> Encoder:
     """A two-stage encoder without its second stage: the same vectors, and scores J / V (equation 4.13).
 
     Args:

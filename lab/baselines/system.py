@@ -212,8 +212,6 @@ def system_identity(about: About, **digests: str) -> str:
 
 def arrays_digest(**arrays: NDArray[np.generic]) -> str:
     """SHA-256 over names, types, shapes and values: the learned state of a system, for its identity."""
-    import torch
+    from core.networks import identity
 
-    from core.networks.identity import tensors_digest
-
-    return tensors_digest({name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()})
+    return identity.arrays_digest({name: np.ascontiguousarray(array) for name, array in arrays.items()})

@@ -130,11 +130,12 @@ def _import_described(
 def _import_caffe(file: Path, mean: Path | None, name: str, size: tuple[int, int] | None, folder: Path) -> None:
     from core.method.catalogue import NETWORK_SUFFIX
     from core.networks.network import Convolution, save_network
+    from core.networks.torch_network import arrays_of
     from lab.conversion.caffe import import_caffe
 
     definition, weights = import_caffe(file, mean, name=name, input_size=size)
     path = folder / f"{name}{NETWORK_SUFFIX}"
-    _written(path, lambda temporary: save_network(temporary, definition, weights))
+    _written(path, lambda temporary: save_network(temporary, definition, arrays_of(weights)))
     shown = definition.input
     means = ", ".join(f"{value:g}" for value in shown.mean)
     rows = table("layer", "type", "parameters", title=f"{name}: input {shown.width}x{shown.height}, mean {means}")

@@ -26,7 +26,7 @@ from core.method.features import FeatureExtractor
 from core.method.presets import PRESETS
 from core.method.projection import Projection
 from core.method.vocabulary import pool_features, train_vocabulary
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.training.default_calibration import UNCALIBRATED
 from lab.training.packaging import network_of, vocabulary_pictures
 from lab.training.projections import fit_cell_projections, fit_projections, paired_cells, refine
@@ -126,7 +126,7 @@ class Ablation:
         self.weights, self.size = load_file(weights), size
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
-        self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
+        self.extractor = FeatureExtractor(network.as_data(), DEFAULT, self.projections)
         self.tasks: ValidationTasks = load_tasks(datasets)
         self.corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
@@ -172,7 +172,7 @@ class Ablation:
     def encoder(self, definition: EncoderDefinition, seed: int) -> Encoder:
         """The encoder of a configuration with a vocabulary of its own, not calibrated."""
         extractor = FeatureExtractor(
-            self._network(definition), definition, self._projections(definition), self._cells(definition)
+            self._network(definition).as_data(), definition, self._projections(definition), self._cells(definition)
         )
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
@@ -197,7 +197,7 @@ class Ablation:
             *_traverse_figures(self.corridor.truth, corridor),
         ]
 
-    def _network(self, definition: EncoderDefinition) -> ShallowNetwork:
+    def _network(self, definition: EncoderDefinition) -> TorchNetwork:
         return network_of(self.weights, definition.outputs, self.size)
 
     def _projections(self, definition: EncoderDefinition) -> dict[str, Projection]:

@@ -26,7 +26,8 @@ from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.presets import NETWORK, PRESETS
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
-from core.networks.network import ShallowNetwork, save_network
+from core.networks.network import save_network
+from core.networks.torch_network import TorchNetwork, arrays_of
 from lab.training.default_calibration import UNCALIBRATED, assess, for_small_maps
 from lab.training.photographs import read, split_photographs
 from lab.training.projections import fit_cell_projections, fit_projections
@@ -43,15 +44,13 @@ def vocabulary_pictures(datasets: Path, count: int, seed: int) -> list[Pixels]:
     return [read(paths[index]) for index in sorted(chosen)]
 
 
-def network_of(
-    weights: dict[str, Tensor], layers: Sequence[str], size: tuple[int, int] | None = None
-) -> ShallowNetwork:
+def network_of(weights: dict[str, Tensor], layers: Sequence[str], size: tuple[int, int] | None = None) -> TorchNetwork:
     """The distilled backbone as deep as ``layers`` needs, for an input of its own or of another height and width."""
     definition = student_definition()
     if size is not None:
         shown = definition.input.model_copy(update={"height": size[0], "width": size[1]})
         definition = definition.model_copy(update={"input": shown})
-    network = ShallowNetwork(definition, layers)
+    network = TorchNetwork(definition, layers)
     network.load_weights(weights)
     return network.eval().requires_grad_(False)
 
@@ -68,7 +67,7 @@ def build(
     network, wanted = network_of(weights, definition.outputs), definition.projected()
     projections = fit_projections(network, wanted, photographs, seed=seed) if wanted else {}
     plain = _untaught(definition)
-    extractor = FeatureExtractor(network, plain, projections)
+    extractor = FeatureExtractor(network.as_data(), plain, projections)
     frames = (
         extractor.regions(extractor.activations([picture])[0]).features
         for picture in track(pictures, f"features for {name}")
@@ -109,7 +108,7 @@ def with_second_stage(
     """
     retained = load_encoder(folder / f"{name}{ENCODER_SUFFIX}", folder / f"{NETWORK}{NETWORK_SUFFIX}")
     plain = _untaught(definition)
-    extractor = FeatureExtractor(network_of(weights, plain.outputs), plain, retained.extractor.projections)
+    extractor = FeatureExtractor(network_of(weights, plain.outputs).as_data(), plain, retained.extractor.projections)
     vocabulary = Vocabulary(retained.centers, retained.extractor.origin)
     encoder = Encoder(name, extractor, plain, vocabulary, UNCALIBRATED)
     return taught(encoder, definition, photographs, seed), vocabulary
@@ -146,7 +145,7 @@ def main(
     with TemporaryDirectory(dir=output, prefix="unfinished-") as unfinished:
         folder = Path(unfinished)
         if not only:
-            save_network(folder / network, student_definition(), tensors)
+            save_network(folder / network, student_definition(), arrays_of(tensors))
         for name in only or PRESETS:
             definition = PRESETS[name]
             if second_stage:

@@ -30,7 +30,7 @@ from core.method.agreement import AgreementDefinition, Cells, correspondences, l
 from core.method.encoder import Encoder
 from core.method.equations import unit_length
 from core.method.projection import Projection, discriminant, fit_projection
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.training.distillation import SIDE
 from lab.training.photographs import AugmentedCrops, split_photographs
 from lab.training.views.displaced_views import COLUMNS, DisplacedViews, Displacement, Kind, displaced_views
@@ -75,7 +75,7 @@ class PairedCells:
 
 
 def fit_projections(
-    network: ShallowNetwork, values: dict[str, int], photographs: Path, crops: int = CROPS, seed: int = 0
+    network: TorchNetwork, values: dict[str, int], photographs: Path, crops: int = CROPS, seed: int = 0
 ) -> dict[str, Projection]:
     """One projection for each layer of ``values``, from the cells of clean crops and of the same crops augmented.
 
@@ -109,7 +109,7 @@ def _crop_pairs(photographs: Path, crops: int, seed: int) -> AugmentedCrops:
     return AugmentedCrops(paths, photographs, SIDE, seed + SEED_OFFSET, 0, crops)
 
 
-def paired_cells(network: ShallowNetwork, photographs: Path, crops: int, seed: int = 0) -> PairedCells:
+def paired_cells(network: TorchNetwork, photographs: Path, crops: int, seed: int = 0) -> PairedCells:
     """The features of all cells of such crops, which :func:`refine` learns from."""
     pairs = _crop_pairs(photographs, crops, seed)
     maps = [_maps(network, pairs[index]) for index in track(range(crops), "cells for the refinement")]
@@ -121,7 +121,7 @@ def paired_cells(network: ShallowNetwork, photographs: Path, crops: int, seed: i
     return PairedCells(clean, augmented, columns=round(cells**0.5))
 
 
-def _maps(network: ShallowNetwork, frames: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
+def _maps(network: TorchNetwork, frames: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
     """Activations of each output, B x C x K."""
     batch = np.stack([prepare(frame, network.input) for frame in frames])
     with torch.inference_mode():

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from core.networks.network import Convolution, NetworkDefinition, build_layer, caffenet_definition
+from core.networks.network import Convolution, NetworkDefinition, caffenet_definition
+from core.networks.torch_network import build_layer
 
 TEACHER_CHANNELS = 512
 SCALE = 0.017

@@ -24,7 +24,14 @@ REPEAT_SECONDS = 60.0
 MOST_KINDS = 1024
 """Most kinds of refusals, and of disclosures, that are counted apart."""
 
-PARTS = {"map": "map", "place": "place", "sequence": "sequence", "camera": "camera", "job": "job"}
+PARTS = {
+    "map": "map",
+    "place": "place",
+    "sequence": "sequence",
+    "camera": "camera",
+    "job": "job",
+    "recording": "recording",
+}
 """Parameters of a path that identify the changed object."""
 
 log = logging.getLogger(LOGGER)
@@ -99,12 +106,13 @@ def note_job(
     Args:
         event: "running", or the state in which the job has ended.
         job: the fields that identify the job, such as its id and its map.
-        arguments: the arguments of the job; the line names other maps and ``dry_run`` if they are among them.
+        arguments: the arguments of the job; the line names other maps, a recording and ``dry_run`` if they are among
+            them.
         problem: the problem object of a job that has failed.
         asker: the caller who started the job, from :func:`now_asking`.
     """
     line = dict(job)
-    for name in ("from", "to"):
+    for name in ("from", "to", "recording"):
         if isinstance(arguments.get(name), str):
             line[name] = arguments[name]
     if isinstance(arguments.get("dry_run"), bool):

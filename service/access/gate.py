@@ -77,33 +77,59 @@ def _host_of(origin: bytes) -> bytes | None:
         return None
 
 
-def check_host(headers: Headers) -> None:
-    """Refuse requests that are addressed to another host name than this machine's own.
+def check_host(headers: Headers, loopback: bool, names: frozenset[str]) -> None:
+    """Refuse requests that a page of another site may have sent under a name that it has had lead here.
+
+    Such a page needs a name of its own in the DNS.  An address is none, and neither is a name without a dot.
+
+    Args:
+        loopback: whether the service listens on loopback alone; then it has no other names than this machine's.
+        names: further names, in lower case, under which the service is reached.
 
     Raises:
         ForeignPage: the Host header names another host, or there are two.
     """
     named = [value for name, value in headers if name == b"host"]
-    if len(named) > 1 or (named and not is_loopback_host(named[0])):
+    if len(named) > 1 or (named and not _is_own(named[0], loopback, names)):
         raise ForeignPage(
-            "While the service has no keys, it answers only requests to localhost or 127.0.0.1. "
-            "Create a key to use it under another name."
+            "While the service has no keys, it answers only requests to "
+            + ("localhost or 127.0.0.1" if loopback else "addresses, or names without a dot")
+            + ", and to the names in PLACEREC_ALLOWED_HOSTS. Create a key to use it under any name."
         )
+
+
+@lru_cache(64)
+def _is_own(host: bytes, loopback: bool, names: frozenset[str]) -> bool:
+    name = _name_of(host)
+    if name in names or is_loopback_host(host):
+        return True
+    return not loopback and name != "" and ("." not in name or is_address(name))
+
+
+def _name_of(host: bytes) -> str:
+    """The name or address in a Host header, in lower case; empty if it has none."""
+    try:
+        return urlsplit(f"//{host.decode('ascii')}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def is_address(name: str) -> bool:
+    """Whether a name is an address of IPv4 or IPv6."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 @lru_cache(64)
 def is_loopback_host(host: bytes) -> bool:
     """Whether a Host header is a loopback name or address."""
-    try:
-        name = urlsplit(f"//{host.decode('ascii')}").hostname or ""
-    except ValueError:
-        return False
+    name = _name_of(host)
     if name == "localhost" or name.endswith(".localhost"):
         return True
-    try:
-        return ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False
+    return is_address(name) and ipaddress.ip_address(name).is_loopback
 
 
 WEBSOCKET = "WEBSOCKET"
@@ -151,11 +177,13 @@ class Gate:
         rates: the limits on requests a second.
         loopback: whether the service listens only on this machine; while there are no keys, requests to other host
             names are then refused.
+        hosts: further names, in lower case, under which a service without keys is reached.
     """
 
     keyring: Keyring | None
     rates: Rates
     loopback: bool
+    hosts: frozenset[str] = frozenset()
 
     def identify(self, scope: Scope) -> Principal:
         """Who sends a request.
@@ -170,8 +198,7 @@ class Gate:
         headers: list[tuple[bytes, bytes]] = scope["headers"]
         if not self.keyring.demanded:
             check_page(headers)
-            if self.loopback:
-                check_host(headers)
+            check_host(headers, self.loopback, self.hosts)
             return ANONYMOUS
         given = [value for name, value in headers if name == b"authorization"]
         try:

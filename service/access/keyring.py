@@ -227,7 +227,7 @@ class Keyring:
         self._known = _Known(demanded=True, held=held)
 
     def _hold(self, key: Key, before: HeldKeys | None) -> HeldKeys:
-        principal = Principal(key.name, key.id, key.role, key.maps)
+        principal = Principal(key.name, key.id, key.role, key.maps, key.learn)
         if key.expires_at is None:
             return HeldKeys(key, principal, None, None)
         expires = key.expires_at.timestamp()

@@ -51,6 +51,9 @@ KeyState = Literal["in force", "revoked", "expired"]
 MOST_KEYS = 10_000
 """Keys that a data directory may have, revoked ones included: a running service holds all of them in memory."""
 
+LEARN = "+learn"
+"""Behind the role of a key, as it is stored, from whose runs maps may learn."""
+
 _ALL = Statement(select(KEYS).order_by(KEYS.c.created_at, KEYS.c.id))
 _PUT = Statement(
     lambda insert: (put := insert(KEYS)).on_conflict_do_update(
@@ -73,6 +76,7 @@ class Key:
         name: of the key's holder; unique among the keys in force.
         role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
+        learn: whether maps may learn from the runs of its holder; only with the role ``enrol``, and ``admin`` has it.
         digest: SHA-256 of the whole key, as its holder sends it.
         created_at: when it was created.
         expires_at: when it expires; None for never.
@@ -89,19 +93,26 @@ class Key:
     expires_at: datetime | None = None
     revoked_at: datetime | None = None
     last_used_at: datetime | None = None
+    learn: bool = False
+
+    @property
+    def teaches(self) -> bool:
+        """Whether maps may learn from the runs of its holder."""
+        return self.role == "admin" or self.learn
 
     def includes(self, other: Key) -> bool:
         """Whether its holder may do whatever the holder of ``other`` may do, and for as long."""
         of_maps = self.maps is None or (other.maps is not None and other.maps <= self.maps)
         as_long = self.expires_at is None or (other.expires_at is not None and other.expires_at <= self.expires_at)
-        return LEVELS[other.role] <= LEVELS[self.role] and of_maps and as_long
+        may = LEVELS[other.role] <= LEVELS[self.role] and other.teaches <= self.teaches
+        return may and of_maps and as_long
 
     def seal(self) -> bytes:
         """The checksum of all fields but the last use."""
         values = [
             self.id,
             self.name,
-            self.role,
+            _stored_role(self),
             None if self.maps is None else sorted(self.maps),
             self.digest.hex(),
             *(text_of(moment) for moment in (self.created_at, self.expires_at, self.revoked_at)),
@@ -153,10 +164,12 @@ class Keys:
         maps: Iterable[str] | None = None,
         expires_at: datetime | None = None,
         keep_admin: bool = False,
+        learn: bool = False,
     ) -> tuple[Key, str]:
         """Create a key; return it and its text, which is not stored.  It is on disk when this returns.
 
         Args:
+            learn: whether maps may learn from the runs of its holder.
             keep_admin: refuse a first key that cannot manage the service.
 
         Raises:
@@ -171,13 +184,16 @@ class Keys:
             )
         if LEVELS.get(role, 0) < 1:
             raise InvalidRequest(f"{role!r} is not a role. Use query, enrol or admin.")
+        if learn and role == "query":
+            raise InvalidRequest("A key of the role query changes no map, so no map can learn from it. Use enrol.")
         limits = None if maps is None else frozenset(check_map_id(map_id) for map_id in maps)
         now = datetime.now(UTC)
         if expires_at is not None and expires_at <= now:
             raise InvalidRequest("The expiry of the key is in the past.")
         identity = secrets.token_hex(6)
         token = f"placerec_{identity}_{secrets.token_urlsafe(SECRET_BYTES)}"
-        key = Key(identity, name, role, limits, digest_of(token.encode()), now, expires_at)
+        option = learn and role == "enrol"
+        key = Key(identity, name, role, limits, digest_of(token.encode()), now, expires_at, learn=option)
         if not self.exists():
             if keep_admin:
                 _check_admin([key], now)  # before there is a file, with which keys are needed
@@ -205,7 +221,7 @@ class Keys:
         """Let the holder of a key do less, or for a shorter time.
 
         Args:
-            changes: new values of ``role``, ``maps`` and ``expires_at``; fields that are left out stay.
+            changes: new values of ``role``, ``maps``, ``expires_at`` and ``learn``; fields that are left out stay.
             keep_admin: refuse to narrow the last key that can manage the service.
 
         Raises:
@@ -222,7 +238,7 @@ class Keys:
             before = _of_id(keys, key_id)
             if not in_force(before, now):
                 raise KeyEnded(f"The key {before.name!r} is revoked or has expired; create another one.")
-            after = replace(before, **changes)
+            after = _narrowed(before, changes)
             for map_id in after.maps or ():
                 check_map_id(map_id)
             if not before.includes(after):
@@ -336,7 +352,7 @@ def row_of(key: Key) -> dict[str, object]:
     return {
         "id": key.id,
         "name": key.name,
-        "role": key.role,
+        "role": _stored_role(key),
         "maps": None if key.maps is None else json.dumps(sorted(key.maps)),
         "digest": key.digest,
         "created_at": text_of(key.created_at),
@@ -348,8 +364,9 @@ def row_of(key: Key) -> dict[str, object]:
 
 
 def _key(row: tuple[object, ...]) -> Key:
-    identity, name, role, maps, digest, created, expires, revoked, _, used = row
-    if role not in LEVELS or not isinstance(digest, bytes):
+    identity, name, stored, maps, digest, created, expires, revoked, _, used = row
+    role, learn, more = str(stored).partition(LEARN)
+    if role not in LEVELS or more or (learn and role != "enrol") or not isinstance(digest, bytes):
         raise ValueError("its role or digest is none")
     return Key(
         id=str(identity),
@@ -361,7 +378,27 @@ def _key(row: tuple[object, ...]) -> Key:
         expires_at=None if expires is None else datetime.fromisoformat(str(expires)),
         revoked_at=None if revoked is None else datetime.fromisoformat(str(revoked)),
         last_used_at=None if used is None else datetime.fromisoformat(str(used)),
+        learn=bool(learn),
     )
+
+
+def _stored_role(key: Key) -> str:
+    return key.role + (LEARN if key.learn else "")
+
+
+def _narrowed(key: Key, changes: Mapping[str, Any]) -> Key:
+    """A key after changes; without the role ``enrol`` it has not its option, which ``admin`` includes.
+
+    Raises:
+        InvalidRequest: the role cannot have the option.
+    """
+    after = replace(key, **changes)
+    if changes.get("learn") and after.role == "query":
+        raise InvalidRequest("A key of the role query changes no map, so no map can learn from it.")
+    if changes.get("learn") is False and after.role == "admin":
+        raise InvalidRequest("The role admin includes that maps learn from its runs; give the key the role enrol, too.")
+    kept = after.learn or (key.role == "admin" and "learn" not in changes)
+    return replace(after, learn=after.role == "enrol" and kept)
 
 
 def text_of(moment: datetime | None) -> str | None:

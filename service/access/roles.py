@@ -36,12 +36,19 @@ class Principal:
         key_id: None without a key.
         role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
+        learn: whether maps may learn from its runs; an option of the role ``enrol``.
     """
 
     name: str
     key_id: str | None
     role: Role
     maps: frozenset[str] | None
+    learn: bool = False
+
+    @property
+    def teaches(self) -> bool:
+        """Whether maps may learn from its runs."""
+        return self.role == "admin" or (self.learn and covers(self.role, "enrol"))
 
     def may_use(self, *map_ids: str | None) -> bool:
         """Whether it may use all of these maps; None, for what belongs to no map, needs a key for all maps."""
@@ -106,6 +113,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
     "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
+    "read_history": Rule("admin", "all"),
     "read_metrics": Rule("query", "all"),  # its series name all maps
     # The console's own files; their requests need a key like any other request
     "read_console": Rule("open", "none"),
@@ -130,6 +138,10 @@ OPERATIONS: dict[str, Rule] = {
     # Places, traverses, cameras: the objects that an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
+    "read_recording": Rule("enrol", "path"),
+    "upload_recording": Rule("enrol", "path", changes=True),
+    "enrol_recording": Rule("enrol", "path", changes=True),
+    "delete_recording": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
     "delete_place": Rule("enrol", "path", changes=True),
     "delete_places": Rule("enrol", "path", changes=True),
@@ -143,6 +155,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path", shows=True),
     "read_plan": Rule("query", "path"),
+    "check_coverage": Rule("query", "path"),
     "list_sequences": Rule("query", "path"),
     "delete_sequence": Rule("enrol", "path", changes=True),
     "list_cameras": Rule("query", "path"),
@@ -162,10 +175,14 @@ OPERATIONS: dict[str, Rule] = {
     "see_review_picture": Rule("enrol", "path", shows=True),
     "export_labels": Rule("enrol", "path", shows=True),
     "label_frame": Rule("enrol", "path", changes=True),
+    "list_stretches": Rule("enrol", "path"),
+    "accept_stretch": Rule("enrol", "path", changes=True),
+    "reject_stretch": Rule("enrol", "path", changes=True),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
     "list_sessions": Rule("query", "path"),
     "read_session": Rule("query", "path"),
+    "read_fleet": Rule("query", "shown"),
     "delete_session": Rule("query", "path"),
     "send_frame": Rule("query", "path"),
     "stream_frames": Rule("query", "path"),
@@ -177,6 +194,10 @@ OPERATIONS: dict[str, Rule] = {
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),
+    "erase_frames": Rule("admin", "path", changes=True),  # it deletes what people have labelled, too
+    "list_backups": Rule("admin", "all"),
+    "schedule_backups": Rule("admin", "all", changes=True),
+    "back_up": Rule("admin", "all", changes=True),
     "export_map": Rule("admin", "path", shows=True),  # it reads all of a map, with its pictures
     "import_map": Rule("admin", "named", changes=True),
     "rebuild_map": Rule("admin", "path", changes=True),

@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import threading
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from datetime import datetime
 from io import TextIOWrapper
 from logging.handlers import WatchedFileHandler
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import BinaryIO, ClassVar, Literal, Protocol
 
-from sqlalchemy import Column, MetaData, Table, bindparam, select
+from sqlalchemy import Column, MetaData, Table, bindparam, delete, select
 
+from core.disk.files import disk_errors, replacing
 from core.disk.permissions import open_private
 from core.errors import StorageFailure, StorageFull
 from core.ledger import Ledger, Statement, Tables
-from core.ledger.statements import integer, text
+from core.ledger.statements import among, integer, text
 from service.access.audit import LOGGER
 from service.administration.audit_lines import AuditLine, Position, lines_of_files
 from service.telemetry.requests import JsonLines
@@ -48,6 +51,8 @@ _AUDIT = Table(
 TABLES = Tables("audit", 1, _METADATA)
 
 _ADD = Statement(lambda insert: insert(_AUDIT).values(replica=bindparam("replica"), line=bindparam("line")))
+_OLDEST = Statement(select(_AUDIT.c.number, _AUDIT.c.line).order_by(_AUDIT.c.number).limit(bindparam("at_most")))
+_FORGET = Statement(delete(_AUDIT).where(among(_AUDIT.c.number, "numbers")))
 _LATEST = Statement(
     select(_AUDIT)
     .where(_AUDIT.c.number < bindparam("before"))
@@ -70,6 +75,13 @@ class AuditTrail(Protocol):
 
         Raises:
             StorageFailure: the file or the database cannot be read.
+        """
+
+    def forget_before(self, moment: datetime) -> None:
+        """Drop the lines from before a moment; files that were moved away stay, for they are their movers'.
+
+        Raises:
+            StorageFull, StorageFailure: the file or the database cannot be written.
         """
 
 
@@ -125,6 +137,21 @@ class AuditFile(WatchedFileHandler):
     def lines(self, before: Position | None) -> Iterator[AuditLine]:
         return lines_of_files(self.path, before)
 
+    def forget_before(self, moment: datetime) -> None:
+        """Write the file anew from its first line that is late enough; nothing is written if that is its first."""
+        with self.lock or nullcontext(), disk_errors("shorten the audit trail", self.path.name):
+            try:
+                old = self.path.open("rb")
+            except FileNotFoundError:
+                return
+            with old:
+                start = _first_from(old, moment)
+                if start == 0:
+                    return
+                old.seek(start)
+                with replacing(self.path) as temporary, temporary.open("wb") as new:
+                    shutil.copyfileobj(old, new)
+
 
 class AuditMemory(logging.Handler):
     """The latest lines, as they would be written to a file."""
@@ -146,6 +173,12 @@ class AuditMemory(logging.Handler):
         for back, line in enumerate(reversed(lines)):
             if before is None or written - back < before.offset:
                 yield AuditLine(Position(0, written - back), len(line), json.loads(line))
+
+    def forget_before(self, moment: datetime) -> None:
+        """Drop the lines from before a moment."""
+        with self.lock or nullcontext():
+            while self._lines and _is_before(self._lines[0], moment):
+                self._lines.popleft()
 
 
 class AuditTable(logging.Handler):
@@ -213,3 +246,31 @@ class AuditTable(logging.Handler):
             for number, replica, line in found:
                 yield AuditLine(Position(0, number), len(line), {**json.loads(line), "replica": replica})
             reached = found[-1][0]
+
+    def forget_before(self, moment: datetime) -> None:
+        """Drop the lines of all services from before a moment."""
+        while True:
+            found = self._ledger.execute("read the audit trail", _OLDEST, at_most=LINES_AT_ONCE)
+            old = [number for number, line in found if _is_before(line, moment)]
+            if old:
+                self._ledger.change("shorten the audit trail", _FORGET, numbers=old)
+            if len(old) < LINES_AT_ONCE:
+                return
+
+
+def _is_before(line: str | bytes, moment: datetime) -> bool:
+    """Whether a line says that it is from before a moment; one that cannot be read is as old as those beside it."""
+    try:
+        return datetime.fromisoformat(json.loads(line)["time"]) < moment
+    except (ValueError, TypeError, KeyError):
+        return True
+
+
+def _first_from(file: BinaryIO, moment: datetime) -> int:
+    """Where the first line begins that is not from before a moment; the end of the file if there is none."""
+    at = 0
+    for line in file:
+        if line.endswith(b"\n") and not _is_before(line, moment):
+            return at
+        at += len(line)
+    return at

@@ -7,6 +7,7 @@ A change is on disk when it is answered, and counts for every later request.  Th
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
@@ -70,6 +71,7 @@ def read_own_key(gate: GateDep, store: StoreDep, principal: PrincipalDep) -> Own
         name=principal.name,
         role=principal.role,
         maps=None if principal.maps is None else sorted(principal.maps),
+        learn=principal.teaches,
         expires_at=expires_at,
         keys_needed=gate.keyring is not None and gate.keyring.demanded,
     )
@@ -116,8 +118,8 @@ def create_key(
             "Other machines can reach this service, which has no keys. Create the first one on the service's own "
             "machine, with 'placerec keys create'."
         )
-    request.state.noted = _noted(new.model_dump(include={"name", "role", "maps"}))
-    key, token = store.create(new.name, new.role, new.maps, new.expires_at, keep_admin=not lock_out)
+    request.state.noted = _noted(new.model_dump(include={"name", "role", "maps", "learn"}))
+    key, token = store.create(new.name, new.role, new.maps, new.expires_at, not lock_out, new.learn)
     _take_effect(gate)
     request.state.noted["changed_key"] = key.id
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{key.id}"
@@ -146,7 +148,7 @@ def narrow_key(
     principal: PrincipalDep,
     lock_out: LockOut = False,
 ) -> KeyView:
-    """Narrow a key by a merge patch: a lower role, fewer maps, an earlier expiry.
+    """Narrow a key by a merge patch: a lower role, fewer maps, an earlier expiry, no more learning from its runs.
 
     Its holder can never do more than on the day on which the key was created; for that, create another key.
     """
@@ -154,6 +156,8 @@ def narrow_key(
     request.state.noted = _noted({"key": key_id, **given})
     if "role" in given and given["role"] is None:
         raise InvalidRequest("role: a key has a role; give query, enrol or admin.")
+    if "learn" in given and given["learn"] is None:
+        raise InvalidRequest("learn: give true or false.")
     if given.get("maps") is not None:
         given["maps"] = frozenset(given["maps"])
     key = store.narrow(key_id, given, keep_admin=not lock_out)
@@ -164,12 +168,18 @@ def narrow_key(
 
 @router.delete("/{key}", dependencies=[WHOLE_DELETION], responses=problem_documentation(UnknownKey, LastAdminKey))
 def delete_key(
-    key_id: KeyId, request: Request, gate: GateDep, store: StoreDep, principal: PrincipalDep, lock_out: LockOut = False
+    key_id: KeyId,
+    request: Request,
+    gate: GateDep,
+    store: StoreDep,
+    engine: EngineDep,
+    principal: PrincipalDep,
+    lock_out: LockOut = False,
 ) -> KeyView:
     """Delete a key: it is revoked, so that no later request is let in with it. Repeating this changes nothing."""
     request.state.noted = _noted({"key": key_id})
     store.find(key_id)  # the store would also take a name
-    key = store.revoke(key_id, keep_admin=not lock_out)
+    key = engine.reserve.making_room(partial(store.revoke, key_id, keep_admin=not lock_out))
     _take_effect(gate)
     request.state.noted["changed_key_name"] = key.name
     return KeyView.of(key, principal.key_id)

@@ -22,6 +22,7 @@ NEW_KEY_EXAMPLE: dict[str, Any] = {
     "name": "robot-7",
     "role": "query",
     "maps": ["lab"],
+    "learn": False,
     "expires_at": "2027-01-31T00:00:00Z",
 }
 KEY_EXAMPLE: dict[str, Any] = {
@@ -44,6 +45,10 @@ class KeyView(BaseModel):
     name: str = Field(description="Whose it is; it appears in logs and in the audit trail.")
     role: KeyRole
     maps: list[str] | None = Field(description="Ids of the maps that it is limited to; null: all maps.")
+    learn: bool = Field(
+        description="Whether maps that learn do so from the runs of its holder. An option of the role enrol; admin "
+        "includes it."
+    )
     state: KeyState
     created_at: Timestamp
     expires_at: Timestamp | None
@@ -80,7 +85,8 @@ def _fields(key: Key, asking: str | None) -> dict[str, Any]:
     names = ("id", "name", "role", "created_at", "expires_at", "revoked_at", "last_used_at")
     maps = None if key.maps is None else sorted(key.maps)
     shown = {name: getattr(key, name) for name in names}
-    return {**shown, "maps": maps, "state": state_of(key, datetime.now(UTC)), "own": key.id == asking}
+    state = state_of(key, datetime.now(UTC))
+    return {**shown, "maps": maps, "learn": key.teaches, "state": state, "own": key.id == asking}
 
 
 class KeyPage(BaseModel):
@@ -101,6 +107,12 @@ class NewKey(BaseModel):
     )
     role: KeyRole = Field(description="enrol includes query, and admin includes everything.")
     maps: MapIds | None = Field(default=None, description="Limit it to these maps; null or left out: all maps.")
+    learn: bool = Field(
+        default=False,
+        strict=True,
+        description="Whether maps that learn do so from the runs of its holder. An option of the role enrol; admin "
+        "includes it.",
+    )
     expires_at: Timestamp | None = Field(default=None, description="When it expires; null or left out: never.")
 
 
@@ -111,6 +123,7 @@ class KeyChanges(BaseModel):
 
     role: KeyRole | None = Field(default=None, description="Not higher than now.")
     maps: MapIds | None = Field(default=None, description="Some of the present ones; null: all maps.")
+    learn: bool | None = Field(default=None, strict=True, description="false: no map learns from its runs any more.")
     expires_at: Timestamp | None = Field(default=None, description="Not later than now; null: never.")
 
 
@@ -125,6 +138,7 @@ class OwnKey(BaseModel):
                     "name": "robot-7",
                     "role": "query",
                     "maps": ["lab"],
+                    "learn": False,
                     "expires_at": "2027-01-31T00:00:00Z",
                     "keys_needed": True,
                 }
@@ -136,5 +150,6 @@ class OwnKey(BaseModel):
     name: str
     role: Role
     maps: list[str] | None = Field(description="Ids of the maps that the key is limited to; null: all maps.")
+    learn: bool = Field(description="Whether maps that learn do so from its runs.")
     expires_at: Timestamp | None
     keys_needed: bool = Field(description="Whether a request needs a key; false on a service without keys.")

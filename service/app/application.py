@@ -23,10 +23,11 @@ from service.access.keys import Keys
 from service.access.rates import Rates
 from service.administration import audit_routes, key_routes
 from service.administration.audit_trail import audit_trail
+from service.app import load_history, service_state
 from service.app import routes as root
-from service.app import service_state
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
+from service.backups import routes as backups
 from service.console import routes as console
 from service.errors.faults import KeysUnreadable
 from service.errors.problems import install_problems, problem_response
@@ -42,8 +43,12 @@ from service.maps.schemas import CalibrationOrder
 from service.places import looks, plan_routes
 from service.places import routes as places
 from service.places.parameters import BatchItem
+from service.poses import routes as poses
+from service.poses.geoposes import GeoPose
 from service.queries import answer_routes, loop_closure, multi_map_routes
 from service.queries import routes as queries
+from service.recordings import routes as recordings
+from service.review import learnt_looks, stretches
 from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
@@ -51,8 +56,8 @@ from service.settings import Settings, read_settings
 from service.shared import open_database
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
+from service.upkeep import fleet, similarity
 from service.upkeep import routes as upkeep
-from service.upkeep import similarity
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -102,8 +107,11 @@ ROUTERS = (
     maps.router,
     places.router,
     places.traverses,
+    recordings.router,
     looks.router,
+    learnt_looks.router,
     plan_routes.router,
+    poses.router,
     camera_routes.router,
     event_routes.router,
     calibration.router,
@@ -112,18 +120,22 @@ ROUTERS = (
     multi_map_routes.router,
     sessions.router,
     stream_routes.router,
+    fleet.router,
     queries.explanations,
     review.router,
+    stretches.router,
     answer_routes.router,
     frames.router,
     upkeep.router,
     similarity.router,
     transfer_routes.router,
+    backups.router,
     jobs.router,
     key_routes.own,
     key_routes.router,
     audit_routes.router,
     service_state.router,
+    load_history.router,
     root.encoders,
     console.router,
 )
@@ -141,8 +153,8 @@ class Application(FastAPI):
     """FastAPI with an OpenAPI document that also says what every operation can answer."""
 
     def openapi(self) -> dict[str, Any]:
-        """The document, with the models of bodies that routes read by hand, and of events."""
-        return document(self, (BatchItem, CalibrationOrder, *EVENTS))
+        """The document, with the models of bodies that routes read by hand, of other answers, and of events."""
+        return document(self, (BatchItem, CalibrationOrder, GeoPose, *EVENTS))
 
 
 class RootPath:
@@ -240,7 +252,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     keyring = None if as_owner else Keyring(store, may_open=may_open)
     metrics = Metrics()
     rates = Rates(chosen.rate_per_key, chosen.rate_burst, database)
-    gate = Gate(keyring, rates, chosen.is_loopback())
+    gate = Gate(keyring, rates, chosen.is_loopback(), chosen.host_names())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

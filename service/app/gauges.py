@@ -49,6 +49,9 @@ class RuntimeCollector(Collector):
         yield _gauge("placerec_event_listeners", "Clients that listen to the events of maps.", listeners)
         dropped = runtime.engine.review_keeper.dropped
         yield _gauge("placerec_review_frames_dropped", "Frames for review that were not stored.", dropped)
+        if (moment := runtime.backups.newest()) is not None:
+            text = "When the newest backup was begun, in seconds since 1970."
+            yield _gauge("placerec_last_backup_timestamp_seconds", text, moment.timestamp())
         yield self._jobs()
         yield from self._maps()
         with suppress(OSError):

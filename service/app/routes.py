@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import platform
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
 import faiss
-import torch
 from fastapi import APIRouter, Depends, FastAPI, Request
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import Response
@@ -62,9 +62,17 @@ async def read_version(request: Request, engine: EngineDep) -> Version:
         version=request.app.version,
         encoder=engine.settings.encoder,
         python=platform.python_version(),
-        torch=torch.__version__,
+        torch=_version_of("torch"),
         faiss=faiss.__version__,
     )
+
+
+def _version_of(distribution: str) -> str | None:
+    """The version of a package, which is not loaded for it; None: it is not installed."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
 
 
 @router.get("/openapi.json", include_in_schema=False)

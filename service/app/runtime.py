@@ -15,13 +15,16 @@ from starlette.datastructures import State
 from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
 from service.access.keyring import Keyring
+from service.administration.audit_trail import AuditTrail
 from service.app.probe import Probe
+from service.backups.backups import Backups
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
+from service.jobs.job import Job
 from service.jobs.jobs import Jobs
-from service.learning import lessons
+from service.learning import lessons, new_ground
 from service.learning.run_notes import RunNotes
-from service.maps import calibration, storage_jobs
+from service.maps import calibration, self_calibration, storage_jobs
 from service.maps.exports import Exports
 from service.maps.imports import Imports
 from service.peers.alone import Alone
@@ -32,12 +35,18 @@ from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
 from service.ray_serve import encoders_for
+from service.recordings import enrolling
+from service.recordings.readers import Readers
+from service.recordings.uploads import Recordings
 from service.sessions.session import Session
 from service.sessions.sessions import Sessions
 from service.sessions.table import session_file
 from service.settings import Settings, unknown_variables
+from service.telemetry.history import LoadHistory
 from service.telemetry.metrics import Metrics
-from service.upkeep import alignment, keypoints, merging, pruning, reencoding
+from service.upkeep import alignment, erasure, keypoints, merging, pruning, reencoding
+from service.upkeep.alarms import Alarms
+from service.upkeep.retention import Retention
 from service.upkeep.similarity import Matrices
 
 if TYPE_CHECKING:
@@ -84,11 +93,16 @@ class Runtime:
                 self.sessions = self.shared.sessions(self.engine.events)
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
+        self.recordings, self.bag_readers = Recordings(settings, self.jobs), Readers()
         self.batch_order, self.plans = BatchOrder(), Plans()
         statistics = QueryStatistics.of_engine if self.shared is None else self.shared.statistics
         self.statistics = statistics(self.engine)
+        self.statistics.on_written = Alarms(self.engine, self.statistics).check
+        self.history = metrics.history = LoadHistory(settings.data_dir)
+        self._shared_ledger = database
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
+        self.backups = Backups(settings, self.engine, self.jobs)
         self.health_examinations = CapacityLimiter(1)  # each is a long search
         self.similarity_matrices = Matrices()
         self.stopping = False
@@ -100,42 +114,64 @@ class Runtime:
         self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
         silent = "The object store does not answer."
         self._pictures = Probe(maps.check_pictures, PICTURES_CHECK_SECONDS, silent)
-        self._register_jobs()
+        rooms = erasure.Rooms(self.engine, self.statistics, self.sessions, self.explanation_pictures, self.recordings)
+        self._register_jobs(rooms)
         self.sessions.on_run = self._learn
+        self.audit: AuditTrail | None = None
+        """The trail of this service, once there is one."""
+        self.retention = Retention(settings, rooms, lambda: self.audit)
 
     def _learn(self, session: Session, notes: RunNotes) -> None:
         """Have a map learn from a run that is over."""
         camera = session.options.camera
-        lessons.submit(self.engine, self.jobs, session.map_id, session.map_created_at, camera, notes)
+        map_id, made = session.map_id, session.map_created_at
+        erased = partial(erasure.concerns, self.jobs, map_id, made)
+        calibrate = partial(self_calibration.calibrate_by_run, self.engine, self.statistics)
+        lessons.submit(self.engine, self.jobs, map_id, made, camera, notes, erased, calibrate)
 
-    def _register_jobs(self) -> None:
+    def _register_jobs(self, rooms: erasure.Rooms) -> None:
         """Register the kinds of jobs that continue after a restart; ``Imports`` registers its own."""
         engine, staging, register = self.engine, self.staging, self.jobs.register
+        align_enrolled = partial(alignment.align_enrolled, self.statistics)
         register(reencoding.KIND, partial(reencoding.reencode, engine))
+        register(erasure.KIND, partial(erasure.erase, rooms))
         register(pruning.KIND, partial(pruning.prune, engine))
-        register(alignment.KIND, partial(alignment.align, engine))
+        register(alignment.KIND, partial(alignment.align, engine, self.statistics))
         register(merging.KIND, partial(merging.merge, engine))
+        register(new_ground.KIND, partial(new_ground.accept, engine))
         register(keypoints.KIND, partial(keypoints.fill_keypoints, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
         register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
         register(calibration.KIND, partial(calibration.run_job, engine, self.statistics))
         register(
             bulk_enrolment.KIND,
-            partial(bulk_enrolment.enrol_staged, engine, staging, alignment.align_enrolled),
+            partial(bulk_enrolment.enrol_staged, engine, staging, align_enrolled),
             partial(bulk_enrolment.discard, staging),
         )
+
+        register(
+            enrolling.KIND,
+            partial(enrolling.enrol_recording, engine, self.recordings, self.bag_readers, align_enrolled),
+            self._bag_job_ended,
+        )
+
+    def _bag_job_ended(self, job: Job) -> None:
+        self.bag_readers.end(job.id)
+        self.recordings.job_ended(job)
 
     def publish(self, state: State) -> None:
         """Make the parts available to the routes, which find them by name (``service.http.routing.FromState``)."""
         state.runtime = self
         state.engine, state.jobs, state.sessions = self.engine, self.jobs, self.sessions
+        state.recordings = self.recordings
         state.staging, state.batch_order, state.plans = self.staging, self.batch_order, self.plans
         state.statistics, state.explanation_pictures = self.statistics, self.explanation_pictures
         state.health_examinations = self.health_examinations
         state.similarity_matrices = self.similarity_matrices
-        state.exports, state.imports = self.exports, self.imports
+        state.exports, state.imports, state.backups = self.exports, self.imports, self.backups
         if self.shared is not None:
             state.audit_trail = self.shared.audit
+        self.audit = getattr(state, "audit_trail", None)
 
     def start(self) -> None:
         """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""
@@ -145,13 +181,20 @@ class Runtime:
         try:
             self._remove_leftovers()
             self.imports.clean()
+            self.recordings.clean()
         except StoreUnavailable as error:
             log.warning("what the last run has left stays until the next start: %s", error)
         self.statistics.start()
+        if self.shared is None:
+            self.history.start()
+        else:
+            self.history.start(self._shared_ledger, self.shared.replica.id)
         self.exports.clean()
         if self.shared is not None:
             self.shared.start()
         self.jobs.start()
+        self.retention.start()
+        self.backups.start()
 
     def _remove_leftovers(self) -> None:
         """Remove the forms and unlisted maps that belong to no unfinished job."""
@@ -168,8 +211,12 @@ class Runtime:
         self.engine.stop_loading()
         await self.exports.close()
         # Jobs stop first, since they need the encoder and the maps.
+        await to_thread.run_sync(self.retention.close)
+        await to_thread.run_sync(self.backups.close)
         await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
+        await to_thread.run_sync(self.bag_readers.close)
         await to_thread.run_sync(self.statistics.close)
+        await to_thread.run_sync(self.history.close)
         await to_thread.run_sync(self.sessions.close)
         if self.shared is not None:
             await to_thread.run_sync(self.shared.close)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from core.method.catalogue import EncoderSummary
 from service.http.schemas import Cursor
@@ -41,5 +41,5 @@ class Version(BaseModel):
     api: str = "v1"
     encoder: str
     python: str
-    torch: str
+    torch: str | None = Field(description="Null: it is not installed, and forward passes are computed in float32.")
     faiss: str

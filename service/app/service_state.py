@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +21,7 @@ from service.http.bodies import UploadMemory
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.settings import Settings
 from service.telemetry import latencies
+from service.telemetry.history import disk_of, resident_memory
 from service.worker_threads import in_thread, thread_turns
 
 RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
@@ -71,7 +70,7 @@ class OperationState(BaseModel):
 
 
 class RequestsState(BaseModel):
-    """The requests of the last minutes."""
+    """The requests of the last minutes, without those of the console."""
 
     seconds: int = Field(description="The time that is looked back on.")
     under_way: int
@@ -256,14 +255,9 @@ def _limits(settings: Settings) -> dict[str, int | float]:
 
 
 def _memory(uploads: UploadMemory) -> MemoryState:
-    resident = None
-    with suppress(OSError, ValueError, IndexError):  # not every system has it
-        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return MemoryState(resident=resident, uploads=uploads.held, upload_limit=uploads.capacity)
+    return MemoryState(resident=resident_memory(), uploads=uploads.held, upload_limit=uploads.capacity)
 
 
 def _disk(directory: Path) -> DiskState | None:
-    with suppress(OSError):
-        usage = shutil.disk_usage(directory)
-        return DiskState(free=usage.free, total=usage.total)
-    return None
+    free, total = disk_of(directory)
+    return None if free is None or total is None else DiskState(free=free, total=total)

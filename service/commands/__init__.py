@@ -1,17 +1,23 @@
 """The ``placerec`` command: one module a command.
 
 Modules that take a second to load (torch, FAISS, the service itself) are imported within the
-commands that need them, so that ``placerec --help`` answers at once.
+commands that need them, so that ``placerec --help`` answers at once; and ``placerec serve``, whose start
+others wait for, loads no other command.
 """
 
-from service.commands.application import application
+import sys
+
 from service.commands.malloc import configure_malloc
 
 
 def main() -> None:
     """Run the command line of this process; the entry point ``placerec``."""
     configure_malloc()
+    if sys.argv[1:2] == ["serve"]:
+        from service.commands.serve import alone as application
+    else:
+        from service.commands.application import application
     application(prog_name="placerec")
 
 
-__all__ = ["application", "main"]
+__all__ = ["main"]

@@ -61,13 +61,11 @@ def _measure_here(
     image: Path | None, encoder: str | None, places: int, rounds: int, threads: int, models_dir: Path | None
 ) -> dict[str, Any]:
     # Imported here because they take a second.
-    import torch
-
-    from core.threads import share_cores
+    from core.threads import cores, share_cores
     from service.commands.timing.samples import jpeg, sample_frame
     from service.commands.timing.stages import better_forward, encode_batch, encoding_runs, medians, search_run
 
-    share_cores(threads or torch.get_num_threads())
+    share_cores(threads or cores())
     chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
     data = jpeg(sample_frame()) if image is None else read_bytes(image)
     with progress() as bar:
@@ -77,14 +75,14 @@ def _measure_here(
             times = medians({**encoding_runs(chosen, data), **batch, "search": search}, rounds)
         times["batch"] /= FRAMES
     forward = better_forward(times)
-    shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {torch.get_num_threads()} threads")
+    shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {threads or cores()} threads")
     for name, milliseconds in [("bare forward pass", forward), *times.items()]:
         called = {"search": f"search of {places}", "batch": f"encode, {FRAMES} together, each"}.get(name, name)
         shown.add_row(called, number(milliseconds, 2), number(milliseconds / forward, 2))
     show(shown)
     return {
         "encoder": chosen.identity,
-        "threads": torch.get_num_threads(),
+        "threads": threads or cores(),
         "places": places,
         "milliseconds": {"forward": forward, **times},
         "ratio": {"encode": times["encode"] / forward},

@@ -52,6 +52,10 @@ def calibrate(
             "--itself", help="Ask for the map's own frames among their neighbours: less reliable, but needs no labels."
         ),
     ] = False,
+    runs: Annotated[
+        bool,
+        typer.Option("--runs", help="By the frames of robots' sessions whose place the whole run knew beyond doubt."),
+    ] = False,
     packaged: Annotated[
         list[Path] | None,
         typer.Option(
@@ -80,8 +84,8 @@ def calibrate(
 
     With --packaged: those of an encoder, for maps that have no calibration of their own, by any pictures of places.
     """
-    if (frames is not None) + (sequence is not None) + itself + (packaged is not None) != 1:
-        raise typer.BadParameter("give exactly one of --frames, --sequence, --itself and --packaged")
+    if (frames is not None) + (sequence is not None) + itself + runs + (packaged is not None) != 1:
+        raise typer.BadParameter("give exactly one of --frames, --sequence, --itself, --runs and --packaged")
     if packaged is not None:
         if precision is not None or false_accept_rate is not None or mean_of_negatives or most is not None:
             raise typer.BadParameter("--packaged takes no target and no --most")
@@ -114,7 +118,8 @@ def calibrate(
             parts.append((name, (file, data, media_type(data))))
         report = ask(target, "POST", path, files=parts).json()
     else:
-        order |= {"method": "map"} if itself else {"method": "sequence", "sequence": sequence}
+        order |= {"method": "map" if itself else "runs"} if sequence is None else {"method": "sequence"}
+        order |= {} if sequence is None else {"sequence": sequence}
         if pairs is not None:
             order["pairs"] = {place: shown or None for place, shown in _rows(pairs, ("place", "shows"))}
         job = submit(

@@ -17,7 +17,7 @@ from core.errors import InvalidIdentifier
 from core.places import check_sequence
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
-from service.commands.console import Failure, complain, progress, say
+from service.commands.console import Failure, complain, progress, remark, say
 from service.commands.jobs import show_outcome, submit
 from service.commands.options.recordings import (
     PANEL,
@@ -25,7 +25,9 @@ from service.commands.options.recordings import (
     EveryDegrees,
     EveryMetres,
     EverySeconds,
+    FixedFrame,
     LargestGap,
+    MovingFrame,
     PoseTopic,
     RecordingOptions,
     Topic,
@@ -35,6 +37,7 @@ from service.commands.options.recordings import (
 )
 
 if TYPE_CHECKING:
+    from core.frames.intrinsics import Intrinsics
     from core.frames.masks import Mask
 
 
@@ -88,6 +91,8 @@ def enrol(
     ] = False,
     topic: Topic = None,
     pose_topic: PoseTopic = None,
+    fixed_frame: FixedFrame = None,
+    moving_frame: MovingFrame = None,
     trajectory: TrajectoryFile = None,
     trajectory_times: TrajectoryTimes = None,
     largest_gap: LargestGap = None,
@@ -125,6 +130,8 @@ def enrol(
         every_degrees,
         every_seconds,
         every_change,
+        fixed_frame,
+        moving_frame,
     )
     target = CommandTarget(url, data_dir)
     began = time.monotonic()
@@ -136,7 +143,9 @@ def enrol(
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             return [FrameToSend(taken, name, camera) for taken in chosen]
 
-        report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
+        report, frames = run(
+            _enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened.intrinsics)
+        )
     _show(report, map_id, name, frames, time.monotonic() - began)
     if align:
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
@@ -181,6 +190,7 @@ async def _enrol(
     camera: str | None,
     create: bool,
     wanted: dict[str, str | None],
+    intrinsics: Intrinsics | None,
 ) -> tuple[Report, int]:
     """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
 
@@ -191,7 +201,7 @@ async def _enrol(
     async with open_service(target) as service:
         given = {key: value for key, value in wanted.items() if value is not None}
         used = await _ready_map(service, map_id, create, given)
-        mask = None if camera is None else await _mask(service, map_id, camera)
+        mask = None if camera is None else await _mask(service, map_id, camera, intrinsics)
         frames = await asyncio.to_thread(choose, used, mask)
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
@@ -225,11 +235,19 @@ async def _ready_map(service: Service, map_id: str, create: bool, settings: dict
     return None if encoder is None else str(encoder)
 
 
-async def _mask(service: Service, map_id: str, camera: str) -> Mask | None:
-    """The mask of a camera's frames; a camera that the map does not have is refused, as each frame would be."""
+async def _mask(service: Service, map_id: str, camera: str, intrinsics: Intrinsics | None) -> Mask | None:
+    """The mask of a camera's frames; a camera that the map does not have is refused, as each frame would be.
+
+    A camera without intrinsics gets those of the recording.
+    """
     from core.frames.masks import Mask  # here because it takes a moment
 
-    found = (await service.get(path_of("maps", map_id, "cameras", camera)))["mask"]
+    path = path_of("maps", map_id, "cameras", camera)
+    known = await service.get(path)
+    found = known["mask"]
+    if intrinsics is not None and known["intrinsics"] is None:
+        await service.request("PUT", path, json={"mask": found, "intrinsics": intrinsics.model_dump(mode="json")})
+        remark(f"The camera {camera} had no intrinsics, and has those of the bag now.")
     return None if found is None else Mask.model_validate_json(json.dumps(found))
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import atexit
 import re
+from dataclasses import replace
 from datetime import UTC, datetime, time, timedelta
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, read_settings
+from service.commands.connection.client import AsJson, DataDir
 from service.commands.console import Commands, Failure, remark, show, show_json, table
+from service.commands.options.settings import read_settings
 
 if TYPE_CHECKING:
     from service.access.keys import Key, Keys, KeyState
@@ -31,6 +33,9 @@ def create(
     maps: Annotated[
         list[str] | None, typer.Option("--map", "-m", help="Limit the key to this map; may be repeated.")
     ] = None,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Maps that learn do so from its runs; for the role enrol.")
+    ] = False,
     expires: Annotated[
         str | None, typer.Option(help="When it expires: after 30m, 12h, 30d or 8w, or at a date (UTC).")
     ] = None,
@@ -44,7 +49,9 @@ def create(
     """
     store = _store(data_dir)
     is_first = not store.exists()
-    key, token = store.create(name, role, maps or None, None if expires is None else moment(expires))
+    until = None if expires is None else moment(expires)
+    key, token = store.create(name, role, maps or None, until, learn=learn)
+    _note(data_dir, "create_key", key, 201, role=key.role, maps=maps or None, learn=key.learn)
     if as_json:
         show_json(_view(key) | {"key": token})
     else:
@@ -61,14 +68,15 @@ def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
     if as_json:
         show_json([_view(key) for key in found])
         return
-    shown = table("id", "name", "role", "maps", "state", "created", "expires", "last used")
+    shown = table("id", "name", "role", "learn", "maps", "state", "created", "expires", "last used")
     for key in found:
         maps = "all" if key.maps is None else ",".join(sorted(key.maps))
         moments = (_shown(moment) for moment in (key.created_at, key.expires_at, key.last_used_at))
-        shown.add_row(key.id, key.name, key.role, maps, _state_of(key), *moments)
+        shown.add_row(key.id, key.name, key.role, "yes" if key.teaches else "no", maps, _state_of(key), *moments)
     show(shown)
     if not found:
-        remark("No key was ever created, so the service needs none.")
+        folder = read_settings(data_dir).data_dir
+        remark(f"No key was ever created in the data directory {folder}, so a service on it needs none.")
 
 
 @keys.command("delete")
@@ -79,6 +87,7 @@ def delete(
     """Delete a key: it is revoked, so that nobody is let in with it; a running service knows within a second."""
     store = _store(data_dir)
     deleted = store.revoke(wanted)
+    _note(data_dir, "delete_key", deleted, 200)
     remark(f"The key {deleted.name} ({deleted.id}) is deleted.")
     if not any(_state_of(other) == "in force" for other in store.all()):
         remark("No key is in force now: the service refuses every request that needs one.")
@@ -113,6 +122,19 @@ def _store(data_dir: Any) -> Keys:
     return Keys.of(settings.data_dir, database)
 
 
+def _note(data_dir: Any, operation: str, key: Key, status: int, **fields: object) -> None:
+    """Have the audit file, if there is one, say what was changed, as over HTTP."""
+    from service.access.audit import ASKER, note_change
+    from service.administration.audit_trail import audit_trail
+
+    file = read_settings(data_dir).audit_file
+    if file is None:
+        return
+    with audit_trail(file):
+        changed = {"changed_key": key.id, "changed_key_name": key.name}
+        note_change(replace(ASKER.get(), operation=operation), {}, {**changed, **fields}, status)
+
+
 def _state_of(key: Key) -> KeyState:
     """Whether a key is in force by this machine's clock."""
     from service.access.keys import state_of
@@ -122,7 +144,8 @@ def _state_of(key: Key) -> KeyState:
 
 def _described(key: Key) -> str:
     maps = "all maps" if key.maps is None else f"maps {', '.join(sorted(key.maps))}"
-    return f"{key.role}, {maps}, {'no expiry' if key.expires_at is None else f'until {_shown(key.expires_at)}'}"
+    role = f"{key.role} with learn" if key.learn else key.role
+    return f"{role}, {maps}, {'no expiry' if key.expires_at is None else f'until {_shown(key.expires_at)}'}"
 
 
 def _shown(moment: datetime | None) -> str:
@@ -136,6 +159,7 @@ def _view(key: Key) -> dict[str, Any]:
         "name": key.name,
         "role": key.role,
         "maps": None if key.maps is None else sorted(key.maps),
+        "learn": key.teaches,
         "state": _state_of(key),
         **{name: None if at is None else at.isoformat() for name, at in moments.items()},
     }

@@ -27,7 +27,9 @@ from service.commands.options.recordings import (
     EveryDegrees,
     EveryMetres,
     EverySeconds,
+    FixedFrame,
     LargestGap,
+    MovingFrame,
     PoseTopic,
     RecordingOptions,
     Topic,
@@ -84,6 +86,8 @@ def query(
     ] = "auto",
     topic: Topic = None,
     pose_topic: PoseTopic = None,
+    fixed_frame: FixedFrame = None,
+    moving_frame: MovingFrame = None,
     trajectory: TrajectoryFile = None,
     trajectory_times: TrajectoryTimes = None,
     largest_gap: LargestGap = None,
@@ -122,6 +126,8 @@ def query(
         every_degrees,
         every_seconds,
         every_change,
+        fixed_frame,
+        moving_frame,
     )
 
     def frames(encoder: str | None) -> Iterator[QueryFrame]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands.connection.client import read_settings
 from service.commands.console import Commands, Failure, remark
+from service.commands.options.settings import read_settings
 
 if TYPE_CHECKING:
     from service.ray_serve.cluster import Cluster

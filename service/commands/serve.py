@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands.connection.client import read_settings
-from service.commands.console import Failure
+from service.commands.console import Commands, Failure
+from service.commands.options.settings import read_settings
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -36,6 +37,13 @@ def serve(
     _serve(settings)
 
 
+alone = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+"""The command line with this command and no other; it is read as the whole one would read it."""
+
+alone.callback()(lambda: None)
+alone.command()(serve)
+
+
 def _serve(settings: Settings) -> None:
     from service.telemetry.native_output import logged_stderr
 
@@ -44,6 +52,7 @@ def _serve(settings: Settings) -> None:
 
 
 def _serve_logged(settings: Settings) -> None:
+    gc.disable()  # all of it lives as long as the process: the engine freezes it once it has loaded
     from service.app.application import create_app
     from service.http.connections import Connections
     from service.http.server import CannotListen, serve_application
@@ -51,6 +60,7 @@ def _serve_logged(settings: Settings) -> None:
     from service.settings import SettingsError
     from service.telemetry.requests import configure_logging
 
+    gc.enable()
     configure_logging(settings.log_level)
     try:
         if settings.ray:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from service.commands.connection.client import read_settings
 from service.commands.console import remark, show, show_json, table
+from service.commands.options.settings import read_settings
 
 
 def settings(as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False) -> None:

@@ -8,21 +8,32 @@ import { html, signal, useEffect, useState } from "./shared/view.js";
 
 const OF_MAPS = {
   plan: ["Plan", () => import("./views/plan.js"), "query"],
+  enrol: ["Enrol", () => import("./views/enrol.js"), "enrol"],
   places: ["Places", () => import("./views/places.js"), "query"],
   try: ["Try", () => import("./views/try.js"), "query"],
   live: ["Live", () => import("./views/live.js"), "query"],
+  answers: ["Answers", () => import("./views/answers.js"), "query"],
   traverses: ["Traverses", () => import("./views/traverses.js"), "query"],
   calibration: ["Calibration", () => import("./views/calibration.js"), "query"],
   review: ["Review", () => import("./views/review.js"), "enrol"],
+  learning: ["Learning", () => import("./views/learning.js"), "query"],
   health: ["Health", () => import("./views/health.js"), "enrol"],
+  cameras: ["Cameras", () => import("./views/cameras.js"), "query"],
+  upkeep: ["Upkeep", () => import("./views/upkeep.js"), "admin"],
 };
 const OF_SERVICE = {
+  home: ["Home", () => import("./views/home.js"), "query", false],
+  robots: ["Robots", () => import("./views/robots.js"), "query", false],
   maps: ["Maps", () => import("./views/maps.js"), "query", false],
   jobs: ["Jobs", () => import("./views/jobs.js"), "query", false],
+  backups: ["Backups", () => import("./views/backups.js"), "admin", true],
   keys: ["Keys", () => import("./views/keys.js"), "admin", true],
   audit: ["Audit", () => import("./views/audit.js"), "admin", true],
   service: ["Service", () => import("./views/service.js"), "query", false],
 };
+
+/** The views of the service that stand above those of a map. */
+const FIRST = ["home", "robots", "maps"];
 
 const menuOpen = signal(false);
 
@@ -75,7 +86,7 @@ function skip(event) {
 
 function viewOf({ parts }) {
   if (!parts.every(isName)) return { name: "", entry: null, map: null, rest: [] };
-  const [first = "maps", map, second = "plan", ...rest] = parts;
+  const [first = "home", map, second = "plan", ...rest] = parts;
   if (first === "maps" && map !== undefined) return { name: second, entry: OF_MAPS[second], map, rest };
   return { name: first, entry: OF_SERVICE[first], map: null, rest: parts.slice(1) };
 }
@@ -138,11 +149,11 @@ function Side() {
   return html`
     <header class="side">
       <div class="brand">
-        <a href=${href("maps")}><${Mark} /> placerec</a>
+        <a href=${href("home")}><${Mark} /> placerec</a>
         <button type="button" class="menu" aria-expanded=${menuOpen.value} aria-controls="menu" onClick=${() => (menuOpen.value = !menuOpen.value)}>Menu</button>
       </div>
       <nav id="menu" aria-label="Views">
-        <ul>${link(OF_SERVICE.maps, "maps", href("maps"), !map && name === "maps")}</ul>
+        <ul>${FIRST.map((id) => link(OF_SERVICE[id], id, href(id), !map && name === id))}</ul>
         ${caller.value && html`<${MapChoice} chosen=${chosen} name=${name} />`}
         ${chosen && caller.value && html`
           <ul class="of-map">
@@ -151,7 +162,7 @@ function Side() {
         `}
         <h2>Service</h2>
         <ul>
-          ${Object.entries(OF_SERVICE).map(([id, entry]) => id !== "maps" && link(entry, id, href(id), map === null && name === id))}
+          ${Object.entries(OF_SERVICE).map(([id, entry]) => !FIRST.includes(id) && link(entry, id, href(id), map === null && name === id))}
         </ul>
         <${Identity} />
         <${Theme} />

@@ -13,13 +13,11 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 
-import torch
-
 from core.errors import InvalidImage
 from core.frames.images import Limits, decode
 from core.geometry.detection import ScaledFrame, keypoints_in
 from core.networks.xfeat import packaged_xfeat
-from core.threads import cores, keep_to, use_threads
+from core.threads import allowed_threads, cores, keep_to, processors, use_threads
 from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import DeadlineExceeded
 
@@ -36,7 +34,7 @@ log = logging.getLogger("placerec.inference")
 
 
 class EncoderThreads:
-    """The waiting frames and the threads that encode them, as many as torch has when this is made.
+    """The waiting frames and the threads that encode them, as many as may compute when this is made.
 
     Args:
         limits: the largest frame that is decoded.
@@ -48,7 +46,7 @@ class EncoderThreads:
         self._at_work = self._pixels = 0  # threads that are busy, and the pixels of their frames
         self._closed = False
         self._changed = threading.Condition()
-        self._count = torch.get_num_threads()
+        self._count = allowed_threads()
         self._threads = [
             threading.Thread(target=self._run, args=(number,), name=f"encoder-{number}", daemon=True)
             for number in range(self._count)
@@ -90,7 +88,7 @@ class EncoderThreads:
                     self._changed.notify()
 
     def _run(self, number: int) -> None:
-        one_each = self._count == cores()
+        one_each = self._count == processors()
         threads = 0
         while (taken := self._next()) is not None:
             frame, alone = taken

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass, field
 
+from core.disk.reserve import Reserve
 from core.errors import (
     InvalidModel,
     MapQuarantined,
@@ -117,6 +118,8 @@ class Engine:
         self.searches = Searches()
         self.events = Events(settings.event_listeners) if events is None else events
         self.review_keeper = ReviewKeeper()
+        self.reserve = Reserve(settings.data_dir, settings.disk_reserve_bytes)
+        """Room for what deletes something."""
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
         self._locks = MapLocks()
@@ -127,6 +130,7 @@ class Engine:
     def start(self) -> None:
         """Begin to load the default encoder in the background; call it from the event loop."""
         self.loop = asyncio.get_running_loop()
+        self.reserve.hold()
         self._loading = asyncio.create_task(self._load_default())
 
     def close(self) -> None:
@@ -252,17 +256,19 @@ class Engine:
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
         keep_scaled: bool = False,
+        keypoints: bool = False,
     ) -> list[Encoded | Exception]:
         """Encode many frames: each frame, without its pixels, or the error that prevented its encoding.
 
         Args:
             keep_scaled: retain of each frame the scaled pixels in which keypoints are found.
+            keypoints: find them at once.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.
         """
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
+        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_scaled)

@@ -11,14 +11,12 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from core.errors import UnknownEncoder
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
-from core.threads import share_cores
+from core.threads import cores, share_cores
 from service.engine.encoder_threads import EncoderThreads
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders, QueuedFrame, deadline_exceeded
 from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
@@ -94,8 +92,8 @@ class EncoderQueue:
         catalogue: the installed encoders.
         limits: the largest frame that is decoded.
         queue_length: the most requests that may have a place at one time.
-        threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0 leaves the
-            number to torch.
+        threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0: one for
+            each core.
         make_encoders: makes the encoders; None: such threads.
     """
 
@@ -111,7 +109,7 @@ class EncoderQueue:
         self._catalogue, self._metrics = catalogue, metrics
         self._room, self._bulk_room = SharedRoom(queue_length), SharedRoom(max(1, queue_length // 2))
         self._loaded: dict[str, Encoder] = {}
-        share_cores(threads or torch.get_num_threads())
+        share_cores(threads or cores())
         self.encoders = EncoderThreads(limits) if make_encoders is None else make_encoders(limits, metrics)
         self._loader = ThreadPoolExecutor(1, "encoder-loader")
 

@@ -4,12 +4,16 @@ The first time of everything in a process is slow: Numba compiles its loops or l
 indexes and SQLite make their working memory.  Without a rehearsal a robot waits for that at its first frame of each
 kind.
 
-``python -m service.engine.rehearsal`` fills Numba's cache, so that no start of a service has to compile.
+``python -m service.engine.rehearsal FOLDER`` fills a folder with the loops that Numba compiles, for each kind of
+processor that this machine can play (``core.kernels.compiled``), so that no start of a service from an image compiles.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
@@ -22,6 +26,7 @@ from core.belief import Odometry, Run, RunOptions, Step, evidence_of, place_grap
 from core.errors import StorageFailure, StorageFull
 from core.frames.preprocessing import Pixels
 from core.judgement.alignment import LEAST_FRAMES, of_matrix, shared_stretches
+from core.kernels.compiled import PROCESSOR, instructions, levels, processor, settings_of
 from core.maps import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, canary_frame
@@ -114,5 +119,17 @@ def main() -> None:
     _rehearse(encoder)
 
 
+def ship(folder: Path) -> None:
+    """Do the same once for this processor and once for each level that it has, each in a process of its own.
+
+    Raises:
+        subprocess.CalledProcessError: one failed.
+    """
+    for settings in ({}, *map(settings_of, levels(instructions()))):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), **settings}
+        subprocess.run([sys.executable, "-m", "service.engine.rehearsal"], env=environment, check=True)
+    (folder / PROCESSOR).write_text(processor())
+
+
 if __name__ == "__main__":
-    main()
+    ship(Path(sys.argv[1])) if len(sys.argv) > 1 else main()

@@ -98,6 +98,26 @@ class JobQueueFull(Fault):
     """Too many jobs wait."""
 
 
+class BackupFolderMissing(Fault):
+    """No setting names a folder for backups."""
+
+
+class BackupIncomplete(Fault):
+    """A backup was made that lacks the present state of some maps."""
+
+
+class UnknownRecording(Fault):
+    """Nothing of a recording of this name is here."""
+
+
+class RecordingOffset(Fault):
+    """A piece of a recording does not begin where the bytes that are here end, or another piece is arriving."""
+
+
+class RecordingInUse(Fault):
+    """A job reads the recording."""
+
+
 class StagingFull(Fault):
     """The frames that wait on disk to be enrolled leave no room for more."""
 
@@ -152,6 +172,10 @@ class FrameOutOfOrder(Fault):
 
 class StreamTaken(Fault):
     """Another connection already streams into the session."""
+
+
+class SessionOfAnother(Fault):
+    """The session was begun with another key."""
 
 
 class KeyNeeded(Fault):
@@ -264,6 +288,14 @@ class TooManyPlaces(Fault):
 
 class PlanTooLarge(Fault):
     """The plan would list more places than one answer may."""
+
+
+class NotLocalized(Fault):
+    """The frame was not recognized, and the caller takes nothing but a pose."""
+
+
+class NoGeoPose(Fault):
+    """The answer has no GeoPose, and the caller takes nothing else."""
 
 
 class TooManyExports(Fault):

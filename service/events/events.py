@@ -216,6 +216,18 @@ class Events:
             if now - moment >= LINGER_SECONDS or len(left) - index > self._room.capacity:
                 del self._feeds[map_id]
 
+    def forget(self, map_id: str) -> None:
+        """Drop the events of a map that are stored for listeners; those who have not read them miss them."""
+        with self._lock:
+            if (feed := self._feeds.get(map_id)) is not None:
+                feed.forget(None)
+
+    def forget_before(self, moment: float) -> None:
+        """Drop the events of all maps from before a moment, in seconds since 1970."""
+        with self._lock:
+            for feed in self._feeds.values():
+                feed.forget(moment)
+
     def end(self, map_id: str) -> None:
         """End the streams of a map that was deleted; earlier events are still read."""
         self._end(map_id)

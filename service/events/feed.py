@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import threading
+import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -28,6 +29,7 @@ class FeedEvent:
     maps: ids of the maps that a caller must be allowed to use to see it; None stands for what belongs to no map.
     full, public: the event as a JSON object, and without the fields that not everybody sees.
     picture: a data URL of the frame; None if there is none.
+    at: when it came here, in seconds since 1970.
     """
 
     number: int
@@ -37,6 +39,7 @@ class FeedEvent:
     full: str
     public: str
     picture: str | None
+    at: float = field(default_factory=time.time)
 
     def data(self, private: bool, pictures: bool) -> str:
         """The JSON object for a listener.
@@ -97,6 +100,11 @@ class Feed:
         while len(self.latest) > MOST_EVENTS or (self.size > MOST_BYTES and len(self.latest) > 1):
             self.size -= self.latest.popleft().size
         self.wake()
+
+    def forget(self, before: float | None) -> None:
+        """Drop the stored events, or those from before a moment; their numbers are not used again."""
+        while self.latest and (before is None or self.latest[0].at < before):
+            self.size -= self.latest.popleft().size
 
     @property
     def shows_pictures(self) -> bool:

@@ -8,10 +8,11 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import BaseModel, Field
 
 from core.judgement.verdict import Verdict
+from core.maps.records import AlarmName
 from core.places import Pose, Timestamp
 from service.access.audit import ASKER, Asker
 
-EventKind = Literal["query", "enrolment", "session", "job", "map"]
+EventKind = Literal["query", "enrolment", "session", "job", "map", "alarm"]
 
 PRIVATE = frozenset({"key", "explanation"})
 """Fields that a key of the role query does not get: the caller, and the path of a picture of the frame."""
@@ -56,6 +57,9 @@ class QueryEvent(Event):
     probability: float | None
     place: str | None = Field(description="Id of the place; non-null only if recognized.")
     best: str | None = Field(description="Id of the best match, with any verdict.")
+    change: dict[str, Any] | None = Field(
+        default=None, description="Whether the frame shows the map as it is, as in the answer."
+    )
     pose: dict[str, Any] | None = Field(description="The estimated pose, as in the answer.")
     score: float | None
     decision: float | None
@@ -121,6 +125,9 @@ class SessionEvent(Event):
     lost: bool | None = None
     place: str | None = Field(default=None, description="Id of the place; non-null only if recognized.")
     pose: Pose | None = Field(default=None, description="The pose of that place.")
+    world: dict[str, Any] | None = Field(
+        default=None, description="Whether the frame shows the map as it is, by the run: `change` of the answer."
+    )
 
 
 class JobEvent(Event):
@@ -144,6 +151,19 @@ class MapEvent(Event):
     change: Literal["edited", "calibrated", "cameras", "deleted"]
     fields: list[str] = Field(default_factory=list, description="The settings that were edited.")
     revision: int | None = Field(description="The revision of the map's record; null if it was deleted.")
+
+
+class AlarmEvent(Event):
+    """A trend has reached the number that the map's settings name, or is under it again."""
+
+    kind: ClassVar[EventKind] = "alarm"
+
+    alarm: AlarmName
+    raised: bool = Field(description="False: it is cleared.")
+    count: int = Field(description="How many places or stretches there are.")
+    limit: int | None = Field(description="From which number on it is raised; null: the setting was taken back.")
+    sentence: str = Field(description="What has happened, and what to do about it.")
+    places: list[str] = Field(description="The first of the places; of stretches, the first place of each.")
 
 
 class Listening(BaseModel):

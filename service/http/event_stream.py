@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from typing import Annotated, Any
 
 from fastapi import Header, Request
@@ -13,6 +14,9 @@ EVENT_STREAM = "text/event-stream"
 
 HEARTBEAT_SECONDS = 3.0
 """A stream sends a comment at least so often, so that connections stay open and a service that hangs is noticed."""
+
+CHECK_SECONDS = 0.5
+"""The key of a caller that waits for events is looked at so often."""
 
 OPENING, HEARTBEAT = ": placerec\n\n", ": still there\n\n"
 
@@ -45,6 +49,20 @@ async def set_within(changed: asyncio.Event, seconds: float) -> bool:
         return False
     changed.clear()
     return True
+
+
+async def set_or_refused(changed: asyncio.Event, seconds: float, check_key: Callable[[], object]) -> bool:
+    """Whether the event was set within some seconds; clears it.
+
+    Args:
+        check_key: raises a Fault if the caller is let in no more, which is raised here soon after.
+    """
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0:
+        if await set_within(changed, min(left, CHECK_SECONDS)):
+            return True
+        check_key()
+    return False
 
 
 async def stream_response(request: Request, stream: AsyncIterator[str]) -> Response:

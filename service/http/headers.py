@@ -25,6 +25,11 @@ def preferred(accept: str | None, *offered: str) -> str:
     return offered[max(range(len(offered)), key=lambda index: (weights[index], -index))]
 
 
+def accepts(accept: str | None, media_type: str) -> bool:
+    """Whether an Accept header allows a media type; one that is left out allows any."""
+    return not accept or _weight(accept, media_type) > 0
+
+
 def _weight(accept: str, media_type: str) -> float:
     """The weight of a media type: that of the most specific media range which includes it."""
     specificities = {media_type: 3, media_type.split("/")[0] + "/*": 2, "*/*": 1}

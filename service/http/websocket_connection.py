@@ -25,6 +25,11 @@ UNKNOWN = "unknown"
 INVALID_DATA, POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1007, 1008, 1013, 1012
 
 
+PROBE = "placerec.probe"
+"""The extension of a WebSocket's scope that finds out whether its client is there (:meth:`WebSocketConnection.probe`).
+"""
+
+
 def handshake_fault(head: bytes) -> Fault | None:
     """Why the websockets library would refuse a request as a handshake; None if it would accept it.
 
@@ -72,6 +77,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._held = deque[int]()  # bytes of the message at work and of each one that waits
         self._write_timer: asyncio.TimerHandle | None = None
         self._holding: Holding | None = None
+        self._heard = asyncio.Event()
 
     def came_from(self, origin: Connection) -> None:
         """Take over the entry of the connection that requested the upgrade in the register."""
@@ -91,9 +97,35 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._held.clear()
         super().connection_lost(exc)
 
+    def handle_connect(self, event: Request) -> None:
+        super().handle_connect(event)
+        if not self.conn.handshake_exc:
+            extensions: Any = {**(self.scope.get("extensions") or {}), PROBE: self.probe}
+            self.scope["extensions"] = extensions
+
+    async def probe(self, seconds: float) -> bool:
+        """Whether the client is there: it answers a ping within some seconds, or has sent something that waits.
+
+        The connection to a client that is not is ended.
+        """
+        if self.read_paused or self._at_work or not self.handshake_complete:
+            return not self.transport.is_closing()
+        self._heard.clear()
+        self.conn.send_ping(b"probe")
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        try:
+            async with asyncio.timeout(seconds):
+                await self._heard.wait()
+        except TimeoutError:
+            self._connections.ended("lost")
+            self.transport.abort()
+            return False
+        return not self.transport.is_closing()
+
     # Incoming
 
     def data_received(self, data: bytes) -> None:
+        self._heard.set()
         if self.close_sent and self.close_timer is None:
             return  # refused
         if not self.handshake_initiated:  # the head, which is not counted as held

@@ -157,6 +157,9 @@ Result = TypeVar("Result")
 POLL_SECONDS = 0.2
 """A job that has to stop withdraws its waiting frames within this time."""
 
+TOGETHER = 16
+"""Steps of a computation, such as queries, between which requests go first."""
+
 YIELD_SECONDS = 1.0
 """A job holds its frames back while requests wait for the encoder, but no longer than this, so that it ends."""
 
@@ -174,6 +177,27 @@ def yield_to_requests(engine: Engine, context: JobContext) -> None:
     context.check_cancelled()
     while engine.queue.waiting and time.monotonic() < until:
         context.pause(0.01)
+
+
+def progress_of(engine: Engine, context: JobContext, message: str = "") -> Callable[[int, int], None]:
+    """Make the function that a computation calls after each of its steps, with those done and all, to be a good job.
+
+    It reports the progress, ends the job that has to stop, and lets requests go first now and then.
+
+    Args:
+        message: as of :meth:`JobContext.progress`.
+
+    Raises (the function):
+        JobCancelled, JobInterrupted: the job has to stop.
+    """
+
+    def advance(done: int, total: int) -> None:
+        context.progress(done, total, message)
+        context.check_cancelled()
+        if done % TOGETHER == 0:
+            yield_to_requests(engine, context)
+
+    return advance
 
 
 def run_after_requests(
@@ -203,7 +227,12 @@ def run_after_requests(
 
 
 def encode_after_requests(
-    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
+    engine: Engine,
+    context: JobContext,
+    identity: str,
+    frames: Sequence[bytes],
+    masks: Sequence[Mask | None],
+    keypoints: bool = False,
 ) -> list[Encoded | Exception]:
     """Encode the frames of a job after the requests that wait; blocks the job's thread.
 
@@ -213,6 +242,7 @@ def encode_after_requests(
         identity: the identity of the encoder.
         frames: the bytes of the files.
         masks: for each frame the part that is ignored.
+        keypoints: whether the frames' keypoints are wanted, too.
 
     Returns:
         For each frame its encoding, without the pixels, or the error that prevented it.
@@ -223,6 +253,6 @@ def encode_after_requests(
     """
 
     async def encode(deadline: RequestDeadline) -> list[Encoded | Exception]:
-        return await engine.encode_all(identity, frames, deadline, masks)
+        return await engine.encode_all(identity, frames, deadline, masks, keypoints=keypoints)
 
     return run_after_requests(engine, context, encode)

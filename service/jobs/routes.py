@@ -24,7 +24,7 @@ from service.http.event_stream import (
     LastEventId,
     described,
     event_text,
-    set_within,
+    set_or_refused,
     stream_response,
 )
 from service.http.routing import FromState, PrincipalDep, StrictRoute, single_values
@@ -91,14 +91,17 @@ def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> Job
 
 
 @router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
-async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
+async def read_job(
+    job_id: JobId, request: Request, jobs: JobsDep, principal: PrincipalDep, wait: Wait = 0.0
+) -> JobView:
     """Read the state of a job. With `wait` the answer comes when the job has ended, or when that time is over."""
     job = await in_thread(_job_for, jobs, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
         with jobs.watchers.watching(job_id) as changed:
             while not (job := await in_thread(jobs.get, job_id)).ended and not (jobs.stopping or changed.over):
-                if not await set_within(changed, until - time.monotonic()):
+                left = until - time.monotonic()
+                if not await set_or_refused(changed, left, lambda: request.app.state.gate.identify(request.scope)):
                     break
     return JobView.of(await in_thread(jobs.get, job_id))
 
@@ -173,10 +176,11 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
                 yield _event(job)
             if job.ended or jobs.stopping or changed.over:
                 return
-            if not await set_within(changed, HEARTBEAT_SECONDS):
-                yield HEARTBEAT
-            await asyncio.sleep(NOTICE_SECONDS)
             try:
+                changed_now = await set_or_refused(changed, HEARTBEAT_SECONDS, check_key)
+                if not changed_now:
+                    yield HEARTBEAT
+                await asyncio.sleep(NOTICE_SECONDS)
                 check_key()
             except Fault:
                 return

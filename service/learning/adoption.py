@@ -12,14 +12,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.belief import PlaceGraph, evidence_of, place_graph
 from core.belief.evidence import believable_score
-from core.errors import PlacerecError, RepeatedLook, StorageFailure, TooManyLooks, UnknownFrame, UnknownPlace
+from core.errors import (
+    LookNameTaken,
+    PlacerecError,
+    RepeatedLook,
+    StorageFailure,
+    TooManyLooks,
+    UnknownFrame,
+    UnknownPlace,
+)
 from core.judgement.background import GUARD_FACTOR
 from core.learning import (
     Lesson,
@@ -27,14 +35,15 @@ from core.learning import (
     PendingProposal,
     Proposal,
     RunFrame,
+    Witness,
     corroborated,
     kept,
     services,
 )
 from core.learning.anchors import place_of
-from core.maps import Enrolment, Map, ReviewFrame
+from core.maps import Enrolment, LearningSetting, Map, ReviewFrame, stored_frames
 from core.method.encoder import Encoder, Encoding
-from core.places import Look, PlaceFields, look_address
+from core.places import Look, PlaceFields, look_address, place_and_look
 from core.recognition.question import Query
 from core.recognition.recognition import describe, frame_digest, locate
 from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of, rank_places
@@ -43,8 +52,8 @@ from service.engine.encoders import Encoded
 Encode = Callable[[Sequence[bytes], Sequence[str | None], bool], list[Encoded | Exception]]
 """Encodes files of cameras with their keypoints, after the requests that wait; with their pixels, or without."""
 
-PAGE = 100
-"""Frames of review that are read at a time."""
+LEARNING = "learning ("
+"""The beginning of who gave a label that a map has given itself; no key has such a name."""
 
 
 @dataclass(frozen=True)
@@ -67,22 +76,31 @@ class WaitingFrame:
             told["frame"], row, told["certainty"], tuple(told["anchors"]), told["distance"], told["misfit"],
             told["geometry"], told["why"],
         )  # fmt: skip
-        return PendingProposal(proposal, told["run"], told["source"])
+        return PendingProposal(proposal, told["run"], Witness.of(told["source"]))
 
 
 def waiting_frames(map_: Map) -> list[WaitingFrame]:
     """The proposals without a label, oldest first."""
-    found: list[WaitingFrame] = []
-    before: int | None = None
-    while page := map_.review.page(before, PAGE, labelled=False).frames:
-        found += [one for frame in page if (one := _waiting(frame)) is not None]
-        before = page[-1].number
+    found = [one for frame in stored_frames(map_.review, labelled=False) if (one := _waiting(frame)) is not None]
     return found[::-1]
 
 
 def _waiting(frame: ReviewFrame) -> WaitingFrame | None:
     told = frame.answer.get("proposal")
     return None if told is None else WaitingFrame(frame.number, told["place"], told, frame.answer)
+
+
+class Took(NamedTuple):
+    """How many proposals became looks, and how many looks went to make room for them."""
+
+    looks: int
+    withdrawn: int
+
+    def __add__(self, other: Took) -> Took:  # type: ignore[override]
+        return Took(self.looks + other.looks, self.withdrawn + other.withdrawn)
+
+
+NOTHING = Took(0, 0)
 
 
 class Adoption:
@@ -92,11 +110,13 @@ class Adoption:
         encoder: the map's.
         graph: of its places.
         encode: see :data:`Encode`.
-        most_looks: of a place, its first included.
+        setting: of the map.
     """
 
-    def __init__(self, map_: Map, encoder: Encoder, graph: PlaceGraph, encode: Encode, most_looks: int) -> None:
-        self.map, self.encoder, self.graph, self.encode, self.most_looks = map_, encoder, graph, encode, most_looks
+    def __init__(
+        self, map_: Map, encoder: Encoder, graph: PlaceGraph, encode: Encode, setting: LearningSetting
+    ) -> None:
+        self.map, self.encoder, self.graph, self.encode, self.setting = map_, encoder, graph, encode, setting
         self._encoded: dict[int, Encoding | None] = {}  # of frames under review, by number
 
     # How looks have served
@@ -136,8 +156,8 @@ class Adoption:
 
     # Taking proposals
 
-    def take(self) -> int:
-        """Take the proposals on which independent evidence agrees; returns how many became looks."""
+    def take(self) -> Took:
+        """Take the proposals on which independent evidence agrees."""
         waiting = waiting_frames(self.map)
         rows = self.map.rows_of([one.place for one in waiting])
         there = [(one, row) for one, row in zip(waiting, rows, strict=True) if row is not None]
@@ -147,11 +167,11 @@ class Adoption:
             return self._scores(there[number][0], [there[other][0] for other in others])
 
         chosen = corroborated(pending, self.graph, calibration_of(self.map, self.encoder), scores)
-        taken = 0
+        took = NOTHING
         for number in sorted(chosen):
-            with suppress(UnknownPlace, UnknownFrame, RepeatedLook, TooManyLooks):
-                taken += self._adopt(*there[number], chosen[number])
-        return taken
+            with suppress(UnknownPlace, UnknownFrame, RepeatedLook, LookNameTaken, TooManyLooks):
+                took += self._adopt(*there[number], chosen[number])
+        return took
 
     def _scores(self, one: WaitingFrame, others: Sequence[WaitingFrame]) -> NDArray[np.float32]:
         """The scores of both stages of a proposal against others; 0 for those that cannot be encoded any more."""
@@ -178,24 +198,38 @@ class Adoption:
                 self._encoded[number] = outcome.encoding
         return [self._encoded[one.number] for one in frames]
 
-    def _adopt(self, one: WaitingFrame, row: int, grounds: str) -> bool:
+    def _adopt(self, one: WaitingFrame, row: int, grounds: str) -> Took:
         """Make a proposal a look of its place, unless the place keeps others instead."""
         try:
             data = self.map.review.picture(one.number)
         except StorageFailure:  # it is damaged, and waits for a person
-            return False
+            return NOTHING
         (made,) = self.encode([data], [one.answer.get("camera")], True)
         if isinstance(made, Exception) or not len(made.encoding.regions):
-            return False
-        staying, rows = self._kept(one.place, row, made.encoding)
-        if len(rows) + 1 not in staying or self.map.review.find(one.number).label is not None:
-            return False  # it repeats others, or a person was faster
+            return NOTHING
+        going = self._going(one.place, row, made.encoding)
+        if going is None or self.map.review.find(one.number).label is not None:
+            return NOTHING  # it repeats others, or a person was faster
         item = self._enrolment(one, data, made)
-        self.map.enrol([item])
-        self.map.withdraw([rows[at - 1] for at in range(1, len(rows) + 1) if at not in staying])
-        said = {"label": {"place": one.place, "look": item.id.rpartition("/")[2]}, "by": f"learning ({grounds})"}
-        self.map.review.label(one.number, {**said, "at": datetime.now(UTC).isoformat()})
-        return True
+        with self.map.review.held(one.number):
+            change, withdrawn = self.map.learn(item, going, self.setting.most_places)
+            if self._claimed(one, item, grounds):
+                return Took(1, withdrawn)
+        # A person has said otherwise, or thrown the frame away, in the same moment: that counts.
+        new = self.map.rows_of([item.id]) if change == "created" else []
+        self.map.withdraw([at for at in new if at is not None])
+        return Took(0, withdrawn)
+
+    def _claimed(self, one: WaitingFrame, item: Enrolment, grounds: str) -> bool:
+        """Label a frame as the look that it has become; false if a person has given it another label."""
+        place, name = place_and_look(item.id)
+        label, now = {"place": place, "look": name}, datetime.now(UTC).isoformat()
+        try:
+            if self.map.review.label_first(one.number, {"label": label, "by": f"{LEARNING}{grounds})", "at": now}):
+                return True
+            return (self.map.review.find(one.number).label or {}).get("label") == label
+        except UnknownFrame:
+            return False
 
     def _enrolment(self, one: WaitingFrame, data: bytes, made: Encoded) -> Enrolment:
         told = one.told
@@ -208,22 +242,27 @@ class Adoption:
         )  # fmt: skip
         return replace(described, run=told["run"], least=told["least_score"])
 
-    def _kept(self, place: str, row: int, encoding: Encoding) -> tuple[set[int], list[int]]:
-        """The looks of a place that stay beside a new one, by number, and the rows of the learnt ones.
+    def _going(self, place: str, row: int, encoding: Encoding) -> list[int] | None:
+        """The rows of the learnt looks of a place that a new one replaces; None if the place does not keep it.
 
-        Number 0 is its first look, then come the learnt ones, and the new one last.
+        The first look stays, and so do those that people added.
         """
-        looks = [look for look in self.map.looks(place) if look.run is not None]
+        looks = self.map.looks(place)
         found = zip(self.map.rows_of([look_address(place, look.name) for look in looks]), looks, strict=True)
-        learnt = {at: look for at, look in found if at is not None}
-        rows, snapshot = list(learnt), self.map.snapshot()
-        stored = np.array([row, *rows], np.int64)
+        there = {at: look for at, look in found if at is not None}
+        learnt = {at: look for at, look in there.items() if look.run is not None}
+        fixed = [row, *(at for at in there if at not in learnt)]
+        snapshot = self.map.snapshot()
+        stored = np.array([*fixed, *learnt], np.int64)
         descriptors = np.concatenate([snapshot.descriptors_at(stored), encoding.descriptor[np.newaxis]])
         local = np.concatenate([snapshot.locals_at(stored), encoding.local[np.newaxis]])
         table = np.stack([_scores_of(self.encoder, descriptors, local, at) for at in range(len(stored) + 1)])
-        history = [LookStatistics(), *map(served, learnt.values()), LookStatistics()]
-        staying = kept(table, self._believable(encoding), self.most_looks, history)
-        return set(staying.tolist()), rows
+        history = [*[LookStatistics()] * len(fixed), *map(served, learnt.values()), LookStatistics()]
+        believable, most = self._believable(encoding), self.setting.most_looks
+        staying = set(kept(table, believable, most, history, len(fixed)).tolist())
+        if len(stored) not in staying:
+            return None
+        return [at for number, at in enumerate(learnt, len(fixed)) if number not in staying]
 
     def _believable(self, encoding: Encoding) -> float:
         """The score at which a frame would just be recognized in the map."""

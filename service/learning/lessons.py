@@ -8,7 +8,7 @@ independent evidence agrees (:mod:`service.learning.adoption`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import replace
 from functools import partial
@@ -20,19 +20,33 @@ from numpy.typing import NDArray
 from core.belief import PlaceGraph
 from core.errors import PlacerecError, UnknownCamera
 from core.frames.masks import Mask
-from core.learning import LessonOptions, Proposal, Trail, cohort_of, least_score, lesson_of
+from core.judgement.trials import StagedTrials
+from core.learning import (
+    Lesson,
+    LessonOptions,
+    Proposal,
+    RunFrame,
+    Trail,
+    cohort_of,
+    least_score,
+    lesson_of,
+    placed_frames,
+    trials_of,
+)
 from core.learning.proposals import LEAST_ANCHORS
 from core.maps import Map, ReviewSetting
 from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
 from core.method.encoder import Encoder
+from core.recognition.calibration import ProgressCallback
 from core.recognition.stages import calibration_of
 from service.access.audit import ASKER
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
-from service.jobs.context import JobContext, run_after_requests
+from service.jobs.context import JobContext, progress_of, run_after_requests
 from service.jobs.jobs import Jobs
+from service.learning import new_ground
 from service.learning.adoption import Adoption, graph_of, likeness_of_encodings
 from service.learning.run_notes import RunNotes
 from service.places.place_events import tell_change
@@ -41,11 +55,23 @@ KIND = "learn"
 
 log = logging.getLogger("placerec.learning")
 
+Calibrate = Callable[[Map, RunNotes, StagedTrials], Mapping[str, Any]]
+"""Has a map calibrated by the frames of a run; returns JSON that tells what became of that."""
+
 TOGETHER = 16
 """Frames that are encoded together; in between, requests go first."""
 
 
-def submit(engine: Engine, jobs: Jobs, map_id: str, made: str, camera: str | None, notes: RunNotes) -> None:
+def submit(
+    engine: Engine,
+    jobs: Jobs,
+    map_id: str,
+    made: str,
+    camera: str | None,
+    notes: RunNotes,
+    erased: Callable[[RunNotes], bool],
+    calibrate: Calibrate,
+) -> None:
     """Have a run's lesson drawn by a job; a run of too few frames teaches nothing.
 
     If no job can be submitted now, the run teaches nothing, and the log says so.
@@ -53,10 +79,13 @@ def submit(engine: Engine, jobs: Jobs, map_id: str, made: str, camera: str | Non
     Args:
         map_id, made: of the map, and when it was created.
         camera: of the session.
+        erased: whether frames of a run were erased since it began; then it teaches nothing.
+        calibrate: takes what the run says of the map's answers.
     """
     if len(notes.frames) < LEAST_ANCHORS:
         return
-    work, arguments = partial(learn, engine, notes, camera), {"session": notes.session, "frames": len(notes.frames)}
+    work = partial(learn, engine, notes, camera, erased, calibrate)
+    arguments = {"session": notes.session, "frames": len(notes.frames)}
     present = ASKER.set(notes.robot)  # whoever ends the session: the audit trail names who has taught the map
     try:
         jobs.submit(KIND, map_id, work, arguments, {map_id: made})
@@ -66,14 +95,24 @@ def submit(engine: Engine, jobs: Jobs, map_id: str, made: str, camera: str | Non
         ASKER.reset(present)
 
 
-def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobContext) -> Mapping[str, Any]:
-    """Propose looks from a run that is over.
+def learn(
+    engine: Engine,
+    notes: RunNotes,
+    camera: str | None,
+    erased: Callable[[RunNotes], bool],
+    calibrate: Calibrate,
+    context: JobContext,
+) -> Mapping[str, Any]:
+    """Propose looks from a run that is over, and what it says of the map's calibration.
 
     Args:
         camera: of the session.
+        erased, calibrate: as of :func:`submit`.  Jobs of one map run one after another, so that nothing is erased
+            meanwhile.
 
     Returns:
-        JSON: the frames of the run, how many of them were proposed as looks, and why others were not.
+        JSON: the frames of the run, how many of them were proposed as looks, and why others were not; and what became
+        of the calibration, if the run says anything of it.
 
     Raises:
         UnknownMap, EncoderNotInstalled, StorageFull, StorageFailure: nothing but proposals was stored.
@@ -84,6 +123,9 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     found: dict[str, Any] = {"session": notes.session, "frames": len(notes.frames), "proposals": 0}
     if setting.mode == "off":
         return found | {"contradiction": "off"}
+    if erased(notes):
+        notes.frames.clear()
+        return found | {"contradiction": "erased"}
     encoder = engine.load_encoder(map_)
     encoded = _encoded(engine, map_, [noted.data for noted in notes.frames], [camera] * len(notes.frames), context)
     frames = [
@@ -96,7 +138,7 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
     count, trail = 0, Trail.of(frames)
     for proposal in best_of_places(lesson.proposals):
         context.check_cancelled()
-        least = _least(proposal, trail, graph, scores, map_, encoder)
+        least = _least(proposal.frame, trail, graph, scores, map_, encoder)
         if least is not None and _propose(map_, notes, proposal, least):
             count += 1
     found |= {
@@ -105,20 +147,55 @@ def learn(engine: Engine, notes: RunNotes, camera: str | None, context: JobConte
         "anchors": len(lesson.anchors),
         "refused": dict(lesson.refused),
     }
+    if setting.calibration != "off":
+        context.check_cancelled()
+        trials = _asked(map_, encoder, lesson, frames, encoded, progress_of(engine, context, "asking frames again"))
+        if len(trials):
+            found |= {"calibration": calibrate(map_, notes, trials)}
+    if setting.new_ground:
+        context.check_cancelled()
+
+        def ground_least(number: int) -> float | None:
+            one = encoded[number]
+            if isinstance(one, Exception) or not len(one.encoding.regions):
+                return None
+            return _least(number, trail, graph, scores, map_, encoder)
+
+        found |= {"new_ground": new_ground.propose(map_, notes, frames, graph, lesson, ground_least)}
     if setting.mode != "auto":
         return found
 
     def encode(files: Sequence[bytes], cameras: Sequence[str | None], pixels: bool) -> list[Encoded | Exception]:
         return _encoded(engine, map_, files, cameras, context, pixels)
 
-    adoption = Adoption(map_, encoder, graph, encode, setting.most_looks)
+    adoption = Adoption(map_, encoder, graph, encode, setting)
     withdrawn = adoption.observe(lesson, frames)
     context.check_cancelled()
-    taken = adoption.take()
-    withdrawn += adoption.rehearse(lesson, frames, encoded) if taken else 0
-    tell_change(engine, map_, "look-added", taken)
+    took = adoption.take()
+    withdrawn += took.withdrawn + (adoption.rehearse(lesson, frames, encoded) if took.looks else 0)
+    tell_change(engine, map_, "look-added", took.looks)
     tell_change(engine, map_, "look-removed", withdrawn)
-    return found | {"taken": taken, "withdrawn": withdrawn}
+    return found | {"taken": took.looks, "withdrawn": withdrawn}
+
+
+def _asked(
+    map_: Map,
+    encoder: Encoder,
+    lesson: Lesson,
+    frames: Sequence[RunFrame],
+    encoded: Sequence[Encoded | Exception],
+    advance: ProgressCallback,
+) -> StagedTrials:
+    """The answers of the map to the frames of a run whose places it knows, with their places and without them."""
+    found = [
+        (placed, one)
+        for placed in placed_frames(lesson, frames)
+        if not isinstance(one := encoded[placed.number], Exception) and len(one.encoding.regions)
+    ]
+    keypoints = [one.keypoints if map_.record.verification else None for _, one in found]
+    return trials_of(
+        map_, encoder, [placed for placed, _ in found], [one.encoding for _, one in found], keypoints, advance
+    )
 
 
 def best_of_places(proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -189,12 +266,10 @@ def _mask(map_: Map, camera: str | None) -> Mask | None:
         return None
 
 
-def _least(
-    proposal: Proposal, trail: Trail, graph: PlaceGraph, scores: _Scores, map_: Map, encoder: Encoder
-) -> float | None:
-    """The score from which on a match with a proposed look is believed; None if the run does not tell it."""
-    cohort = cohort_of(trail, proposal.frame, graph)
-    beside, far = (scores.of(proposal.frame, part) for part in (cohort.beside, cohort.far))
+def _least(frame: int, trail: Trail, graph: PlaceGraph, scores: _Scores, map_: Map, encoder: Encoder) -> float | None:
+    """The score from which on a match with a frame of the run is believed; None if the run does not tell it."""
+    cohort = cohort_of(trail, frame, graph)
+    beside, far = (scores.of(frame, part) for part in (cohort.beside, cohort.far))
     return least_score(beside, far, calibration_of(map_, encoder))
 
 
@@ -214,9 +289,9 @@ def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> bo
         "geometry": None if proposal.geometry is None else round(proposal.geometry, 1),
         "why": proposal.why,
         "run": notes.session,
-        "source": notes.source,
+        "source": str(notes.source),
         "least_score": least,
-        "taken": None if noted.taken is None else moment_text(noted.taken),
+        "taken": moment_text(noted.taken),
     }
     setting = map_.record.review or ReviewSetting()
     return map_.review.keep(noted.data, {**noted.answer, "proposal": told}, setting, renew=True)

@@ -10,10 +10,10 @@ from datetime import UTC, datetime
 from threading import Lock
 from weakref import WeakSet
 
-from core.learning import RunFrame
+from core.learning import RunFrame, Witness
 from core.maps import Map
 from service.access.audit import ASKER, Asker
-from service.access.roles import Principal, covers
+from service.access.roles import Principal
 
 MOST_FRAMES, MOST_BYTES = 600, 64 << 20
 """The most frames of a run, and bytes of their files, that are noted together; a longer run has several lessons."""
@@ -28,13 +28,13 @@ class NotedFrame:
 
     frame: as it was judged alone, without its keypoints.
     data: the bytes of its file.
-    taken: when it was taken; None: the robot did not say.
+    taken: when it was taken or, if the robot did not say, when it came.
     answer: to the frame alone, as review has it; JSON values.
     """
 
     frame: RunFrame
     data: bytes
-    taken: datetime | None
+    taken: datetime
     answer: dict[str, object]
 
 
@@ -44,12 +44,12 @@ class RunNotes:
 
     session: its id.
     robot: who began it.
-    source: a name for the robot and the day: runs of one source are one witness.
+    source: the robot, and when the session began.
     """
 
     session: str
     robot: Asker
-    source: str
+    source: Witness
     frames: list[NotedFrame] = field(default_factory=list)
     bytes: int = 0
 
@@ -88,9 +88,9 @@ def noted_bytes() -> int:
 def new_notes(map_: Map, session_id: str, principal: Principal) -> RunNotes | None:
     """Notes of a session that begins; None if its map learns nothing, or not from this robot.
 
-    A robot whose key has the role ``query`` alone changes no map.
+    A robot changes a map only if its key says so (:attr:`service.access.roles.Principal.teaches`).
     """
-    if map_.record.learning.mode == "off" or not covers(principal.role, "enrol"):
+    if map_.record.learning.mode == "off" or not principal.teaches:
         return None
-    today = datetime.now(UTC).date().isoformat()
-    return RunNotes(session_id, ASKER.get(), f"{principal.key_id or principal.name} {today}")
+    source = Witness(principal.key_id or principal.name, datetime.now(UTC))
+    return RunNotes(session_id, ASKER.get(), source)

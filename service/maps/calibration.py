@@ -9,18 +9,18 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from fastapi import APIRouter, Depends, Request, Response
 
 from core import errors
 from core.errors import RevisionMismatch
-from core.judgement.trials import Trials
+from core.judgement.calibration import FittedCalibration, Target, adjust_calibration
+from core.judgement.trials import Trials, joined_stages
 from core.judgement.verdict import Calibration
 from core.maps import Map, Snapshot
-from core.method.encoder import Encoder, Encoding
+from core.method.encoder import Encoder
 from core.recognition.calibration import (
-    TOGETHER,
     LabelledQueries,
     ProgressCallback,
     adjust_to_labels,
@@ -33,6 +33,7 @@ from core.recognition.calibration import (
     calibrate_map as fit_calibration,
 )
 from core.recognition.stages import calibration_of
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import (
@@ -50,12 +51,13 @@ from service.http.openapi import NAMED
 from service.http.routing import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
-from service.jobs.context import JobContext, creation_time, encode_after_requests, yield_to_requests
+from service.jobs.context import JobContext, creation_time, encode_after_requests, progress_of
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps.map_events import tell_map
 from service.maps.schemas import MOST_FRAMES, CalibrationOrder, CalibrationReport
+from service.places.map_events import tell_map
 from service.queries.answers import StatisticsDep
+from service.queries.histories.run_trials import RunTrials
 from service.queries.statistics import QueryStatistics, map_key
 from service.review.labels import KnownFrame, known_frames, parts, with_regions
 from service.worker_threads import in_thread
@@ -64,6 +66,12 @@ log = logging.getLogger("placerec.calibration")
 
 KIND = "calibrate"
 """The kind of the job."""
+
+RUNS: Final = "runs"
+"""The source of a calibration that rests on the runs of robots."""
+
+ALIGNED: Final = "aligned:"
+"""The source of a calibration that a map has made of an aligned traverse, whose name follows."""
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -125,20 +133,20 @@ async def calibrate_map(
     """Measure when a map's answers can be believed, and store the result as the map's calibration.
 
     With a JSON body, the queried frames are the map's own: those of one traverse, compared with the others, or
-    all of them, or those stored for review and labelled. With a form, they are new frames: each is a file part,
-    and a part `calibration` holds the same JSON with a label for each frame. The threshold, the margin and the
-    probability curve follow from the answers; the reported quality is cross-validated. If the answers are too few or
-    too poor to calibrate the map, the request is refused and the map keeps its calibration.
+    all of them, or those stored for review and labelled; or those of robots' runs. With a form, they are new frames:
+    each is a file part, and a part `calibration` holds the same JSON with a label for each frame. The threshold, the
+    margin and the probability curve follow from the answers; the reported quality is cross-validated. If the answers
+    are too few or too poor to calibrate the map, the request is refused and the map keeps its calibration.
     """
     map_ = await engine.map(map_id)
     expected = expected_revision(if_match, map_.record.revision)
     if media_type(request) == FORM:
-        order, encodings = await _read_labelled_frames(engine, map_, request, deadline)
+        order, encoded = await _read_labelled_frames(engine, map_, request, deadline)
     else:
-        order, encodings = await _read_order(request), []
+        order, encoded = await _read_order(request), []
     known: list[KnownFrame] = []
     if order.method == "labels" and not order.background:
-        known, encodings = await _encode_known(engine, map_, deadline)
+        known, encoded = await _encode_known(engine, map_, deadline)
     encoder = await engine.queue.load(map_.record.encoder)
     request.state.noted = {"map": map_id, "method": order.method}
     if order.background:
@@ -153,7 +161,8 @@ async def calibrate_map(
             )
 
     replaces = map_.record.calibration
-    report, trials = await in_thread(measure, map_, encoder, order, encodings, advance, known)
+    ran = await in_thread(statistics.run_trials, map_key(map_)) if order.method == "runs" else []
+    report, trials = await in_thread(measure, map_, encoder, order, encoded, advance, known, ran)
     await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
@@ -180,7 +189,7 @@ async def _read_order(request: Request) -> CalibrationOrder:
 
 async def _read_labelled_frames(
     engine: Engine, map_: Map, request: Request, deadline: RequestDeadline
-) -> tuple[CalibrationOrder, list[Encoding]]:
+) -> tuple[CalibrationOrder, list[Encoded]]:
     """The order in a form, and its frames encoded, in the order of the labels.
 
     Raises:
@@ -203,33 +212,35 @@ async def _read_labelled_frames(
     for name in names:
         check_part(files[name], engine.settings)
     masks = [await camera_mask(map_, label.camera) for label in order.labels]
+    frames, wanted = [files[name].data for name in names], map_.record.verification
     with engine.queue.place(len(names)):
-        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in names], deadline, masks)
-    encodings = []
+        outcomes = await engine.encode_all(map_.record.encoder, frames, deadline, masks, keypoints=wanted)
+    encoded = []
     for name, outcome in zip(names, outcomes, strict=True):
         if isinstance(outcome, Exception):
             raise outcome
         if not len(outcome.encoding.regions):
             raise errors.NoRegions(f"The frame {name[:80]!r} has no regions to compare.")
-        encodings.append(outcome.encoding)
-    return order, encodings
+        encoded.append(outcome)
+    return order, encoded
 
 
-async def _encode_known(
-    engine: Engine, map_: Map, deadline: RequestDeadline
-) -> tuple[list[KnownFrame], list[Encoding]]:
+async def _encode_known(engine: Engine, map_: Map, deadline: RequestDeadline) -> tuple[list[KnownFrame], list[Encoded]]:
     """The labelled frames of the map's review, those that can be encoded, and their encodings.
 
     Raises:
         StorageFailure, EncoderNotInstalled.
     """
     frames, _ = await in_thread(known_frames, map_, MOST_FRAMES)
-    found: list[tuple[KnownFrame, Encoding]] = []
+    found: list[tuple[KnownFrame, Encoded]] = []
     some = parts(map_, frames)
     while (part := await in_thread(next, some, None)) is not None:
         chosen, files, masks = part
-        found += with_regions(chosen, await engine.encode_all(map_.record.encoder, files, deadline, masks))
-    return [frame for frame, _ in found], [encoding for _, encoding in found]
+        outcomes = await engine.encode_all(
+            map_.record.encoder, files, deadline, masks, keypoints=map_.record.verification
+        )
+        found += with_regions(chosen, outcomes)
+    return [frame for frame, _ in found], [encoded for _, encoded in found]
 
 
 # Measuring and storing
@@ -239,15 +250,17 @@ def measure(
     map_: Map,
     encoder: Encoder,
     order: CalibrationOrder,
-    encodings: Sequence[Encoding],
+    encoded: Sequence[Encoded],
     advance: ProgressCallback,
     known: Sequence[KnownFrame] = (),
+    ran: Sequence[RunTrials] = (),
 ) -> tuple[CalibrationReport, Trials]:
     """Ask a map the frames of an order, and report the calibration that follows; nothing is stored.
 
     Args:
-        encodings: the frames of the order's labels, or of ``known``, in their order; empty for the other methods.
+        encoded: the frames of the order's labels, or of ``known``, in their order; empty for the other methods.
         known: the labelled frames of the map's review, for the method ``labels``.
+        ran: the answers of the map to the frames of its latest runs, for the method ``runs``.
 
     Returns:
         The report, and the answers that it rests on.
@@ -255,8 +268,11 @@ def measure(
     Raises:
         UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure, and whatever ``advance`` raises.
     """
+    if order.method == "runs":
+        found = _from_runs(map_, encoder, ran, order.target)
+        return _report(map_, encoder, order, found, calibration_warnings(found, "runs")), found.trials
     snapshot = map_.snapshot()
-    queries = _queries(map_, snapshot, order, encodings, known)
+    queries = _queries(map_, snapshot, order, encoded, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
     adjusted = (order.method, order.beside) == ("labels", "encoder")
@@ -264,7 +280,14 @@ def measure(
         found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
     else:
         found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
-    report = CalibrationReport(
+    warnings = calibration_warnings(found, "adjusted" if adjusted else order.method, queries.aligned)
+    return _report(map_, encoder, order, found, warnings), found.trials
+
+
+def _report(
+    map_: Map, encoder: Encoder, order: CalibrationOrder, found: FittedCalibration, warnings: list[str]
+) -> CalibrationReport:
+    return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
         method=order.method,
@@ -273,9 +296,32 @@ def measure(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=calibration_warnings(found, "adjusted" if adjusted else order.method, queries.aligned),
+        warnings=warnings,
     )
-    return report, found.trials
+
+
+def _from_runs(map_: Map, encoder: Encoder, ran: Sequence[RunTrials], target: Target) -> FittedCalibration:
+    """The calibration of a person, or the encoder's, adjusted to the answers in some runs.
+
+    Raises:
+        CalibrationImpossible: there are too few, or the target is not a precision.
+    """
+    if target.rule != "precision":
+        raise errors.CalibrationImpossible("From runs, the target can only be a precision.")
+    if not ran:
+        raise errors.CalibrationImpossible(
+            "No run of a robot has told which places its frames show. Let the map learn (its setting learning: "
+            "a mode other than off, calibration propose or auto), and drive with odometry; what a run says is there "
+            "when its job of the kind learn is over."
+        )
+    own = map_.record.calibration
+    base = encoder.calibration if own is None or by_itself(own) else own
+    return adjust_calibration(joined_stages([one.trials for one in ran]), base, RUNS, target)
+
+
+def by_itself(calibration: Calibration) -> bool:
+    """Whether a map has found a calibration by itself, so that it may replace it by another one."""
+    return calibration.source == RUNS or calibration.source.startswith(ALIGNED)
 
 
 def remember(statistics: QueryStatistics, map_: Map, report: CalibrationReport, trials: Trials) -> None:
@@ -290,17 +336,19 @@ def _queries(
     map_: Map,
     snapshot: Snapshot,
     order: CalibrationOrder,
-    encodings: Sequence[Encoding],
+    encoded: Sequence[Encoded],
     known: Sequence[KnownFrame],
 ) -> LabelledQueries:
+    encodings, keypoints = [one.encoding for one in encoded], [one.keypoints for one in encoded]
     if order.method == "labels":
         if not known:
             raise errors.CalibrationImpossible("No frame of the map's review is labelled with a place that it has.")
         places = [frame.place for frame in known]
-        return queries_from_labels(map_, snapshot, encodings, places, [frame.own for frame in known])
+        return queries_from_labels(map_, snapshot, encodings, places, [frame.own for frame in known], keypoints)
     if order.method == "frames":
         assert order.labels is not None
-        return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
+        labels = [label.place for label in order.labels]
+        return queries_from_labels(map_, snapshot, encodings, labels, keypoints=keypoints)
     if order.method == "sequence":
         assert order.sequence is not None
         return queries_from_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
@@ -360,18 +408,13 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
         if map_.record.calibration == report.calibration:
             return report.model_dump(mode="json")  # the process was killed after the commit
 
-    def advance(done: int, total: int) -> None:
-        context.progress(done, total)
-        context.check_cancelled()
-        if done % TOGETHER == 0:
-            yield_to_requests(engine, context)
-
     encoder = engine.load_encoder(map_)
     known: list[KnownFrame] = []
-    encodings: list[Encoding] = []
+    encoded: list[Encoded] = []
     if order.method == "labels":
-        known, encodings = _encode_known_after_requests(engine, context, map_)
-    report, trials = measure(map_, encoder, order, encodings, advance, known)
+        known, encoded = _encode_known_after_requests(engine, context, map_)
+    ran = statistics.run_trials(map_key(map_)) if order.method == "runs" else []
+    report, trials = measure(map_, encoder, order, encoded, progress_of(engine, context), known, ran)
     remember(statistics, map_, report, trials)
     result = report.model_dump(mode="json")
     if not order.dry_run:
@@ -383,9 +426,10 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
 
 def _encode_known_after_requests(
     engine: Engine, context: JobContext, map_: Map
-) -> tuple[list[KnownFrame], list[Encoding]]:
+) -> tuple[list[KnownFrame], list[Encoded]]:
     """:func:`_encode_known` in a job, which lets requests go first."""
-    found: list[tuple[KnownFrame, Encoding]] = []
+    found: list[tuple[KnownFrame, Encoded]] = []
     for chosen, files, masks in parts(map_, known_frames(map_, MOST_FRAMES)[0]):
-        found += with_regions(chosen, encode_after_requests(engine, context, map_.record.encoder, files, masks))
-    return [frame for frame, _ in found], [encoding for _, encoding in found]
+        wanted = map_.record.verification
+        found += with_regions(chosen, encode_after_requests(engine, context, map_.record.encoder, files, masks, wanted))
+    return [frame for frame, _ in found], [encoded for _, encoded in found]

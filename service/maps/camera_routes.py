@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path
@@ -12,8 +13,8 @@ from core.places import Camera
 from service.errors.faults import UnsupportedMediaType
 from service.errors.problems import problem_documentation
 from service.http.routing import WHOLE_DELETION, EngineDep, MapId, StrictRoute, json_body, single_values
-from service.maps.map_events import tell_map
 from service.maps.schemas import CameraDefinition, CameraList, CameraView
+from service.places.map_events import tell_map
 
 router = APIRouter(
     prefix="/v1/maps/{map}/cameras",
@@ -72,5 +73,5 @@ def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraVie
 def delete_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
     """Delete a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
     map_ = engine.maps.get(map_id)
-    map_.cameras.forget(name)
+    engine.reserve.making_room(partial(map_.cameras.forget, name))
     tell_map(engine, map_, "cameras")

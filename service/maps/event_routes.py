@@ -27,7 +27,7 @@ from service.http.event_stream import (
     LastEventId,
     described,
     event_text,
-    set_within,
+    set_or_refused,
     stream_response,
 )
 from service.http.routing import EngineDep, MapId, PrincipalDep, single_values
@@ -163,19 +163,27 @@ class MapStream:
                     continue
                 if listener.ended:
                     return
-                if await set_within(listener.changed, HEARTBEAT_SECONDS):
+                try:
+                    changed = await set_or_refused(listener.changed, HEARTBEAT_SECONDS, self._check_key)
+                except Fault:
+                    return
+                if changed:
                     await asyncio.sleep(GATHER_SECONDS)
                 elif await in_thread(self._is_gone):
                     return
                 else:
                     yield HEARTBEAT
 
+    def _check_key(self) -> Principal:
+        """Who listens; raises a Fault if it may no longer."""
+        principal = self._identify()
+        self.check(principal)
+        return principal
+
     def _listening_now(self) -> Principal | None:
         """Who listens; None if it may no longer."""
         with suppress(Fault):
-            principal = self._identify()
-            self.check(principal)
-            return principal
+            return self._check_key()
         return None
 
     def _is_gone(self) -> bool:

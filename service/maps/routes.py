@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from core import errors
 from core.judgement.verdict import Calibration
-from core.maps import LearningSetting, Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
+from core.maps import AlarmSetting, LearningSetting, Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
 from core.maps.pagination import Listing, decode_name, page_of
 from core.places import check_map_id
 from service.engine.engine import Engine
@@ -37,8 +37,8 @@ from service.jobs.schemas import JobView
 from service.maps import storage_jobs
 from service.maps.calibration_preview import measured_of
 from service.maps.limits import check_map_count
-from service.maps.map_events import tell_end, tell_map
 from service.maps.schemas import (
+    AlarmChanges,
     CalibrationChanges,
     LearningChanges,
     MapChanges,
@@ -48,10 +48,12 @@ from service.maps.schemas import (
     QuarantinedMap,
     ReviewChanges,
 )
+from service.places.map_events import tell_end, tell_map
 from service.queries.answers import StatisticsDep
 from service.queries.counts import VerdictCounts
 from service.queries.given_answers import MapKey
 from service.queries.statistics import QueryStatistics, map_key
+from service.recordings.routes import RecordingsDep
 
 router = APIRouter(
     prefix="/v1/maps",
@@ -62,7 +64,7 @@ router = APIRouter(
 )
 log = logging.getLogger("placerec.maps")
 
-Setting = TypeVar("Setting", ReviewSetting, LearningSetting)
+Setting = TypeVar("Setting", ReviewSetting, LearningSetting, AlarmSetting)
 
 ALL_MAPS = "(all)"
 """The lock held while a map is created, so that two requests cannot both create the last map that is allowed; no map
@@ -219,7 +221,7 @@ def _settings_changes(engine: Engine, statistics: QueryStatistics, map_: Map, ch
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     calibration, review = given.pop("calibration", None), given.pop("review", None)
-    learning = given.pop("learning", None)
+    learning, alarms = given.pop("learning", None), given.pop("alarms", None)
     values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
     if "calibration" in changes.model_fields_set:
         measured_at = None if calibration is None else calibration.measured_at
@@ -234,10 +236,13 @@ def _settings_changes(engine: Engine, statistics: QueryStatistics, map_: Map, ch
     if "learning" in changes.model_fields_set:
         off = LearningSetting()
         values["learning"] = off if learning is None else _changed(map_.record.learning, off, learning)
+    if "alarms" in changes.model_fields_set:
+        silent = AlarmSetting()
+        values["alarms"] = silent if alarms is None else _changed(map_.record.alarms, silent, alarms)
     return values
 
 
-def _changed(now: Setting, default: Setting, changes: ReviewChanges | LearningChanges) -> Setting:
+def _changed(now: Setting, default: Setting, changes: ReviewChanges | LearningChanges | AlarmChanges) -> Setting:
     """A setting of several values after a merge patch; null stands for the default of a value."""
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     changed = {name: getattr(default, name) if value is None else value for name, value in given.items()}
@@ -275,13 +280,14 @@ def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | No
     "/{map}",
     status_code=204,
     dependencies=[WHOLE_DELETION],
-    responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch),
+    responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch, errors.StorageFailure),
 )
-def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
+def delete_map(map_id: MapId, engine: EngineDep, recordings: RecordingsDep, if_match: IfMatch = None) -> None:
     """Delete a map with everything that it contains. A damaged map can be deleted, too."""
     if if_match is not None:
         expected_revision(if_match, engine.maps.find(map_id).record.revision)
     engine.maps.delete(map_id)
+    recordings.forget_map(map_id)
     engine.metrics.forget_map(map_id)
     tell_end(engine, map_id)
 

@@ -11,6 +11,8 @@ from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
 from core.maps import (
+    AlarmLimit,
+    AlarmSetting,
     IndexStatus,
     Keep,
     LearningSetting,
@@ -20,7 +22,7 @@ from core.maps import (
     StorageStatus,
     TierSetting,
 )
-from core.maps.records import COMPACT_FROM, LearningMode
+from core.maps.records import COMPACT_FROM, MOST_REJECTED, LearningMode, RejectedGround
 from core.places import Timestamp
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 from service.queries.counts import VerdictCounts
@@ -35,7 +37,16 @@ MAP_EXAMPLE: dict[str, Any] = {
     "same_place_frames": 3,
     "verification": True,
     "review": None,
-    "learning": {"mode": "off", "least_probability": 0.95, "most_looks": 3},
+    "learning": {
+        "mode": "off",
+        "least_probability": 0.95,
+        "most_looks": 3,
+        "most_places": None,
+        "new_ground": False,
+        "calibration": "propose",
+        "rejected_ground": [],
+    },
+    "alarms": {"worse_places": None, "changed_places": 10, "quiet_stretches": None},
     "calibration": {
         "source": "encoder-default",
         "threshold": 0.09,
@@ -89,6 +100,7 @@ class MapView(BaseModel):
     verification: bool = Field(description="Whether keypoints of each frame are stored, by which answers are verified.")
     review: ReviewSetting | None = Field(description="Which frames are stored to be reviewed by people; null: none.")
     learning: LearningSetting = Field(description="How the map learns from the runs of its robots.")
+    alarms: AlarmSetting = Field(description="From which numbers on trends of the health report become events.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
@@ -177,6 +189,22 @@ class LearningChanges(BaseModel):
     mode: LearningMode | None = None
     least_probability: float | None = Field(strict=True, default=None, ge=0.5, lt=1)
     most_looks: int | None = Field(strict=True, default=None, ge=2, le=33)
+    most_places: int | None = Field(strict=True, default=None, ge=1, le=2**31)
+    new_ground: bool | None = Field(strict=True, default=None)
+    calibration: LearningMode | None = None
+    rejected_ground: list[RejectedGround] | None = Field(
+        default=None, max_length=MOST_REJECTED, description="Those that stay rejected; null: none."
+    )
+
+
+class AlarmChanges(BaseModel):
+    """Changes of what raises an alarm; null: never."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    worse_places: AlarmLimit = None
+    changed_places: AlarmLimit = None
+    quiet_stretches: AlarmLimit = None
 
 
 class MapChanges(BaseModel):
@@ -198,6 +226,7 @@ class MapChanges(BaseModel):
     )
     review: ReviewChanges | None = Field(default=None, description="null: no frames are stored from now on.")
     learning: LearningChanges | None = Field(default=None, description="null: nothing is learnt from now on.")
+    alarms: AlarmChanges | None = Field(default=None, description="null: no alarm is raised from now on.")
     calibration: CalibrationChanges | None = None
 
 
@@ -250,7 +279,7 @@ class CameraList(BaseModel):
     next_cursor: None = None
 
 
-Method = Literal["frames", "sequence", "map", "labels"]
+Method = Literal["frames", "sequence", "map", "labels", "runs"]
 
 MOST_FRAMES = 2000
 
@@ -282,7 +311,8 @@ class CalibrationOrder(BaseModel):
     method: Method = Field(
         description="Which frames query the map. `frames`: the labelled frames of this form. `sequence`: one "
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
-        "neighbours, which is the least reliable method. `labels`: the frames that were stored for review and labelled."
+        "neighbours, which is the least reliable method. `labels`: the frames stored for review and labelled. "
+        "`runs`: the frames of robots' sessions whose place the whole run knew beyond doubt; the target is not used."
     )
     target: Target = Field(default=Target(rule="precision", value=0.95), description="The target of the threshold.")
     dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")

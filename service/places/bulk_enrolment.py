@@ -20,7 +20,14 @@ from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import FormPart
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.context import JobContext, creation_time, run_after_requests
+from service.jobs.context import (
+    JobCancelled,
+    JobContext,
+    JobGivesWay,
+    JobInterrupted,
+    creation_time,
+    run_after_requests,
+)
 from service.jobs.job import Job
 from service.jobs.jobs import Jobs
 from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
@@ -120,11 +127,11 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
             were stored before stay.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
-    enrolment = _BulkEnrolment(engine, staging, context)
-    result = enrolment.run()
+    form = _Form(engine, staging, context)
+    result = EnrolmentInCommits(engine, context, form.entries, form.frame).run()
     if not context.arguments.get("align", False):
         return result
-    return {**result, "aligned": align(engine, context, enrolment.sequences())}
+    return {**result, "aligned": align(engine, context, form.sequences())}
 
 
 @dataclass
@@ -149,29 +156,45 @@ class _Outcome:
             self.named.append(item)
 
 
-class _BulkEnrolment:
-    """One attempt of the job."""
+class EnrolmentInCommits:
+    """One attempt of a job that enrols many frames, some with each commit.
 
-    def __init__(self, engine: Engine, staging: Staging, context: JobContext) -> None:
-        self.engine, self.context = engine, context
+    Args:
+        entries: JSON values, each with the ``id`` of its place.
+        frame: reads the frame of an entry by its position; an error that concerns this frame alone is reported.  It may
+            give way, after which it is asked for the same frame again.
+        gives_way: whether other jobs may come between two commits, after which the entries are read again.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        context: JobContext,
+        entries: Sequence[Any],
+        frame: Callable[[int], FrameToEnrol],
+        gives_way: bool = True,
+    ) -> None:
+        self.engine, self.context, self.entries, self._frame = engine, context, entries, frame
+        self._gives_way = gives_way
         self.map = context.map(engine.maps)
-        self.form = staging.open(context.arguments["form"])
-        self.entries, self.files = _read_form(engine, self.form)
-        self.first: dict[str, int] = {}
-        """The position of the first entry of each id."""
-        for position, entry in enumerate(self.entries):
-            self.first.setdefault(entry_id(entry) or "", position)
         nothing = {"done": 0, "changes": {}, "failed": 0, "named": []}
         self.outcome = _Outcome(**context.notes.get("told", nothing))
 
     def run(self) -> Mapping[str, Any]:
+        """Enrol what an attempt before this one has not; the result of the job.
+
+        Raises:
+            TooManyPlaces, EncoderNotInstalled, StorageFull, StorageFailure: what was stored before stays.
+            JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
+        """
         outcome, total = self.outcome, len(self.entries)
         while outcome.done < total:
             self.context.progress(outcome.done, total)
             self.context.check_cancelled()
             self._enrol_some()
             self.context.remember(told=vars(outcome))
-            self.context.give_way()
+            if self._gives_way:
+                self.context.give_way()
         self.context.progress(outcome.done, total)
         return {
             "map": self.map.record.id,
@@ -180,11 +203,6 @@ class _BulkEnrolment:
             "changes": outcome.changes,
             "failed": {"count": outcome.failed, "items": outcome.named},
         }
-
-    def sequences(self) -> list[str]:
-        """The names of the form's traverses, in the order of their first entries."""
-        names = [entry.get("sequence") for entry in self.entries if isinstance(entry, dict)]
-        return list(dict.fromkeys(name for name in names if isinstance(name, str)))
 
     def _enrol_some(self) -> None:
         """Encode and store the frames of one commit."""
@@ -195,6 +213,12 @@ class _BulkEnrolment:
         while stop < len(self.entries) and len(frames) < PLACES_PER_COMMIT and size < BYTES_PER_COMMIT:
             try:
                 frames.append(self._frame(stop))
+            except (JobCancelled, JobInterrupted):
+                raise
+            except JobGivesWay:
+                if stop == self.outcome.done:
+                    raise
+                break  # those before it are stored first
             except Exception as error:
                 check_frame_error(error)
                 failures[stop] = error
@@ -217,12 +241,30 @@ class _BulkEnrolment:
             self.outcome.fail(position, self.entries[position], failures[position])
         self.outcome.done = stop
 
-    def _frame(self, position: int) -> FrameToEnrol:
-        entry = self.entries[position]
-        frame = read_entry(entry, self.files, self._read, self.map.cameras, self.engine.settings)
-        if self.first[frame.id] != position:
+
+class _Form:
+    """The form of a job."""
+
+    def __init__(self, engine: Engine, staging: Staging, context: JobContext) -> None:
+        self._settings, self._cameras = engine.settings, context.map(engine.maps).cameras
+        self._form = staging.open(context.arguments["form"])
+        self.entries, self._files = _read_form(engine, self._form)
+        self._first: dict[str, int] = {}
+        """The position of the first entry of each id."""
+        for position, entry in enumerate(self.entries):
+            self._first.setdefault(entry_id(entry) or "", position)
+
+    def sequences(self) -> list[str]:
+        """The names of the form's traverses, in the order of their first entries."""
+        names = [entry.get("sequence") for entry in self.entries if isinstance(entry, dict)]
+        return list(dict.fromkeys(name for name in names if isinstance(name, str)))
+
+    def frame(self, position: int) -> FrameToEnrol:
+        """The frame of an entry."""
+        frame = read_entry(self.entries[position], self._files, self._read, self._cameras, self._settings)
+        if self._first[frame.id] != position:
             raise InvalidRequest(f"id: the form has {frame.id} twice.")
         return frame
 
     def _read(self, name: str) -> FormPart:
-        return self.form.read(self.files[name])
+        return self._form.read(self._files[name])

@@ -191,7 +191,7 @@ async def enrol_look(
         fields: time and camera of the frame.
 
     Raises:
-        UnknownPlace, RepeatedLook, TooManyLooks: the place cannot have it.
+        UnknownPlace, RepeatedLook, LookNameTaken, TooManyLooks: the place cannot have it.
         UnknownCamera, and what ``enrol`` raises.
     """
     frame = FrameToEnrol(place_id, fields, data, await camera_mask(map_, fields.camera), origin=origin)

@@ -99,6 +99,20 @@ class PlaceConditions(BaseModel):
         default=None, description="Its metadata has these values under these keys, at its top level."
     )
 
+    def wanted(self) -> PlaceFilter:
+        """The conditions.
+
+        Raises:
+            InvalidRequest: there are none, or they contradict each other.
+        """
+        if self.after is not None and self.before is not None and self.after > self.before:
+            raise InvalidRequest("filter: after is later than before.")
+        metadata = {} if self.where is None else checked_metadata(self.where)
+        made = PlaceFilter(None, self.sequence, self.camera, self.after, self.before, metadata)
+        if not made:
+            raise InvalidRequest("filter: give at least one condition; to delete all places, delete the map.")
+        return made
+
 
 DELETION_EXAMPLES: tuple[Any, ...] = (
     {"ids": ["p7", "p8"], "dry_run": False},
@@ -134,14 +148,7 @@ class Deletion(BaseModel):
         """
         if self.filter is None:
             return PlaceFilter(tuple(dict.fromkeys(self.ids or ())))
-        given = self.filter
-        if given.after is not None and given.before is not None and given.after > given.before:
-            raise InvalidRequest("filter: after is later than before.")
-        metadata = {} if given.where is None else checked_metadata(given.where)
-        made = PlaceFilter(None, given.sequence, given.camera, given.after, given.before, metadata)
-        if not made:
-            raise InvalidRequest("filter: give at least one condition; to delete all places, delete the map.")
-        return made
+        return self.filter.wanted()
 
 
 class DeletedPlaces(BaseModel):

@@ -93,20 +93,20 @@ class LookPageParameters(PageParameters):
     run: Run | None = Field(default=None, description="Only those that were learnt from this run.")
 
 
-class RemovedLooks(BaseModel):
-    """Looks that were removed together."""
-
-    run: str
-    looks: int = Field(ge=0, description="How many there were.")
-
-
 @router.post(
     "/places/{place}/looks",
     status_code=201,
     openapi_extra=frame_body(LookParameters),
     responses={
         200: {"model": AddedLook, "description": "The place had this look."},
-        **problem_documentation(*ENROLMENT_PROBLEMS, errors.UnknownPlace, errors.RepeatedLook, errors.TooManyLooks),
+        **problem_documentation(
+            *ENROLMENT_PROBLEMS,
+            errors.UnknownPlace,
+            errors.UnknownLook,
+            errors.RepeatedLook,
+            errors.LookNameTaken,
+            errors.TooManyLooks,
+        ),
     },
 )
 async def add_look(
@@ -126,7 +126,9 @@ async def add_look(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = PlaceFields(timestamp=options.timestamp, camera=options.camera)
     stored = await enrol_look(engine, map_, place_id, data, fields, deadline)
-    (look,) = [one for one in await in_thread(map_.looks, place_id) if one.name == stored.name]
+    look = next((one for one in await in_thread(map_.looks, place_id) if one.name == stored.name), None)
+    if look is None:
+        raise errors.UnknownLook(f"The look {stored.name!r} of place {place_id!r} was removed in the same moment.")
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "place": place_id, "look": stored.name, "change": stored.change}
     return AddedLook(
@@ -180,21 +182,6 @@ def list_all_looks(map_id: MapId, page: Annotated[LookPageParameters, Query()], 
     """List the looks of all places in the order in which they were added: all, or those learnt from one run."""
     found, next_cursor = engine.maps.get(map_id).all_looks(page.cursor, page.limit, page.run)
     return LookPage(items=[_view(place_id, look) for place_id, look in found], next_cursor=next_cursor)
-
-
-@router.delete("/looks", dependencies=[WHOLE_DELETION], responses=problem_documentation(errors.StorageFull))
-def delete_learnt_looks(
-    map_id: MapId,
-    run: Annotated[Run, Query(description="The run whose looks are removed.")],
-    request: Request,
-    engine: EngineDep,
-) -> RemovedLooks:
-    """Remove all looks that were learnt from one run, in one commit."""
-    map_ = engine.maps.get(map_id)
-    count = map_.forget_learnt(run)
-    request.state.noted = {"map": map_id, "run": run, "looks": count}
-    tell_change(engine, map_, "look-removed", count)
-    return RemovedLooks(run=run, looks=count)
 
 
 def _view(place_id: str, look: Look) -> LookView:

@@ -27,12 +27,15 @@ def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
         raise InvalidRequest(f"metadata: the value has more than {settings.max_metadata_bytes} bytes.")
 
 
-class PlaceDescription(Parameters):
-    """Pose, time and traverse of a frame, flat."""
+class PoseParameters(Parameters):
+    """A pose, flat."""
 
     x: Coordinate | None = Field(default=None, description="Metres in the map's frame; with y.", examples=[1.5])
     y: Coordinate | None = Field(default=None, description="Metres in the map's frame; with x.", examples=[2.0])
-    z: Coordinate | None = Field(default=None, description="Metres in the map's frame; beside x and y.")
+    z: Coordinate | None = Field(
+        default=None,
+        description="Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude.",
+    )
     latitude: float | None = Field(default=None, ge=-90, le=90, allow_inf_nan=False, description="Degrees, WGS 84.")
     longitude: float | None = Field(default=None, ge=-180, le=180, allow_inf_nan=False, description="Degrees, WGS 84.")
     heading: float | None = Field(
@@ -43,6 +46,15 @@ class PlaceDescription(Parameters):
         description="Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude.",
         examples=[90.0],
     )
+
+    def given_pose(self) -> dict[str, float]:
+        """The parts of the pose that are given, by name."""
+        return {name: value for name in POSE if (value := getattr(self, name)) is not None}
+
+
+class PlaceDescription(PoseParameters):
+    """Pose, time and traverse of a frame, flat."""
+
     timestamp: Timestamp | None = Field(
         default=None,
         description="When the frame was taken (ISO 8601; UTC without a zone).",
@@ -60,7 +72,7 @@ class PlaceDescription(Parameters):
             InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be stored.
         """
         check_metadata(metadata, settings)
-        pose = {name: value for name in POSE if (value := getattr(self, name)) is not None}
+        pose = self.given_pose()
         return PlaceFields(
             pose=validated(Pose, pose) if pose else None,
             timestamp=self.timestamp,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -269,7 +270,7 @@ def delete_places(map_id: MapId, order: Deletion, request: Request, engine: Engi
     """
     map_, wanted = engine.maps.get(map_id), order.wanted()
     choose = map_.ids_of if order.dry_run else map_.forget_all
-    found = choose(wanted, MOST_DELETED)
+    found = engine.reserve.making_room(partial(choose, wanted, MOST_DELETED))
     changed = {} if found and not order.dry_run else {"change": None}
     if not order.dry_run:
         tell_change(engine, map_, "deleted", len(found))
@@ -311,7 +312,7 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
 def delete_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     """Delete a place: no later query finds it."""
     map_ = engine.maps.get(map_id)
-    map_.forget(place_id)
+    engine.reserve.making_room(partial(map_.forget, place_id))
     tell_deletion(engine, map_, place_id)
 
 
@@ -337,7 +338,7 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
 def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> DeletedSequence:
     """Delete all places of a traverse at once."""
     map_ = engine.maps.get(map_id)
-    count = map_.forget_sequence(sequence)
+    count = engine.reserve.making_room(partial(map_.forget_sequence, sequence))
     tell_change(engine, map_, "deleted", count, sequence)
     request.state.noted = {"places": count}
     return DeletedSequence(name=sequence, places=count)

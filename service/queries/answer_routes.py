@@ -19,7 +19,7 @@ from service.queries.answers import StatisticsDep
 from service.queries.counts import HourCount
 from service.queries.given_answers import GivenAnswer
 from service.queries.recent_answers import MOST_OF_MAP
-from service.queries.schemas import EstimatedPose
+from service.queries.schemas import CHANGE_EXAMPLE, ChangeView, EstimatedPose
 from service.queries.statistics import map_key
 
 router = APIRouter(
@@ -31,6 +31,7 @@ ANSWER_EXAMPLE: dict[str, Any] = {
     "verdict": "recognized",
     "probability": 0.97,
     "place": "p7",
+    "change": CHANGE_EXAMPLE,
     "pose": None,
     "score": 0.41,
     "margin": 0.12,
@@ -66,6 +67,7 @@ class RecentAnswerView(BaseModel):
     verdict: Verdict
     probability: float | None
     place: str | None = Field(description="Id of the place, if it was recognized.")
+    change: ChangeView | None = None
     pose: EstimatedPose | None
     score: float | None
     margin: float | None
@@ -102,7 +104,9 @@ class RecentAnswerView(BaseModel):
         }
 
 
-_SAME = ("at", "verdict", "probability", "place", "pose", "score", "margin", "decision", "threshold", "reason")
+_SAME = (
+    "at", "verdict", "probability", "place", "change", "pose", "score", "margin", "decision", "threshold", "reason",
+)  # fmt: skip
 
 
 class PlaceMatchView(RecentAnswerView):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 from fastapi import Depends
 
+from core.judgement.change import UsualScore, WorldChange, change_of
 from core.judgement.position import PoseEstimate
 from core.maps import Map
 from core.recognition.recognition import Answer
@@ -14,14 +15,29 @@ from core.recognition.stages import Candidates
 from service.engine.encoders import Encoded
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
-from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup, ScoreParts, VerificationView
+from service.queries.schemas import (
+    ChangeView,
+    EstimatedPose,
+    Match,
+    QueryAnswer,
+    RivalGroup,
+    ScoreParts,
+    VerificationView,
+)
 from service.queries.statistics import QueryStatistics
+
+UsualScores = Callable[[str], UsualScore]
+"""Returns the usual score of recognized frames at a place, by its id."""
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
 
 
-def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
-    """The JSON answer to a frame."""
+def answer_of(map_: Map, encoded: Encoded, found: Answer, usual: UsualScores | None = None) -> QueryAnswer:
+    """The JSON answer to a frame.
+
+    Args:
+        usual: returns the usual score at a place; None: none is known.
+    """
     judgement = found.judgement
     weights: Sequence[float | None] = found.weights or [None] * len(found.matches)
     matches = [
@@ -35,6 +51,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         verdict=judgement.verdict,
         place=matches[0].place if recognized else None,
         probability=judgement.probability,
+        change=ChangeView.of(change_in(found, usual)),
         pose=estimated_pose(found.pose, matches[0].place, found.note) if recognized else None,
         score=judgement.score,
         margin=judgement.margin,
@@ -51,6 +68,14 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         encoder=encoded.encoder.identity,
         milliseconds=rounded({**encoded.milliseconds, **_searching(found)}),
     )
+
+
+def change_in(found: Answer, usual: UsualScores | None = None) -> WorldChange | None:
+    """The change that a frame shows; None without a match, for several frames that were fused, and without a curve."""
+    if not found.matches or found.candidates.first is None:
+        return None
+    known = UsualScore() if usual is None else usual(found.matches[0][1].id)
+    return change_of(found.judgement, found.calibration, float(found.candidates.scores[0]), known)
 
 
 def _why_nothing(found: Answer) -> Literal["no-regions", "no-place-allowed", "empty-map"]:
@@ -92,6 +117,15 @@ def verification_view(found: Answer) -> VerificationView:
     return VerificationView(state=stage.state, candidates=verified, keypoints=keypoints)
 
 
+def estimate_at(estimate: PoseEstimate | None, best: PlaceView | None) -> PoseEstimate | None:
+    """An estimated pose with a height if the place of the best match has one: on the Earth it is that of the place."""
+    if estimate is None or best is None or best.pose is None:
+        return estimate
+    if estimate.pose.kind() == "geographic":
+        return estimate.at_height(best.pose.z)
+    return estimate.without_height() if best.pose.z is None else estimate
+
+
 def estimated_pose(estimate: PoseEstimate | None, best: PlaceView, note: str | None = None) -> EstimatedPose | None:
     """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none.
 
@@ -99,10 +133,8 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView, note: str | N
         note: why the camera's intrinsics were not used, as ``core.errors.UnfitIntrinsics`` says it; None if they were,
             or if there are none.
     """
-    if estimate is None:
+    if (estimate := estimate_at(estimate, best)) is None:
         return None
-    if best.pose is not None and best.pose.z is None:
-        estimate = estimate.without_height()
     return EstimatedPose(
         **estimate.pose.model_dump(exclude_none=True),
         spread=estimate.spread,

@@ -1,17 +1,20 @@
 """The tables of counted answers: how counts are added to those of a ledger, and read.
 
-The tables are bounded: they have one row for each place of a map, and for each of some weeks and hours.
+The tables are bounded: they have one row for each place of a map, and for each of some weeks and hours; of the history
+of a place as many as :mod:`service.queries.histories.tables` says.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import fields
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, get_args
 
 from sqlalchemy import Column, ForeignKey, MetaData, Table, UniqueConstraint, bindparam, delete, func, select
+from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.elements import ClauseElement, ColumnElement
 
 from core.disk.sqlite_file import DURABLE
@@ -20,8 +23,9 @@ from core.ledger import Ledger, LedgerConnection, Statement, Tables
 from core.ledger.disposable import DisposableLedger
 from core.ledger.rows import given_rows
 from core.ledger.sqlite import file_of
-from core.ledger.statements import Insert, among, greatest, integer, real, text
+from core.ledger.statements import DIALECTS, DialectName, Insert, among, greatest, integer, real, text
 from core.upkeep.drift import SCORE_BINS, Week
+from core.upkeep.histories import PlacePeriod
 from service.queries.counts import AnswerCounts, PlaceCount, Statistics, VerdictCounts, hour_of
 from service.queries.given_answers import MapKey
 
@@ -57,9 +61,9 @@ _VERDICTS: Final = get_args(Verdict)
 _SUMS = "score", "score_squares", "decision", "decision_squares"
 _BINS = tuple(f"bin{number}" for number in range(SCORE_BINS))
 
-_CODE = Column("code", integer(), primary_key=True, autoincrement=True)
-_MAPS = Table(
-    "counted_maps", _METADATA, _CODE, *_texts("id", "made", "since"), UniqueConstraint("id", "made"), sqlite_strict=True
+CODE = Column("code", integer(), primary_key=True, autoincrement=True)
+MAPS = Table(
+    "counted_maps", _METADATA, CODE, *_texts("id", "made", "since"), UniqueConstraint("id", "made"), sqlite_strict=True
 )
 _PLACES = Table(
     "place_counts", _METADATA, _map(), Column("id", text(), primary_key=True),
@@ -73,7 +77,35 @@ _HOURS = Table(
     "hour_counts", _METADATA, _map(), Column("hour", integer(), primary_key=True), *_numbers(*_VERDICTS), **_FORM
 )
 _CALIBRATIONS = Table("calibrations", _METADATA, _map(), *_texts("at", "report", "trials"), **_FORM)
-TABLES = Tables("statistics", 3, _METADATA)
+
+# How each place answered in periods of ``span`` days from ``began`` on (:mod:`service.queries.histories.tables`).
+HISTORY = Table(
+    "place_history", _METADATA, _map(), Column("id", text(), primary_key=True),
+    *(Column(name, integer(), primary_key=True) for name in ("span", "began")),
+    *(Column(one.name, real() if one.type == "float" else integer(), nullable=False) for one in fields(PlacePeriod)),
+    **_FORM,
+)  # fmt: skip
+ALARMS = Table(
+    "alarms", _METADATA, _map(), Column("alarm", text(), primary_key=True), *_numbers("raised", "count"),
+    *_texts("since"), **_FORM,
+)  # fmt: skip
+
+# Answers to frames whose place a run knew beyond doubt (:mod:`service.queries.histories.run_trials`).
+RUN_TRIALS = Table(
+    "run_trials", _METADATA, _map(), *(Column(name, text(), primary_key=True) for name in ("run", "at")),
+    *_texts("source", "trials"), **_FORM,
+)  # fmt: skip
+
+
+def _making(*tables: Table) -> Mapping[DialectName, list[str]]:
+    """The statements that make tables, in each dialect."""
+    return {
+        name: [str(CreateTable(table).compile(dialect=DIALECTS[name])) for table in tables]
+        for name in get_args(DialectName)
+    }
+
+
+TABLES = Tables("statistics", 5, _METADATA, migrations={3: _making(HISTORY, ALARMS), 4: _making(RUN_TRIALS)})
 
 # Statements
 
@@ -81,7 +113,7 @@ Combination = Callable[[ColumnElement[Any], ColumnElement[Any]], ColumnElement[A
 """Makes the new value of a column of what it has and what it is given."""
 
 
-def _putting(table: Table, combined: Combination) -> Statement:
+def putting(table: Table, combined: Combination) -> Statement:
     """Put the ``rows`` into a table, each combined with the one that it has already."""
     keys = [column.name for column in table.primary_key]
 
@@ -99,48 +131,54 @@ def _added(column: ColumnElement[Any], counted: ColumnElement[Any]) -> ColumnEle
     return greatest(column, counted) if column is _PLACES.c.last else column + counted
 
 
-def _of(table: Table) -> ColumnElement[bool]:
+def of_map(table: Table) -> ColumnElement[bool]:
+    """Whether a row is of the map with the number ``code``."""
     return table.c.map == bindparam("code")
 
 
-_THE_MAP = _MAPS.c.id == bindparam("id"), _MAPS.c.made == bindparam("made")
+THE_MAP = MAPS.c.id == bindparam("id"), MAPS.c.made == bindparam("made")
 
 # The row of the map is written either way, and so locked until the transaction ends.
 _NUMBER = Statement(
     lambda insert: (
-        insert(_MAPS)
+        insert(MAPS)
         .values(id=bindparam("id"), made=bindparam("made"), since=bindparam("since"))
-        .on_conflict_do_update(index_elements=["id", "made"], set_={"since": _MAPS.c.since})
-        .returning(_CODE)
+        .on_conflict_do_update(index_elements=["id", "made"], set_={"since": MAPS.c.since})
+        .returning(CODE)
     )
 )
-_ADD_PLACES, _ADD_WEEKS, _ADD_HOURS = (_putting(table, _added) for table in (_PLACES, _WEEKS, _HOURS))
-_OLDEST = select(_WEEKS.c.monday).where(_of(_WEEKS)).order_by(_WEEKS.c.monday.desc()).offset(MOST_WEEKS).limit(1)
+_ADD_PLACES, _ADD_WEEKS, _ADD_HOURS = (putting(table, _added) for table in (_PLACES, _WEEKS, _HOURS))
+_OLDEST = select(_WEEKS.c.monday).where(of_map(_WEEKS)).order_by(_WEEKS.c.monday.desc()).offset(MOST_WEEKS).limit(1)
 _DELETE_WEEKS = Statement(
-    delete(_WEEKS).where(_of(_WEEKS), _WEEKS.c.monday <= _OLDEST.correlate(None).scalar_subquery())
+    delete(_WEEKS).where(of_map(_WEEKS), _WEEKS.c.monday <= _OLDEST.correlate(None).scalar_subquery())
 )
-_DELETE_HOURS = Statement(delete(_HOURS).where(_of(_HOURS), _HOURS.c.hour < bindparam("oldest")))
-_ALL_MAPS = Statement(select(_CODE, _MAPS.c.id, _MAPS.c.made))
-_DELETE_MAP = Statement(delete(_MAPS).where(bindparam("code") == _CODE))
-_COUNT_PLACES = Statement(select(func.count()).join_from(_PLACES, _MAPS).where(*_THE_MAP))
+_DELETE_HOURS = Statement(delete(_HOURS).where(of_map(_HOURS), _HOURS.c.hour < bindparam("oldest")))
+_ALL_MAPS = Statement(select(CODE, MAPS.c.id, MAPS.c.made))
+_DELETE_MAP = Statement(delete(MAPS).where(bindparam("code") == CODE))
+_COUNT_PLACES = Statement(select(func.count()).join_from(_PLACES, MAPS).where(*THE_MAP))
 _DELETE_PLACES = Statement(
     delete(_PLACES).where(
-        _PLACES.c.map == select(_CODE).where(*_THE_MAP).scalar_subquery(), ~among(_PLACES.c.id, "present")
+        _PLACES.c.map == select(CODE).where(*THE_MAP).scalar_subquery(), ~among(_PLACES.c.id, "present")
     )
 )
-_MAP = Statement(select(_CODE, _MAPS.c.since).where(*_THE_MAP))
+_DELETE_HISTORIES = Statement(
+    delete(HISTORY).where(
+        HISTORY.c.map == select(CODE).where(*THE_MAP).scalar_subquery(), ~among(HISTORY.c.id, "present")
+    )
+)
+_MAP = Statement(select(CODE, MAPS.c.since).where(*THE_MAP))
 _COUNTS = _PLACES.c.best, _PLACES.c.recognized, _PLACES.c.last
-_PLACES_OF_MAP = Statement(select(_PLACES.c.id, *_COUNTS).where(_of(_PLACES)))
-_PLACE = Statement(select(*_COUNTS).join_from(_PLACES, _MAPS).where(*_THE_MAP, _PLACES.c.id == bindparam("place")))
-_WEEKS_OF_MAP = Statement(select(*_WEEKS.columns[1:]).where(_of(_WEEKS)).order_by(_WEEKS.c.monday))
+_PLACES_OF_MAP = Statement(select(_PLACES.c.id, *_COUNTS).where(of_map(_PLACES)))
+_PLACE = Statement(select(*_COUNTS).join_from(_PLACES, MAPS).where(*THE_MAP, _PLACES.c.id == bindparam("place")))
+_WEEKS_OF_MAP = Statement(select(*_WEEKS.columns[1:]).where(of_map(_WEEKS)).order_by(_WEEKS.c.monday))
 _COUNTED_HOURS = (
-    select(_MAPS.c.id, _MAPS.c.made, *_HOURS.columns[1:])
-    .join_from(_HOURS, _MAPS)
+    select(MAPS.c.id, MAPS.c.made, *_HOURS.columns[1:])
+    .join_from(_HOURS, MAPS)
     .where(_HOURS.c.hour >= bindparam("oldest"))
 )
-_HOURS_OF_ALL, _HOURS_OF_MAP = Statement(_COUNTED_HOURS), Statement(_COUNTED_HOURS.where(*_THE_MAP))
-_PUT_CALIBRATION = _putting(_CALIBRATIONS, lambda _, new: new)
-_CALIBRATION = Statement(select(*_CALIBRATIONS.columns[1:]).join_from(_CALIBRATIONS, _MAPS).where(*_THE_MAP))
+_HOURS_OF_ALL, _HOURS_OF_MAP = Statement(_COUNTED_HOURS), Statement(_COUNTED_HOURS.where(*THE_MAP))
+_PUT_CALIBRATION = putting(_CALIBRATIONS, lambda _, new: new)
+_CALIBRATION = Statement(select(*_CALIBRATIONS.columns[1:]).join_from(_CALIBRATIONS, MAPS).where(*THE_MAP))
 
 
 def statistics_file(directory: Path) -> DisposableLedger:
@@ -150,9 +188,13 @@ def statistics_file(directory: Path) -> DisposableLedger:
     return DisposableLedger(file_of(directory / FILE, TABLES, settings, readable, check_whole=False))
 
 
-def add_counts(connection: LedgerConnection, key: MapKey, counted: AnswerCounts) -> None:
-    """Add counts of a map to those of the ledger, and delete those of weeks and hours that are too old."""
-    code = _number(connection, key, counted.since)
+def add_counts(connection: LedgerConnection, key: MapKey, counted: AnswerCounts) -> int:
+    """Add counts of a map to those of the ledger, and delete those of weeks and hours that are too old.
+
+    Returns:
+        The number of the map in the tables.
+    """
+    code = number_of(connection, key, counted.since)
     places = [(code, place, count.best, count.recognized, count.last) for place, count in counted.places.items()]
     hours = [(code, hour, *(counts[verdict] for verdict in _VERDICTS)) for hour, counts in counted.hours.items()]
     connection.execute(_ADD_PLACES, rows=json.dumps(places))
@@ -160,6 +202,7 @@ def add_counts(connection: LedgerConnection, key: MapKey, counted: AnswerCounts)
     connection.execute(_ADD_HOURS, rows=json.dumps(hours))
     connection.execute(_DELETE_WEEKS, code=code)
     connection.execute(_DELETE_HOURS, code=code, oldest=hour_of(datetime.now(UTC) - timedelta(hours=HOURS)))
+    return code
 
 
 def delete_maps_beside(connection: LedgerConnection, present: Collection[MapKey]) -> None:
@@ -176,7 +219,8 @@ def count_places(connection: LedgerConnection, key: MapKey) -> int:
 
 def delete_places_beside(connection: LedgerConnection, key: MapKey, present: Collection[str]) -> None:
     """Delete the counts of all places of a map but some."""
-    connection.execute(_DELETE_PLACES, id=key[0], made=key[1], present=list(present))
+    for delete_those in (_DELETE_PLACES, _DELETE_HISTORIES):
+        connection.execute(delete_those, id=key[0], made=key[1], present=list(present))
 
 
 def read_counts(connection: LedgerConnection, key: MapKey) -> Statistics:
@@ -215,7 +259,7 @@ def read_hours(ledger: Ledger, oldest: int, key: MapKey | None) -> dict[MapKey, 
 
 def put_calibration(connection: LedgerConnection, key: MapKey, at: str, report: str, trials: str) -> None:
     """Store the measurements of a map's calibration, in place of earlier ones."""
-    code = _number(connection, key, at)
+    code = number_of(connection, key, at)
     connection.execute(_PUT_CALIBRATION, rows=json.dumps([(code, at, report, trials)]))
 
 
@@ -226,7 +270,7 @@ def read_calibration(connection: LedgerConnection, key: MapKey) -> tuple[datetim
     return None
 
 
-def _number(connection: LedgerConnection, key: MapKey, since: str) -> int:
+def number_of(connection: LedgerConnection, key: MapKey, since: str) -> int:
     """The number of a map in the tables, which it gets if it has none."""
     ((code,),) = connection.execute(_NUMBER, id=key[0], made=key[1], since=since)
     return int(code)

@@ -6,12 +6,14 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date, datetime, timedelta
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.verdict import Verdict
 from core.places import Timestamp
 from core.upkeep.drift import Week
+from core.upkeep.histories import PlacePeriod
 
 
 class VerdictCounts(BaseModel):
@@ -63,6 +65,13 @@ class PlaceCount:
         return PlaceCount(self.best + other.best, self.recognized + other.recognized, max(self.last, other.last))
 
 
+class PassedBy(NamedTuple):
+    """The place that a run was sure to be at with a frame, and whether the frame alone was not recognized."""
+
+    place: str
+    missed: bool
+
+
 @dataclass(frozen=True)
 class Statistics:
     """The statistics of a map.
@@ -79,12 +88,21 @@ class Statistics:
 
 @dataclass
 class AnswerCounts:
-    """The counts of one map that are not written yet."""
+    """The counts of one map that are not written yet.
+
+    periods: how places answered, by their id and the day.
+    """
 
     since: str
     places: dict[str, PlaceCount] = field(default_factory=dict)
     weeks: dict[date, Week] = field(default_factory=dict)
     hours: dict[int, Counter[Verdict]] = field(default_factory=dict)
+    periods: dict[tuple[str, date], PlacePeriod] = field(default_factory=dict)
+
+    @property
+    def waiting(self) -> int:
+        """How many places have counts."""
+        return len(self.places.keys() | {place for place, _ in self.periods})
 
     def add(self, other: AnswerCounts) -> None:
         for place, count in other.places.items():
@@ -93,6 +111,12 @@ class AnswerCounts:
             self.weeks[monday] = self.weeks.get(monday, Week(monday)) + week
         for hour, verdicts in other.hours.items():
             self.hours.setdefault(hour, Counter()).update(verdicts)
+        for (place, day), period in other.periods.items():
+            self.add_period(place, day, period)
+
+    def add_period(self, place: str, day: date, period: PlacePeriod) -> None:
+        """Add to how a place answered on a day."""
+        self.periods[place, day] = self.periods.get((place, day), PlacePeriod()) + period
 
 
 def monday_of(day: date) -> date:

@@ -7,7 +7,9 @@ from contextlib import suppress
 
 from core.errors import PlacerecError
 from core.maps import Map
+from core.upkeep.histories import PlacePeriod
 from service.engine.engine import Engine
+from service.queries.counts import PassedBy
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics, map_key
@@ -24,6 +26,7 @@ def follow_answer(
     milliseconds: Mapping[str, float] | None = None,
     count: bool = True,
     review: bool = True,
+    passed: PassedBy | None = None,
 ) -> None:
     """Count an answer, send it to the listeners of its map, if any, and store the frame if the map's settings say so.
 
@@ -36,13 +39,14 @@ def follow_answer(
         milliseconds: of the whole request, where the answer does not say it.
         count: whether the answer says something of the map, in whose statistics it is counted.
         review: whether the map may store the frame.
+        passed: the place that a run was sure to be at.
     """
     record, given = map_.record, GivenAnswer.of(answer, queried, milliseconds)
     engine.metrics.observe_answer(record.id, answer.verdict, answer.score)
     if "search" in answer.milliseconds:
         engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
     if count:
-        _count(engine, statistics, record.id, given)
+        _count(engine, statistics, record.id, answer, given, passed)
     is_stored = review and record.review is not None and answer.verdict in record.review.verdicts
     if not is_stored and not engine.events.heard(record.id):
         return
@@ -52,9 +56,32 @@ def follow_answer(
         engine.review_keeper.offer(map_, frame, given.for_review(event))
 
 
-def _count(engine: Engine, statistics: QueryStatistics, map_id: str, given: GivenAnswer) -> None:
+def _count(
+    engine: Engine,
+    statistics: QueryStatistics,
+    map_id: str,
+    answer: QueryAnswer,
+    given: GivenAnswer,
+    passed: PassedBy | None,
+) -> None:
     """Count an answer in the statistics of its map, and store it for a while, if the map still exists."""
     with suppress(PlacerecError):  # the map was deleted in the meantime
         key = map_key(engine.maps.find(map_id))
-        statistics.observe(key, given.verdict, given.best, given.score, given.decision)
+        statistics.observe(key, given.verdict, given.best, given.score, given.decision, _period(answer), passed)
         statistics.recent.add(key, given)
+
+
+def _period(answer: QueryAnswer) -> PlacePeriod | None:
+    """The count of an answer for its best match; None without one."""
+    if not answer.matches:
+        return None
+    recognized, parts = answer.verdict == "recognized", answer.matches[0].parts
+    inliers = None if parts is None else parts.inliers
+    return PlacePeriod(
+        best=1,
+        recognized=int(recognized),
+        probability=answer.probability or 0.0,
+        score=0.0 if parts is None or not recognized else parts.similarity + parts.agreement,
+        verified=int(inliers is not None),
+        inliers=inliers or 0,
+    )

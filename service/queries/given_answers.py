@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from core.judgement.verdict import Verdict
 from service.access.audit import ASKER, Asker
 from service.events.schemas import QueryEvent
-from service.queries.schemas import EstimatedPose, QueryAnswer
+from service.queries.schemas import ChangeView, EstimatedPose, QueryAnswer
 
 MOST_MATCHES = 5
 """Matches that are stored of one answer, the best ones."""
@@ -28,12 +28,14 @@ class QueriedFrame(NamedTuple):
     camera: the name of the camera that took it.
     session, number: the session that it belongs to, and the robot's number of it.
     question: the parameters of the question, as :meth:`~service.queries.parameters.FilterParameters.again` gives them.
+    taken: when it was taken, as the robot said.
     """
 
     camera: str | None = None
     session: str | None = None
     number: int | None = None
     question: Mapping[str, Any] | None = None
+    taken: datetime | None = None
 
 
 class GivenAnswer(NamedTuple):
@@ -61,6 +63,7 @@ class GivenAnswer(NamedTuple):
     milliseconds: Mapping[str, float]
     revision: int | None
     asker: Asker
+    change: ChangeView | None = None
 
     @classmethod
     def of(
@@ -87,6 +90,7 @@ class GivenAnswer(NamedTuple):
             {**answer.milliseconds, **(milliseconds or {})},
             answer.revision,
             ASKER.get(),
+            answer.change,
         )
 
     @property
@@ -110,6 +114,7 @@ class GivenAnswer(NamedTuple):
             request_id=self.asker.request_id,
             key=self.asker.principal if self.asker.key is not None else None,
             operation=self.asker.operation,
+            change=None if self.change is None else self.change.model_dump(),
             pose=None if self.pose is None else self.pose.model_dump(exclude_none=True),
             camera=self.frame.camera,
             session=self.frame.session,
@@ -123,7 +128,8 @@ class GivenAnswer(NamedTuple):
     def for_review(self, event: QueryEvent) -> dict[str, Any]:
         """The part of the answer that is stored with a frame for review, as JSON values."""
         shown = event.model_dump(mode="json", include=REVIEWED)
-        return shown | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
+        taken = {} if self.frame.taken is None else {"taken": self.frame.taken.isoformat()}
+        return shown | taken | {"matches": [{"place": place, "score": score} for place, score in self.matches]}
 
     def rank_of(self, place_id: str) -> int | None:
         """The rank of a place among the matches; None if it is not among the stored ones."""

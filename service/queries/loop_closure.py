@@ -155,13 +155,14 @@ async def query_or_enrol(
     else:
         frame = FrameToEnrol(options.id, fields, data, mask)
         closure = await in_thread(close_loop, engine, map_, frame, encoded, question)
-        answer = answer_of(map_, encoded, closure.answer)
+        answer = answer_of(map_, encoded, closure.answer, statistics.usual(map_))
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"
     response.status_code = 201 if change == "created" else 200
     request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
-    follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera, question=options.again()))
+    queried = QueriedFrame(options.camera, question=options.again(), taken=options.timestamp)
+    follow_answer(engine, statistics, map_, answer, data, queried)
     shown = None if enrolled is None else PlaceView.of(enrolled)
-    return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)
+    return ClosureAnswer(**answer.__dict__, enrolment=change, enrolled=shown)

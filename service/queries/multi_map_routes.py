@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import Response
 
 from core import errors
 from core.judgement.probability import sigmoid
@@ -15,6 +16,8 @@ from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.errors.faults import (
     InvalidRequest,
+    NoGeoPose,
+    NotLocalized,
     QueueFull,
     UnsupportedMediaType,
 )
@@ -32,12 +35,14 @@ from service.http.routing import (
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
-from service.queries.answers import StatisticsDep, answer_of, estimated_pose
+from service.poses.geoposes import VARY, Located, geopose_content, negotiated
+from service.queries.answers import StatisticsDep, answer_of, estimate_at, estimated_pose
 from service.queries.following import follow_answer
 from service.queries.given_answers import QueriedFrame
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
+from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -51,15 +56,21 @@ MOST_FRAMES = 16
 """The most cameras of a rig."""
 
 
-@router.post("/query", openapi_extra=frames_body(MultiMapParameters))
+@router.post(
+    "/query",
+    response_model=SeveralAnswer,
+    openapi_extra=frames_body(MultiMapParameters),
+    responses={200: geopose_content(), **problem_documentation(NotLocalized, NoGeoPose)},
+)
 async def query_maps(
     options: Annotated[MultiMapParameters, Query()],
     request: Request,
+    response: Response,
     engine: EngineDep,
     statistics: StatisticsDep,
     principal: PrincipalDep,
     deadline: DeadlineDep,
-) -> SeveralAnswer:
+) -> Any:
     """Locate the frames of one moment in several maps; the matches are ranked together by calibrated probability.
 
     A form with several file parts is one query of a rig: the evidence of its cameras is added up place by place, so
@@ -67,6 +78,8 @@ async def query_maps(
     reported, and the other maps answer all the same. `place` is given only with the verdict `recognized`: the most
     probable match is recognized in its own map, and no other map has a match of another place that is nearly as
     probable.
+
+    With `Accept: application/geopose+json` the answer is an OGC GeoPose as that of one map is.
     """
     engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
@@ -80,7 +93,7 @@ async def query_maps(
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
-    wholes = [_whole_answer(report) for report in reports]
+    wholes = [_whole_answer(report, statistics) for report in reports]
     answers = [_map_answer(request, report, whole) for report, whole in zip(reports, wholes, strict=True)]
     queried, data = QueriedFrame(frames[0].camera, question=options.again()), frames[0].data
     total = rounded({"total": milliseconds_since(started(request))})
@@ -101,6 +114,16 @@ async def query_maps(
         place = PlaceView.of(recognized.answer.matches[0][1])
         pose = estimated_pose(recognized.answer.pose, place)
     request.state.noted = {"maps": len(map_ids), "frames": len(frames), "verdict": together.verdict}
+    response.headers.update(VARY)
+    located = Located(
+        together.verdict,
+        None if recognized is None else recognized.map_id,
+        None if place is None else place.id,
+        together.probability,
+        None if recognized is None or recognized.answer is None else estimate_at(recognized.answer.pose, place),
+    )
+    if (found := negotiated(request.headers.get("accept"), options.format).response(located)) is not None:
+        return found
     return SeveralAnswer(
         verdict=together.verdict,
         map=None if recognized is None else recognized.map_id,
@@ -182,6 +205,7 @@ def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None)
         status=200,
         verdict=answer.verdict,
         probability=answer.probability,
+        change=answer.change,
         score=answer.score,
         margin=answer.margin,
         decision=answer.decision,
@@ -194,13 +218,14 @@ def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None)
     )
 
 
-def _whole_answer(report: MapReport) -> QueryAnswer | None:
+def _whole_answer(report: MapReport, statistics: QueryStatistics) -> QueryAnswer | None:
     """The answer of a report as one query of its map would give it; None if the map did not answer."""
     frames = [one for one in report.frames if isinstance(one, Encoded)]
     seen = next((one for one in frames if len(one.encoding.regions)), frames[0] if frames else None)
     if report.map_ is None or report.error is not None or seen is None:
         return None
-    return answer_of(report.map_, seen, report.answer or answer_to_blank(report.map_, seen.encoder, seen.encoding))
+    found = report.answer or answer_to_blank(report.map_, seen.encoder, seen.encoding)
+    return answer_of(report.map_, seen, found, statistics.usual(report.map_))
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

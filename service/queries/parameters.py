@@ -18,6 +18,7 @@ from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.filters import MOST_NAMES, checked_metadata, parsed_json
 from service.places.parameters import PlaceDescription
+from service.poses.geoposes import AnswerFormat
 
 Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
 KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
@@ -246,6 +247,12 @@ class QueryParameters(LocateParameters):
         return Question(self.k, self.selection(), self.verify, self.camera, self.explain)
 
 
+class SingleQueryParameters(QueryParameters):
+    """The parameters of a query of one frame."""
+
+    format: AnswerFormat = None
+
+
 class ClosureParameters(FilterParameters):
     """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
 
@@ -277,6 +284,7 @@ class MultiMapParameters(LocateParameters):
     )
     k: Matches = 5
     verify: Verification = "auto"
+    format: AnswerFormat = None
 
     def question(self) -> Question:
         """The question about a rig; each of its frames has a camera of its own; see ``selection`` for errors."""

@@ -136,3 +136,9 @@ class ExplanationPictures:
                 f"There is no picture {name[:40]!r}; the latest {MOST} are stored for {SECONDS / 60:.0f} minutes."
             )
         return picture
+
+    def forget(self, key: MapKey) -> None:
+        """Drop the pictures of a map."""
+        with self._lock:
+            for one in [one for one in self._stored if one[0] == key]:
+                del self._stored[one]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
+from collections.abc import Callable
+from datetime import datetime
 
 from pydantic import ConfigDict, TypeAdapter
 from sqlalchemy import Column, Index, MetaData, Table, bindparam, delete, insert, select
 from sqlalchemy.sql import ColumnElement
 
 from core.ledger import Ledger, Statement, Tables
-from core.ledger.statements import integer, text
+from core.ledger.statements import among, integer, text
 from service.queries.given_answers import GivenAnswer, MapKey
 
 MOST_OF_MAP = 500
@@ -44,6 +46,9 @@ _ADD = Statement(
     insert(_ANSWERS).values(map=bindparam("id"), made=bindparam("made"), answer=bindparam("answer")).inline()
 )
 _READ = Statement(select(_ANSWERS.c.answer).where(*_OF_MAP).order_by(_ANSWERS.c.number.desc()).limit(bindparam("most")))
+_NUMBERED = Statement(select(_ANSWERS.c.number, _ANSWERS.c.answer).where(*_OF_MAP))
+_OLDEST = Statement(select(_ANSWERS.c.number, _ANSWERS.c.answer).order_by(_ANSWERS.c.number).limit(bindparam("most")))
+_DELETE = Statement(delete(_ANSWERS).where(among(_ANSWERS.c.number, "numbers")))
 _TRIM_MAP, _TRIM = _deletion_beyond(*_OF_MAP), _deletion_beyond()
 
 _JSON = TypeAdapter(GivenAnswer, config=ConfigDict(defer_build=True))
@@ -92,6 +97,50 @@ class RecentAnswers:
         self.flush()
         found = self._ledger.execute("read the latest answers", _READ, id=key[0], made=key[1], most=MOST_OF_MAP)
         return [_JSON.validate_json(answer) for (answer,) in found]
+
+    def forget(self, key: MapKey, wanted: Callable[[GivenAnswer], bool]) -> int:
+        """Drop the answers of a map that fulfil a condition; returns how many.
+
+        Raises:
+            StorageFull, StorageFailure: as :meth:`of_map`.
+        """
+        with self._lock:
+            count = self._drop(key, wanted)
+        if self._ledger is None:
+            return count
+        self.flush()
+        found = self._ledger.execute("read the latest answers", _NUMBERED, id=key[0], made=key[1])
+        gone = [number for number, answer in found if wanted(_JSON.validate_json(answer))]
+        if gone:
+            self._ledger.change("delete answers", _DELETE, numbers=gone)
+        return count + len(gone)
+
+    def _drop(self, key: MapKey, wanted: Callable[[GivenAnswer], bool]) -> int:
+        before = self._stored.get(key, ())
+        left = deque((one for one in before if not wanted(one)), maxlen=MOST_OF_MAP)
+        if key in self._stored:
+            self._stored[key] = left
+        self._count -= len(before) - len(left)
+        return len(before) - len(left)
+
+    def forget_before(self, moment: datetime) -> None:
+        """Drop the answers of all maps from before a moment.
+
+        Raises:
+            StorageFull, StorageFailure: as :meth:`of_map`.
+        """
+        with self._lock:
+            for key in list(self._stored):
+                self._drop(key, lambda one: one.at < moment)
+        if self._ledger is not None:
+            found = self._ledger.execute("read the oldest answers", _OLDEST, most=MOST)
+            gone = []
+            for number, answer in found:
+                if _JSON.validate_json(answer).at >= moment:
+                    break  # numbers rise with time
+                gone.append(number)
+            if gone:
+                self._ledger.change("delete answers", _DELETE, numbers=gone)
 
     def flush(self) -> None:
         """Add the answers to the ledger, if there is one; raises as :meth:`of_map`, and they stay in memory."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from starlette.responses import Response
@@ -13,6 +13,8 @@ from service.engine.engine import camera_mask
 from service.errors.faults import (
     EncoderNotInstalled,
     InvalidRequest,
+    NoGeoPose,
+    NotLocalized,
     QueueFull,
     UnknownExplanation,
     UnsupportedMediaType,
@@ -33,11 +35,12 @@ from service.http.routing import (
 )
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
-from service.queries.answers import StatisticsDep, answer_of
+from service.poses.geoposes import VARY, Located, geopose_content, negotiated
+from service.queries.answers import StatisticsDep, answer_of, estimate_at
 from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.following import follow_answer
 from service.queries.given_answers import QueriedFrame
-from service.queries.parameters import QueryParameters
+from service.queries.parameters import QueryParameters, SingleQueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
 from service.queries.statistics import map_key
@@ -58,38 +61,54 @@ explanations = APIRouter(
     dependencies=[Depends(single_values)],
 )
 QueryOptions = Annotated[QueryParameters, Query()]
+SingleQueryOptions = Annotated[SingleQueryParameters, Query()]
 PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 
 
 @router.post(
     "/query",
-    openapi_extra=frame_body(QueryParameters),
-    responses=problem_documentation(errors.TooManyPixels, errors.NotAnImage, errors.TruncatedImage),
+    response_model=QueryAnswer,
+    openapi_extra=frame_body(SingleQueryParameters),
+    responses={
+        200: geopose_content(),
+        **problem_documentation(
+            errors.TooManyPixels, errors.NotAnImage, errors.TruncatedImage, NotLocalized, NoGeoPose
+        ),
+    },
 )
 async def query(
     map_id: MapId,
-    options: QueryOptions,
+    options: SingleQueryOptions,
     request: Request,
+    response: Response,
     engine: EngineDep,
     statistics: StatisticsDep,
     pictures: PicturesDep,
     deadline: DeadlineDep,
-) -> QueryAnswer:
+) -> Any:
     """Locate one frame in a map.
 
     `place` is given only with the verdict `recognized`; `matches` lists the best places with any
     verdict. A place that was never enrolled is `unknown`, which is an answer and no error.
+
+    With `Accept: application/geopose+json` the answer of a map in latitude and longitude is an OGC GeoPose. Where there
+    is none it is JSON, if the header allows that, else 404 `not-localized` or 406 `no-geopose`.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     answered = await engine.ask(map_, data, options.question(), deadline)
-    answer = answer_of(map_, answered.frame, answered.answer)
+    answer = answer_of(map_, answered.frame, answered.answer, statistics.usual(map_))
     if options.explain and answered.answer.matches:
         encoded = await in_thread(scaled_for_drawing, answered.frame)
         answer.explanation = await explain_match(engine, pictures, map_, encoded, answered.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     follow_answer(engine, statistics, map_, answer, data, QueriedFrame(options.camera, question=options.again()))
-    return answer
+    response.headers.update(VARY)
+    place = answer.place.id if answer.place is not None else None
+    located = Located(
+        answer.verdict, map_id, place, answer.probability, estimate_at(answered.answer.pose, answer.place)
+    )
+    return negotiated(request.headers.get("accept"), options.format).response(located) or answer
 
 
 @router.post(
@@ -138,9 +157,9 @@ async def query_batch(
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     answered = await engine.searches.answer(map_, list(encoded.values()), question)
-    queried = QueriedFrame(options.camera, question=options.again())
+    queried, usual = QueriedFrame(options.camera, question=options.again()), statistics.usual(map_)
     for index, one in zip(encoded, answered, strict=True):
-        answer = items[index].answer = answer_of(map_, one.frame, one.answer)
+        answer = items[index].answer = answer_of(map_, one.frame, one.answer, usual)
         follow_answer(engine, statistics, map_, answer, files[index].data, queried, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})

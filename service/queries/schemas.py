@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
+from core.judgement.change import ChangeVerdict, WorldChange
 from core.judgement.position import PoseSource
 from core.judgement.verdict import Verdict
 from core.recognition.verification import VerificationState
@@ -170,9 +171,13 @@ class EstimatedPose(BaseModel):
 
     model_config = ConfigDict(json_schema_extra={"examples": [POSE_EXAMPLE]})
 
-    x: float | None = Field(default=None, description="Metres in the map's frame, as are y and z.")
+    x: float | None = Field(default=None, description="Metres in the map's frame, as is y.")
     y: float | None = None
-    z: float | None = None
+    z: float | None = Field(
+        default=None,
+        description="Metres: in the map's frame beside x and y; beside a latitude that of the best match, above the "
+        "ellipsoid of WGS 84. Left out if the best match has none.",
+    )
     latitude: float | None = Field(default=None, description="Degrees, WGS 84, as is longitude.")
     longitude: float | None = None
     heading: float | None = Field(default=None, description="Degrees, counted as the places' headings are.")
@@ -228,6 +233,28 @@ class RivalGroup(BaseModel):
 
 Reason = Literal["no-regions", "empty-map", "no-place-allowed"]
 
+CHANGE_EXAMPLE: dict[str, Any] = {"verdict": "known", "known": 0.93, "changed": 0.06, "new": 0.01}
+
+
+class ChangeView(BaseModel):
+    """Whether a frame shows the map as it is, as it was, or something that the map does not have."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [CHANGE_EXAMPLE]})
+
+    verdict: ChangeVerdict = Field(
+        description="`new` where its probability is 0.5 at least; else the more probable of `known` and `changed`."
+    )
+    known: float = Field(description="The probability that it shows a place of the map as one of its looks does.")
+    changed: float = Field(description="The probability that it shows one that looks different from all of them.")
+    new: float = Field(description="The probability that it shows no place of the map. The three sum to 1.")
+
+    @classmethod
+    def of(cls, found: WorldChange | None) -> ChangeView | None:
+        """The JSON view of a change."""
+        if found is None:
+            return None
+        return cls(verdict=found.verdict, known=found.known, changed=found.changed, new=found.new)
+
 
 class QueryAnswer(BaseModel):
     """Where a frame was taken, or that this is not known."""
@@ -239,6 +266,7 @@ class QueryAnswer(BaseModel):
                     "verdict": "recognized",
                     "place": PLACE_EXAMPLE,
                     "probability": 0.99,
+                    "change": CHANGE_EXAMPLE,
                     "pose": POSE_EXAMPLE,
                     "score": 0.41,
                     "margin": 0.12,
@@ -266,6 +294,11 @@ class QueryAnswer(BaseModel):
     probability: float | None = Field(
         description="The probability that the best match is right, calibrated on frames with known truth; null if "
         "there is no match, or if the calibration gives no probabilities."
+    )
+    change: ChangeView | None = Field(
+        default=None,
+        description="Whether the frame shows the map as it is; its place, if it is known or changed, is the best "
+        "match, as surely as `probability` says. Null where `probability` is, and for a rig.",
     )
     pose: EstimatedPose | None = Field(description="Null unless recognized, or if the place has no pose.")
     score: float | None = Field(description="Score of the best match (see its `score`); null if there is none.")
@@ -297,7 +330,7 @@ class QueryAnswer(BaseModel):
 class ClosureAnswer(QueryAnswer):
     """Where a frame was taken, and the new place if it was unknown."""
 
-    change: Literal["created", "unchanged"] | None = Field(
+    enrolment: Literal["created", "unchanged"] | None = Field(
         description="created: the frame was enrolled; unchanged: an earlier, equal request had enrolled it; null: it "
         "was not enrolled."
     )
@@ -343,6 +376,7 @@ class MapAnswer(BaseModel):
     status: int = Field(description="The status that a query of this map alone would have had.")
     verdict: Verdict | None = Field(default=None, description="The map's own verdict, regardless of the other maps.")
     probability: float | None = None
+    change: ChangeView | None = None
     score: float | None = None
     margin: float | None = None
     decision: float | None = None

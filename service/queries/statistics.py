@@ -9,16 +9,19 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
+from functools import partial
 
 from core.errors import PlacerecError, UnknownMap
+from core.judgement.change import UsualScore
 from core.judgement.verdict import Verdict
 from core.ledger import Ledger
 from core.ledger.disposable import once_more_if_replaced
-from core.maps import Map
+from core.maps import AlarmName, Map
 from core.upkeep.drift import Week
+from core.upkeep.histories import Histories, PlacePeriod
 from service.engine.engine import Engine
 from service.queries.count_tables import (
     HOURS,
@@ -34,8 +37,29 @@ from service.queries.count_tables import (
     read_place,
     statistics_file,
 )
-from service.queries.counts import AnswerCounts, HourCount, PlaceCount, Statistics, VerdictCounts, hour_of, monday_of
+from service.queries.counts import (
+    AnswerCounts,
+    HourCount,
+    PassedBy,
+    PlaceCount,
+    Statistics,
+    VerdictCounts,
+    hour_of,
+    monday_of,
+)
 from service.queries.given_answers import MapKey
+from service.queries.histories.run_trials import RunTrials, forget_run_trials, put_run_trials, read_run_trials
+from service.queries.histories.tables import (
+    AlarmState,
+    add_periods,
+    fold,
+    put_alarm,
+    read_alarms,
+    read_all_alarms,
+    read_histories,
+    read_usual,
+)
+from service.queries.histories.usual_scores import UsualScores
 from service.queries.recent_answers import RecentAnswers
 
 MOST_WAITING = 50_000
@@ -85,6 +109,11 @@ class QueryStatistics:
         self._lock = threading.Lock()
         self._counts: dict[MapKey, AnswerCounts] = {}
         self._waiting = 0
+        self._folded: dict[MapKey, date] = {}
+        self._usual = UsualScores()
+        self.on_written: Callable[[Collection[MapKey]], None] = lambda maps: None
+        """Called by the thread that writes, with the maps whose counts were written since."""
+        self._written: set[MapKey] = set()
         self.recent = RecentAnswers(ledger if shared else None)
         """The latest answers."""
         self.lost = 0
@@ -142,12 +171,21 @@ class QueryStatistics:
     # Counting
 
     def observe(
-        self, key: MapKey, verdict: Verdict, best: str | None, score: float | None, decision: float | None
+        self,
+        key: MapKey,
+        verdict: Verdict,
+        best: str | None,
+        score: float | None,
+        decision: float | None,
+        period: PlacePeriod | None = None,
+        passed: PassedBy | None = None,
     ) -> None:
         """Count one answer.
 
         Args:
             best: the id of the best match; None if there is none (a blank frame, an empty map).
+            period: what is counted of the best match besides; None: nothing.
+            passed: the place that a run was sure to be at; None: it was not, or there is no run.
         """
         now = datetime.now(UTC)
         counted = Week.of(monday_of(now.date()), verdict, score, decision)
@@ -155,15 +193,27 @@ class QueryStatistics:
             counts = self._counts.setdefault(key, AnswerCounts(since=now.isoformat()))
             counts.weeks[counted.monday] = counts.weeks.get(counted.monday, Week(counted.monday)) + counted
             counts.hours.setdefault(hour_of(now), Counter())[verdict] += 1
-            if best is None:
-                return
-            if best not in counts.places:
-                if self._waiting >= MOST_WAITING:
-                    self.lost += 1
-                    return
-                self._waiting += 1
-            seen = PlaceCount(1, int(verdict == "recognized"), now.isoformat(timespec="seconds"))
-            counts.places[best] = counts.places.get(best, PlaceCount()) + seen
+            if best is not None and self._has_room(counts, best, now.date()):
+                recognized = int(verdict == "recognized")
+                seen = PlaceCount(1, recognized, now.isoformat(timespec="seconds"))
+                counts.places[best] = counts.places.get(best, PlaceCount()) + seen
+                counts.add_period(best, now.date(), period or PlacePeriod(1, recognized))
+            if passed is not None and self._has_room(counts, passed.place, now.date()):
+                counts.add_period(passed.place, now.date(), PlacePeriod(passed=1, missed=int(passed.missed)))
+
+    def _has_room(self, counts: AnswerCounts, place: str, day: date) -> bool:
+        """Whether a place may be counted before the next writing; if not, a count is lost."""
+        if (place, day) in counts.periods:
+            return True
+        if self._waiting >= MOST_WAITING:
+            self.lost += 1
+            return False
+        self._waiting += 1
+        return True
+
+    def usual(self, map_: Map) -> Callable[[str], UsualScore]:
+        """Returns the usual score at a place of a map, by the counts that were written; nothing is waited for."""
+        return partial(self._usual.of, map_key(map_))
 
     def flush(self) -> None:
         """Write the counts, and the answers that others see.
@@ -187,8 +237,10 @@ class QueryStatistics:
                 for key, newer in self._counts.items():
                     taken.setdefault(key, AnswerCounts(newer.since)).add(newer)
                 self._counts = taken
-                self._waiting = sum(len(counts.places) for counts in taken.values())
+                self._waiting = sum(counts.waiting for counts in taken.values())
             raise
+        with self._lock:
+            self._written |= taken.keys()
 
     def _run(self) -> None:
         while not self._stop.wait(self._seconds):
@@ -196,19 +248,35 @@ class QueryStatistics:
                 self.flush()
             except Exception as error:
                 log.error("the statistics of queries cannot be written: %s", error)
+                continue
+            with self._lock:
+                written, self._written = self._written, set()
+            try:
+                self.on_written(written)
+            except Exception as error:
+                log.error("whether maps have changed cannot be said: %s", error)
 
     @once_more_if_replaced
     def _write(self, counts: Mapping[MapKey, AnswerCounts]) -> None:
         """Add counts to those of the ledger, all or none."""
-        sizes = self._sizes()
+        sizes, today = self._sizes(), datetime.now(UTC).date()
+        usual, folded = {}, {}
         with self._ledger.transaction(WRITE) as connection:
             if sizes is not None:
                 delete_maps_beside(connection, sizes)
             for key in sorted(counts):  # in one order, so that no two services wait for one another
                 if sizes is None or key in sizes:
-                    add_counts(connection, key, counts[key])
+                    code = add_counts(connection, key, counts[key])
+                    add_periods(connection, code, counts[key].periods)
+                    if is_new_day := self._folded.get(key) != today:
+                        fold(connection, code, today)
+                        folded[key] = today
+                    usual[key] = read_usual(connection, code, list(counts[key].places), is_new_day)
                 if sizes is not None and key in sizes and count_places(connection, key) > sizes[key] + SPARE_PLACES:
                     delete_places_beside(connection, key, self._present(key[0]))
+        self._folded |= folded
+        for key, (whole, places) in usual.items():
+            self._usual.put(key, whole, places)
 
     # Reading
 
@@ -227,11 +295,17 @@ class QueryStatistics:
 
     def hours(self, key: MapKey) -> list[HourCount]:
         """The answers of a map in the last ``HOURS`` hours, including those that are not written yet, in order."""
-        found = self._last_hours(key).get(key, {})
-        return [
-            HourCount(hour=datetime.fromtimestamp(3600 * hour, UTC), **counts.model_dump())
-            for hour, counts in found.items()
-        ]
+        return self.hours_of_all(key).get(key, [])
+
+    def hours_of_all(self, key: MapKey | None = None) -> dict[MapKey, list[HourCount]]:
+        """The same of every map that had any answers, or of the only map that is wanted."""
+        return {
+            one: [
+                HourCount(hour=datetime.fromtimestamp(3600 * hour, UTC), **counts.model_dump())
+                for hour, counts in hours.items()
+            ]
+            for one, hours in self._last_hours(key).items()
+        }
 
     def last_day(self, key: MapKey | None = None) -> dict[MapKey, VerdictCounts]:
         """The answers of the last ``HOURS`` hours, of the maps that had any.
@@ -259,6 +333,33 @@ class QueryStatistics:
             for one, hours in found.items()
         }
 
+    # Histories
+
+    @once_more_if_replaced
+    def histories(self, key: MapKey) -> Histories:
+        """How the places of a map answered over time, including what is not written yet."""
+        self.flush()
+        with self._ledger.transaction(READ) as connection:
+            return read_histories(connection, key)
+
+    @once_more_if_replaced
+    def put_alarm(self, key: MapKey, alarm: AlarmName, is_raised: bool, count: int) -> bool:
+        """Raise or clear an alarm of a map; whether that is a change, which only one of several services sees."""
+        with self._ledger.transaction("raise an alarm") as connection:
+            return put_alarm(connection, key, alarm, is_raised, count, datetime.now(UTC))
+
+    @once_more_if_replaced
+    def alarms(self, key: MapKey) -> list[tuple[AlarmName, int, datetime]]:
+        """The alarms of a map that are raised: their names, the counts that raised them, and since when."""
+        with self._ledger.transaction(READ) as connection:
+            return read_alarms(connection, key)
+
+    @once_more_if_replaced
+    def alarms_of_all(self, after: datetime) -> list[AlarmState]:
+        """The alarms of all maps that are raised, and then those that were cleared after a moment; the latest first."""
+        with self._ledger.transaction(READ) as connection:
+            return read_all_alarms(connection, after)
+
     # Calibrations
 
     @once_more_if_replaced
@@ -277,3 +378,24 @@ class QueryStatistics:
         """When a map was last measured to be calibrated, the report and the trials; None if it was not."""
         with self._ledger.transaction(READ) as connection:
             return read_calibration(connection, key)
+
+    # Runs
+
+    @once_more_if_replaced
+    def keep_run_trials(self, key: MapKey, ran: RunTrials) -> None:
+        """Store what a run says of a map's answers, beside what the runs before it said."""
+        now = datetime.now(UTC).isoformat()
+        with self._ledger.transaction("store the trials of a run") as connection:
+            put_run_trials(connection, key, now, ran)
+
+    @once_more_if_replaced
+    def run_trials(self, key: MapKey) -> list[RunTrials]:
+        """The trials of the latest runs of a map, oldest first."""
+        with self._ledger.transaction(READ) as connection:
+            return read_run_trials(connection, key)
+
+    @once_more_if_replaced
+    def forget_run_trials(self, key: MapKey, run: str) -> None:
+        """Delete the trials of a run."""
+        with self._ledger.transaction("forget the trials of a run") as connection:
+            forget_run_trials(connection, key, run)

@@ -16,7 +16,7 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
-from core.networks.forward import Device, Precision
+from core.networks.backbone import Device, Precision
 from core.networks.xfeat import packaged_xfeat
 from core.threads import share_cores
 from service.engine.encoder_threads import EncoderThreads

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from core.errors import PlacerecError, StorageFailure, UnknownCamera
 from core.frames.masks import Mask
 from core.maps import Map
-from core.method.encoder import Encoding
 from core.places import look_address
 from service.engine.encoders import Encoded
-
-LEARNING = "learning ("
-"""The beginning of who gave a label that a map has given itself; no key has such a name."""
+from service.engine.engine import Engine
+from service.learning.adoption import LEARNING
+from service.places.place_events import tell_change
 
 TOGETHER = 32
 """Number of frames that are read and encoded at a time."""
@@ -59,6 +59,26 @@ def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
     return usable, len(found) - len(usable)
 
 
+def withdraw_contradicted(
+    engine: Engine, map_: Map, before: Mapping[str, Any] | None, label: Mapping[str, Any]
+) -> None:
+    """Withdraw the look that a map has taken by itself from a frame of which a person says that it shows another place.
+
+    Args:
+        before: the label that the frame had, and who gave it; None: it had none.
+        label: what the person says.
+
+    Raises:
+        StorageFull, StorageFailure.
+    """
+    if before is None or not str(before.get("by")).startswith(LEARNING):
+        return
+    place, look = before["label"]["place"], before["label"].get("look")
+    if look is not None and label.get("place") != place:
+        (row,) = map_.rows_of([look_address(place, look)])
+        tell_change(engine, map_, "look-removed", map_.withdraw([] if row is None else [row]))
+
+
 Part = tuple[list[KnownFrame], list[bytes], list[Mask | None]]
 """Some frames, their files, and the masks of their cameras."""
 
@@ -87,10 +107,10 @@ def _mask(map_: Map, camera: str | None) -> Mask | None:
 
 def with_regions(
     frames: Sequence[KnownFrame], outcomes: Sequence[Encoded | Exception]
-) -> list[tuple[KnownFrame, Encoding]]:
+) -> list[tuple[KnownFrame, Encoded]]:
     """The frames that were encoded and have regions; others cannot be searched for."""
     return [
-        (frame, outcome.encoding)
+        (frame, outcome)
         for frame, outcome in zip(frames, outcomes, strict=True)
         if not isinstance(outcome, Exception) and len(outcome.encoding.regions)
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query
@@ -25,6 +26,7 @@ from service.http.schemas import PageParameters
 from service.http.uploads import FORMATS
 from service.places.enrolment import FrameToEnrol, LookOrigin, digest_of, enrol, enrol_look
 from service.places.schemas import PlaceView
+from service.review.labels import withdraw_contradicted
 from service.review.schemas import ExportedLabel, Labelled, LabelList, LabelOrder, NewPlace, ReviewFrameView, ReviewPage
 from service.worker_threads import in_thread
 
@@ -106,6 +108,7 @@ def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) ->
         errors.InvalidField,
         errors.NoRegions,
         errors.RepeatedLook,
+        errors.LookNameTaken,
         errors.TooManyLooks,
         errors.StorageFull,
         PlaceTaken,
@@ -121,7 +124,8 @@ async def label_frame(
     """Label a stored frame: a place of the map, a new place as which it is enrolled, or no place of the map.
 
     With `"look": true` it is also added to the looks of the place. Or take its label back, or throw the frame away. A
-    label that is given again replaces the one before; enrolled places and looks stay. Labels serve to calibrate the
+    label that is given again replaces the one before; enrolled places and looks stay, but for a look that the map had
+    taken by itself as another place than the label says: it is withdrawn. Labels serve to calibrate the
     map, with the method `labels`. Simultaneous labels of one frame are applied one after the other.
     """
     map_ = await engine.map(map_id)
@@ -131,7 +135,7 @@ async def label_frame(
 
 async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, deadline: RequestDeadline) -> Labelled:
     if order.discard:
-        await in_thread(map_.review.discard, number)
+        await in_thread(engine.reserve.making_room, partial(map_.review.discard, number))
         return Labelled(id=number, discarded=True, frame=None, enrolled=None)
     if order.clear:
         frame = await in_thread(map_.review.label, number, None)
@@ -139,7 +143,7 @@ async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, dead
     if order.new is not None:
         with map_.review.held(number):
             enrolled = await _enrol(engine, map_, number, order.new, deadline)
-            return await _store(map_, number, {"new": order.new.id}, enrolled)
+            return await _store(engine, map_, number, {"new": order.new.id}, enrolled)
     label: dict[str, Any] = {"stranger": True}
     if order.place is not None:
         check_place_id(order.place)
@@ -148,14 +152,19 @@ async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, dead
         if order.look:
             with map_.review.held(number):
                 label["look"] = await _add_look(engine, map_, number, order.place, deadline)
-                return await _store(map_, number, label)
-    return await _store(map_, number, label)
+                return await _store(engine, map_, number, label)
+    return await _store(engine, map_, number, label)
 
 
-async def _store(map_: Map, number: int, label: dict[str, Any], enrolled: PlaceView | None = None) -> Labelled:
+async def _store(
+    engine: Engine, map_: Map, number: int, label: dict[str, Any], enrolled: PlaceView | None = None
+) -> Labelled:
     asker = ASKER.get()
     said = {"label": label, "at": datetime.now(UTC).isoformat(), "by": asker.principal if asker.key else None}
+    before = await in_thread(map_.review.find, number)
+    await in_thread(withdraw_contradicted, engine, map_, before.label, label)
     frame = await in_thread(map_.review.label, number, said)
+    await in_thread(withdraw_contradicted, engine, map_, frame.replaced, label)  # it may be of this very moment
     return Labelled(id=number, discarded=False, frame=ReviewFrameView.of(frame), enrolled=enrolled)
 
 

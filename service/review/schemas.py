@@ -37,8 +37,10 @@ class ReviewFrameView(BaseModel):
     answer: dict[str, Any] = Field(
         description="How it was answered: `verdict`, `reason`, `probability`, `score`, `decision`, `threshold`, "
         "`best` (id of the best match), `matches` (`place` and `score` of the first five), `revision`; and whose it "
-        "was: `camera`, `session`, `frame`, `file`, `operation`, `request_id`, `key`. `proposal`, if a run proposes "
-        "the frame as a look: among others `place`, `certainty`, `why`, `run`, `geometry`, `least_score`, `taken`."
+        "was: `camera`, `session`, `frame`, `file`, `operation`, `request_id`, `key`; `taken`, when the robot took "
+        "it, if it said so. `proposal`, if a run proposes "
+        "the frame as a look: among others `place`, `certainty`, `why`, `run`, `geometry`, `least_score`, `taken`. "
+        "`stretch`, if it is of a stretch of new ground."
     )
     label: ReviewLabel | None
     labelled_at: Timestamp | None

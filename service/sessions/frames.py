@@ -9,25 +9,28 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence_of, view_of
+from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, agreement, evidence_of, view_of
+from core.judgement.change import WorldChange
 from core.learning import RunFrame
 from core.maps import Map
 from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from service.access.audit import ASKER
+from service.access.roles import ANONYMOUS, Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.events.schemas import SessionEvent
 from service.http.routing import rounded
-from service.learning.run_notes import NotedFrame
+from service.learning.run_notes import NotedFrame, new_notes
 from service.places.schemas import PlaceView
 from service.queries.answers import answer_of
+from service.queries.counts import PassedBy
 from service.queries.following import follow_answer
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.parameters import QueryParameters
-from service.queries.schemas import QueryAnswer
+from service.queries.schemas import ChangeView, QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
     BeliefView,
@@ -43,6 +46,9 @@ from service.sessions.session import Session
 from service.sessions.sessions import SessionMoved, Sessions, alive_rows
 from service.worker_threads import in_thread
 
+SURELY_THERE = 0.95
+"""A run passes a place if it is this probable that the robot is there."""
+
 log = logging.getLogger("placerec.sessions")
 
 
@@ -56,6 +62,7 @@ async def process_frame(
     options: FrameParameters,
     deadline: RequestDeadline,
     request_id: str | None,
+    principal: Principal = ANONYMOUS,
 ) -> SessionAnswer:
     """Process one frame of a session, after the frames that came before it.
 
@@ -65,6 +72,7 @@ async def process_frame(
         data: the bytes of a JPEG, PNG or WebP file.
         request_id: the id that the client gave the request; a frame without a number that comes again with the same
             id is the same frame.
+        principal: who sends it.
 
     Raises:
         FrameOutOfOrder: a later frame was processed already.
@@ -80,10 +88,12 @@ async def process_frame(
         run = await in_thread(_found_run, sessions, map_, session)
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
+        session.receive(ASKER.get())
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
-        queried = QueriedFrame(session.options.camera, session.id, options.frame, _question(session, options.k))
-        single = answer_of(map_, answered.frame, answered.answer)
+        asked = _question(session, options.k)
+        queried = QueriedFrame(session.options.camera, session.id, options.frame, asked, options.timestamp)
+        single = answer_of(map_, answered.frame, answered.answer, statistics.usual(map_))
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
             while True:
@@ -100,13 +110,22 @@ async def process_frame(
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
+        if session.notable:  # it began at another service, or before a restart
+            session.notes, session.notable = new_notes(map_, session.id, principal), False
         if session.notes is not None:
             given = GivenAnswer.of(single, queried)
             await in_thread(_note, sessions, session, run, map_, data, options, answered.answer, seen, given)
     total = {"total": answer.milliseconds["total"]}
-    follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total)
+    follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total, passed=_passed(answer))
     tell_belief(engine, map_, session, answer)
     return answer
+
+
+def _passed(answer: SessionAnswer) -> PassedBy | None:
+    """The place that a robot was sure to be at with a frame that counts; None if it was not."""
+    if answer.place is None or answer.view is not None or (answer.probability or 0.0) < SURELY_THERE:
+        return None
+    return PassedBy(answer.place.id, answer.single.verdict != "recognized")
 
 
 def tell_belief(engine: Engine, map_: Map, session: Session, answer: SessionAnswer) -> None:
@@ -126,6 +145,7 @@ def tell_belief(engine: Engine, map_: Map, session: Session, answer: SessionAnsw
         lost=answer.lost,
         place=None if answer.place is None else answer.place.id,
         pose=None if answer.place is None else answer.place.pose,
+        world=None if answer.change is None else answer.change.model_dump(),
     )
     engine.events.publish(event)
 
@@ -190,6 +210,7 @@ def _advance(
         frame=options.frame,
         frames=run.frames,
         **belief_view(map_, run, found).__dict__,
+        change=_change(run, found, answered, single),
         earlier=None
         if earlier is None
         else EarlierBelief(
@@ -220,6 +241,15 @@ def _advance(
     return answer, seen
 
 
+def _change(run: Run, found: Estimate, answered: Answer, single: QueryAnswer) -> ChangeView | None:
+    """The change that a frame shows, by the run; None for one that shows hardly anything."""
+    alone = single.change
+    if alone is None or run.sight == "covered":
+        return None
+    agreed = agreement(found, int(answered.candidates.rows[0]), run.graph)
+    return ChangeView.of(WorldChange(alone.known, alone.changed, alone.new).during(found.unknown, agreed))
+
+
 def _note(
     sessions: Sessions,
     session: Session,
@@ -233,7 +263,7 @@ def _note(
 ) -> None:
     """Note a frame for what the map learns from the run; a run to which another key sends frames teaches nothing."""
     notes = session.notes
-    if notes is None or notes.robot.key != ASKER.get().key:
+    if notes is None or session.visited:
         session.notes = None
         return
     rows = answered.candidates.rows
@@ -242,7 +272,9 @@ def _note(
         seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None, options.odometry_pose(),
         run.sight,
     )  # fmt: skip
-    if not notes.add(NotedFrame(frame, data, options.timestamp, given.for_review(given.event(map_.record.id)))):
+    taken = options.timestamp or given.at
+    told = given.for_review(given.event(map_.record.id))
+    if not notes.add(NotedFrame(frame, data, taken, told)):
         log.warning("session %s teaches its map nothing: the notes of runs have no room", session.id)
         session.notes = None
     elif notes.full:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -21,18 +22,19 @@ GRAPH_REUSE = 20.0
 class _CachedGraph:
     """The graph of a map's snapshot.
 
+    snapshot: is not kept, for what was deleted from the map cannot be erased while a snapshot of before is in use.
     made: when it was finished, by the monotonic clock.
     took: how many seconds it took to build.
     """
 
-    snapshot: Snapshot
+    snapshot: weakref.ref[Snapshot]
     graph: PlaceGraph
     made: float
     took: float
 
     def serves(self, snapshot: Snapshot, now: float) -> bool:
         """Whether the graph is that of the snapshot, or recent enough to be used for it."""
-        return self.snapshot is snapshot or now - self.made < GRAPH_REUSE * self.took
+        return self.snapshot() is snapshot or now - self.made < GRAPH_REUSE * self.took
 
 
 class SessionGraphs:
@@ -58,7 +60,7 @@ class SessionGraphs:
             snapshot = scope.snapshot
             graph = place_graph(snapshot.whereabouts, scope.living_rows(), snapshot.rows, neighborhood)
             done = time.monotonic()
-            self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)
+            self._graphs[key] = _CachedGraph(weakref.ref(snapshot), graph, done, done - now)
             return graph
 
     def drop_unused(self, sessions: Iterable[Session]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
@@ -14,6 +15,7 @@ from service.errors.faults import (
     FrameOutOfOrder,
     QueueFull,
     SessionExpired,
+    SessionOfAnother,
     TooManySessions,
     UnknownSession,
     UnsupportedMediaType,
@@ -55,6 +57,7 @@ router = APIRouter(
 SessionId = Annotated[str, Path(alias="session", description="Id of the session.", examples=["s-4f2a9c01d37be586"])]
 FrameOptions = Annotated[FrameParameters, Query()]
 GONE = problem_documentation(UnknownSession, SessionExpired)
+BOUND = GONE | problem_documentation(SessionOfAnother, UnknownSession, SessionExpired)
 
 
 def _may_see_keys(principal: Principal) -> bool:
@@ -83,7 +86,7 @@ def create_session(
     if new.camera is not None:
         map_.cameras.mask(new.camera)
     session = sessions.create(map_, new)
-    session.notes = new_notes(map_, session.id, principal)
+    session.notes, session.notable = new_notes(map_, session.id, principal), False
     response.headers["Location"] = f"{engine.settings.root_path}/v1/maps/{map_id}/sessions/{session.id}"
     return session_view(session, _may_see_keys(principal))
 
@@ -113,18 +116,21 @@ async def read_session(
         return await in_thread(session_report, sessions, map_, session, _may_see_keys(principal))
 
 
-@router.delete("/{session}", status_code=204, dependencies=[WHOLE_DELETION], responses=GONE)
-async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> None:
-    """Delete a session: its run is over."""
+@router.delete("/{session}", status_code=204, dependencies=[WHOLE_DELETION], responses=BOUND)
+async def delete_session(
+    map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep, principal: PrincipalDep
+) -> None:
+    """Delete a session: its run is over. Besides the key that began it, keys of the role `admin` may."""
     map_ = await engine.map(map_id)
     session = await in_thread(sessions.find, map_, session_id)
-    await in_thread(sessions.delete, session)
+    session.require(principal, ending=True)
+    await in_thread(engine.reserve.making_room, partial(sessions.delete, session))
 
 
 @router.post(
     "/{session}/frames",
     openapi_extra=frame_body(FrameParameters),
-    responses=GONE
+    responses=BOUND
     | problem_documentation(
         errors.UnknownCamera,
         UnknownSession,
@@ -146,9 +152,10 @@ async def send_frame(
     engine: EngineDep,
     sessions: SessionsDep,
     statistics: StatisticsDep,
+    principal: PrincipalDep,
     deadline: DeadlineDep,
 ) -> SessionAnswer:
-    """Send one frame of a session, and learn where the robot is.
+    """Send one frame of a session that this key has begun, and learn where the robot is.
 
     The answer is the belief after the frame; `single` has the answer to the frame alone. A frame that is sent again,
     with the same `frame` number or, without one, with the same `X-Request-Id`, counts once and gets the same answer.
@@ -156,10 +163,13 @@ async def send_frame(
     """
     engine.queue.check_room()
     session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # fails before the body is read
+    session.require(principal)
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")
     given_id = given if REQUEST_ID.fullmatch(given) else None
-    answer = await process_frame(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
+    answer = await process_frame(
+        engine, sessions, statistics, map_, session, data, options, deadline, given_id, principal
+    )
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "session": session_id, "verdict": answer.verdict}
     return answer

@@ -12,7 +12,7 @@ from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
-from service.queries.schemas import QueryAnswer
+from service.queries.schemas import ChangeView, QueryAnswer
 
 SESSION_EXAMPLE: dict[str, Any] = {
     "id": "s-4f2a9c01d37be586",
@@ -278,6 +278,7 @@ class SessionAnswer(BeliefView):
                     "unknown": 0.01,
                     "lost": False,
                     "candidates": [{"rank": 1, "probability": 0.97, "place": PLACE_EXAMPLE}],
+                    "change": {"verdict": "changed", "known": 0.12, "changed": 0.87, "new": 0.01},
                     "earlier": None,
                     "motion": "odometry",
                     "view": None,
@@ -295,6 +296,11 @@ class SessionAnswer(BeliefView):
     session: str
     frame: int | None = Field(description="The robot's number of the frame.")
     frames: int = Field(description="How many frames the session has processed.")
+    change: ChangeView | None = Field(
+        default=None,
+        description="Whether the frame shows the map as it is, by the run: the robot may be sure of a place that the "
+        "frame alone does not show as any look of it does. Null for a covered frame, and where that of `single` is.",
+    )
     earlier: EarlierBelief | None = Field(description="With a lag, once there are enough frames.")
     motion: Motion = Field(description="How the robot's motion since the last frame was known.")
     view: Sight | None = Field(

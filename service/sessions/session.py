@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from core.belief import Run, to_bytes
 from core.maps import Map
 from core.maps.selection import Conditions, Selection
-from service.errors.faults import QueueFull
+from service.access.audit import Asker
+from service.access.roles import Principal, covers
+from service.errors.faults import QueueFull, SessionOfAnother
 from service.learning.run_notes import RunNotes
 from service.sessions.schemas import NewSession
-from service.sessions.table import SessionRecord, key_of
+from service.sessions.table import SessionRecord, is_begun_by, is_visited, key_of, visited
 
 WAITING = 8
 """The most frames of one session that may wait for their turn."""
@@ -41,7 +43,9 @@ class Session:
     restored: whether the session was restored after a restart.
     streaming: whether a WebSocket streams into the session.
     notes: what the map learns from, of the frames that this service has processed; None: it learns nothing.
+    notable: whether it is still to be decided whether this service takes notes.
     begun_by: the caller and the request that began it, as its record has them.
+    probe: finds out within some seconds whether the client of that WebSocket is there, and else ends it.
     waiting: how many frames are being processed or wait for that.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
@@ -66,7 +70,9 @@ class Session:
     restored: bool = False
     streaming: bool = False
     notes: RunNotes | None = None
+    notable: bool = True
     begun_by: str | None = None
+    probe: Callable[[float], Awaitable[bool]] | None = None
     waiting: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -80,8 +86,8 @@ class Session:
         """
         options = NewSession.model_validate_json(record.options)
         session = cls(record.id, record.map, record.map_created_at, options, record.expires_after, record.created)
-        session.read_fields(record)
         session.begun_by = record.begun_by
+        session.read_fields(record)
         session.idle_since = time.monotonic() - max(0.0, record.idle)
         return session
 
@@ -90,6 +96,21 @@ class Session:
         self.used, self.revision, self.recorded = record.used, record.revision, record.revision
         self.number, self.moment, self.request = record.number, record.moment, record.request
         self.lost, self.frames, self.answer = record.lost, record.frames, record.answer
+        self._see_visitors(record)
+
+    def _see_visitors(self, record: SessionRecord) -> None:
+        if not self.visited:  # which may not be saved yet
+            self.begun_by = record.begun_by
+
+    @property
+    def visited(self) -> bool:
+        """Whether another key than the one that began the session has sent a frame into it, to any service."""
+        return is_visited(self.begun_by)
+
+    def receive(self, asker: Asker) -> None:
+        """Note who sends a frame."""
+        if not self.visited and not is_begun_by(self.begun_by, asker):
+            self.begun_by = visited(self.begun_by)
 
     def record(self) -> SessionRecord:
         """The session as it is saved."""
@@ -113,6 +134,7 @@ class Session:
     def see(self, head: SessionRecord) -> None:
         """Note the revision of the record, and when the last frame came."""
         self.used, self.recorded = head.used, max(self.recorded, head.revision)
+        self._see_visitors(head)
         self.idle_since = max(self.idle_since, time.monotonic() - max(0.0, head.idle))
 
     @property
@@ -144,6 +166,23 @@ class Session:
     def touch(self) -> None:
         """Note that a frame has come now."""
         self.used, self.idle_since = time.time(), time.monotonic()
+
+    def require(self, principal: Principal, ending: bool = False) -> None:
+        """Refuse callers with another key than the one that began the session.
+
+        A key that takes the place of a revoked one under the same name counts as the same.  A session that was begun
+        while there were no keys is anybody's.
+
+        Args:
+            ending: whether the session is to end, which keys of the role ``admin`` may have as well.
+
+        Raises:
+            SessionOfAnother: the session is not the caller's.
+        """
+        if self.key is None or principal.key_id is None or principal.name == self.key:
+            return
+        if not (ending and covers(principal.role, "admin")):
+            raise SessionOfAnother(f"The session {self.id} was begun with another key; begin one of your own.")
 
     @property
     def selection(self) -> Selection | None:

@@ -38,12 +38,13 @@ from service.peers.peers import Peers
 from service.sessions.graphs import SessionGraphs
 from service.sessions.schemas import NewSession
 from service.sessions.session import Session, creation_time
-from service.sessions.table import SessionRecord, SessionTable, begun_by, caller_of
+from service.sessions.table import SessionRecord, SessionTable, begun_by, caller_of, is_visited
 from service.settings import Settings
 
 EXPIRED = "No frame came for too long."
 MAP_GONE = "Its map was deleted; the map of that id is another one now."
 STATE_LOST = "Its saved belief was damaged on disk."
+DELETED = "It was deleted."
 GAVE_WAY = "Its room was needed for others, and it had waited longest for a frame."
 
 REFUSALS = (StorageFull, StorageFailure, Damage)
@@ -170,8 +171,20 @@ class Sessions:
             self._graphs.drop_unused(self._held.values())
         if held is not None and held.notes is not None:
             notes, held.notes = held.notes, None
-            self.on_run(held, notes)
+            if self._is_of_one_key(held):
+                self.on_run(held, notes)
         return held is not None
+
+    def _is_of_one_key(self, session: Session) -> bool:
+        """Whether no other key has sent a frame into a session that is over, to any service."""
+        if session.visited or self._alone:
+            return not session.visited
+        try:
+            head = self._table.head(session.id)
+        except REFUSALS as error:
+            log.warning("session %s teaches its map nothing: %s", session.id, error)
+            return False
+        return head is None or not is_visited(head.begun_by)
 
     def _begun_before(self, map_: Map, session: Session) -> Session | None:
         """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
@@ -212,6 +225,8 @@ class Sessions:
             self._let_go(session_id)
         if head is None or head.map != map_.record.id:
             raise _unknown(session_id)
+        if head.ended == DELETED:
+            raise _unknown(session_id)
         if head.ended is not None:
             raise _ended(session_id, head.ended)
         session = self._held.get(session_id) or self._session_of(head)
@@ -232,25 +247,64 @@ class Sessions:
             held = list(self._held.values())
         return sorted((one for one in held if one.is_about(map_)), key=lambda one: one.id)
 
+    def all(self) -> list[Session]:
+        """The sessions of all maps that have not ended, in the order of their ids."""
+        if not self._alone:
+            found = (self._session_of(record) for record in self._table.living())
+            return [session for session in found if session is not None and not session.over]
+        self._end_expired()
+        with self._lock:
+            return sorted(self._held.values(), key=lambda one: one.id)
+
     def count(self) -> int:
         """The number of sessions of all maps that have not ended; those of other services a few seconds ago."""
         return len(self._held) if self._alone else self._counted
 
     def delete(self, session: Session) -> None:
         """Delete a session; later it counts as unknown."""
-        self._table.forget(session.id)
+        if session.visited and not self._alone:
+            self._table.end(session.id, DELETED)  # for the services that have notes of it
+        else:
+            self._table.forget(session.id)
         self._let_go(session.id)
-        self._tell(session, "ended", "It was deleted.")
+        self._tell(session, "ended", DELETED)
+
+    def erase(self, session: Session) -> None:
+        """Delete a session, and have its map learn nothing from the notes that this service has of it."""
+        session.notes = None
+        self.delete(session)
+
+    def forget_notes(self, map_: Map, going: Callable[[RunNotes], bool]) -> None:
+        """Drop notes of the runs through a map that go on at this service; these runs teach nothing from now on."""
+        with self._lock:
+            held = [one for one in self._held.values() if one.is_about(map_)]
+        for session in held:
+            if (notes := session.notes) is not None and going(notes):
+                session.notes = None
+
+    def forget(self, session_id: str) -> None:
+        """Delete what is remembered of a session that has ended, once this service has let go of it."""
+        self._let_go(session_id)  # before: what is remembered says whether the run may teach
+        self._table.forget(session_id)
 
     def tidy(self) -> None:
         """End the sessions of all services that have expired, and let go of those that this one holds in vain."""
         for record in self._table.end_expired(EXPIRED):
             if (session := self._session_of(record)) is not None:
                 self._tell(session, "ended", EXPIRED)
-        for session in self._expired():
+        for session in [*self._expired(), *self._ended_elsewhere()]:
             if not session.streaming:
                 self._let_go(session.id)
         self._counted = self._table.count()
+
+    def _ended_elsewhere(self) -> list[Session]:
+        """The sessions of which this service has notes, and that another service has ended."""
+        with self._lock:
+            noted = [one for one in self._held.values() if one.notes is not None]
+        if not noted or self._alone:
+            return []
+        living = {record.id for record in self._table.living()}
+        return [one for one in noted if one.id not in living]
 
     def _end_expired(self) -> None:
         """End the sessions that have expired; where services share them, :meth:`tidy` does that."""

@@ -17,10 +17,12 @@ from fastapi import APIRouter, WebSocket
 from starlette.datastructures import State
 from starlette.requests import Request
 from starlette.responses import Response
+from starlette.types import Message
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from core.errors import PlacerecError
 from core.places import check_map_id
+from service.access.roles import Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import (
@@ -38,8 +40,10 @@ from service.errors.faults import (
 )
 from service.errors.problems import Problem, problem_of, problem_response
 from service.http.bodies import parse_json
+from service.http.event_stream import CHECK_SECONDS
 from service.http.schemas import validated
 from service.http.uploads import check_frame
+from service.http.websocket_connection import PROBE
 from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters
 from service.sessions.session import Session
@@ -49,6 +53,9 @@ from service.worker_threads import in_thread
 router = APIRouter()
 
 POLICY_VIOLATION = 1008
+
+PROBE_SECONDS = 2.0
+"""The client of a stream answers a ping within this time, or another connection may take the session over."""
 
 
 @router.websocket("/v1/maps/{map}/sessions/{session}/stream")
@@ -61,18 +68,51 @@ async def stream_frames(socket: WebSocket) -> None:
         map_id, session_id = check_map_id(socket.path_params["map"]), socket.path_params["session"]
         map_ = await engine.map(map_id)
         session = await in_thread(sessions.find, map_, session_id)
-        if session.streaming:
+        session.require(socket.scope["state"]["principal"])
+        if session.streaming and not await _is_lost(session):
             raise StreamTaken("Another connection streams into this session; close that one first.")
     except (Fault, PlacerecError) as error:
         await socket.send_denial_response(_denial(socket, error))
         return
-    session.streaming = True
+    session.streaming, session.probe = True, socket.scope.get("extensions", {}).get(PROBE)
     try:
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
             await _serve(socket.app.state, map_id, session, socket)
     finally:
-        session.streaming = False
+        session.streaming, session.probe = False, None
+
+
+async def _is_lost(session: Session) -> bool:
+    """Whether the connection that streams into a session has lost its client; it is ended then."""
+    if session.probe is None or await session.probe(PROBE_SECONDS):
+        return False
+    until = time.monotonic() + PROBE_SECONDS
+    while session.streaming and time.monotonic() < until:
+        await asyncio.sleep(0.01)
+    return not session.streaming
+
+
+async def _received(socket: WebSocket, seconds: float) -> Message:
+    """The next message; the caller's key is looked at while none comes.
+
+    Raises:
+        TimeoutError: none came within some seconds.
+        Fault: the key is not valid any more.
+    """
+    waiting = asyncio.ensure_future(socket.receive())
+    until = time.monotonic() + seconds
+    try:
+        while True:
+            left = until - time.monotonic()
+            await asyncio.wait({waiting}, timeout=min(max(left, 0), CHECK_SECONDS))
+            if waiting.done():
+                return waiting.result()
+            if left <= 0:
+                raise TimeoutError
+            socket.app.state.gate.identify(socket.scope)
+    finally:
+        waiting.cancel()
 
 
 async def _serve(state: State, map_id: str, session: Session, socket: WebSocket) -> None:
@@ -80,10 +120,13 @@ async def _serve(state: State, map_id: str, session: Session, socket: WebSocket)
     refused = False  # whether the parameters of the next frame were refused
     while True:
         try:
-            async with asyncio.timeout(session.expires_after):
-                message = await socket.receive()
+            message = await _received(socket, session.expires_after)
         except TimeoutError:
             await socket.close(POLICY_VIOLATION, "No frame came for too long.")
+            return
+        except Fault as error:
+            await _send_problem(socket, error)
+            await socket.close(POLICY_VIOLATION, "The key is not valid any more.")
             return
         if message["type"] != "websocket.receive":
             return
@@ -99,7 +142,8 @@ async def _serve(state: State, map_id: str, session: Session, socket: WebSocket)
                 refused = False
                 continue
             await socket.app.state.gate.turn(socket.scope)
-            answer = await _answer(state, map_id, session, message["bytes"], given or {})
+            principal: Principal = socket.scope["state"]["principal"]
+            answer = await _answer(state, map_id, session, message["bytes"], given or {}, principal)
         except (Fault, PlacerecError) as error:
             await _send_problem(socket, error)
             if isinstance(error, UnknownSession | SessionExpired):
@@ -113,7 +157,9 @@ async def _serve(state: State, map_id: str, session: Session, socket: WebSocket)
             await socket.send_text(answer)
 
 
-async def _answer(state: State, map_id: str, session: Session, data: bytes, given: dict[str, Any]) -> str:
+async def _answer(
+    state: State, map_id: str, session: Session, data: bytes, given: dict[str, Any], principal: Principal
+) -> str:
     options, engine = validated(FrameParameters, given), state.engine
     if len(data) > engine.settings.max_image_bytes:
         raise BodyTooLarge(f"The frame has more than {engine.settings.max_image_bytes} bytes.")
@@ -121,7 +167,8 @@ async def _answer(state: State, map_id: str, session: Session, data: bytes, give
     map_ = await engine.map(map_id)
     await in_thread(state.sessions.find, map_, session.id)
     deadline = RequestDeadline(time.monotonic() + engine.settings.request_timeout, _never)
-    answer = await process_frame(engine, state.sessions, state.statistics, map_, session, data, options, deadline, None)
+    parts = engine, state.sessions, state.statistics
+    answer = await process_frame(*parts, map_, session, data, options, deadline, None, principal)
     return answer.model_dump_json()
 
 

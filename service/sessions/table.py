@@ -69,7 +69,8 @@ class SessionRecord:
     ended: why the session has ended; None if it has not.
     state: the belief, as ``core.belief.record`` writes it; None where it is not read.
     answer: the last answer, JSON; None where it is not read.
-    begun_by: the caller and the request that began it, from :func:`begun_by`; None if unknown.
+    begun_by: the caller and the request that began it, from :func:`begun_by`, and whether another key has sent frames
+        since; None if unknown.
     """
 
     id: str
@@ -95,6 +96,28 @@ class SessionRecord:
 def begun_by(asker: Asker) -> str:
     """The caller, the id of the request that begins a session, and the name of the key, as JSON."""
     return json.dumps([asker.caller, asker.request_id, asker.principal if asker.key is not None else None])
+
+
+def visited(begun_by: str | None) -> str:
+    """The value of :func:`begun_by` for a session to which another key has sent a frame."""
+    try:
+        caller, request, key, *_ = json.loads(begun_by or "")
+    except (ValueError, TypeError):
+        caller = request = key = None
+    return json.dumps([caller, request, key, True])
+
+
+def is_visited(begun_by: str | None) -> bool:
+    """Whether another key has sent a frame into a session, or it is not known with which it was begun."""
+    try:
+        return bool(json.loads(begun_by or "")[3:])
+    except (ValueError, TypeError):
+        return True
+
+
+def is_begun_by(begun_by: str | None, asker: Asker) -> bool:
+    """Whether a caller has the key with which a session was begun, or neither has any."""
+    return asker.key == (None if key_of(begun_by) is None else caller_of(begun_by))
 
 
 def caller_of(begun_by: str | None) -> str:
@@ -197,13 +220,11 @@ _BEGUN = Statement(
         _C.used > seconds_now() - REPEATED_SECONDS,
     )
 )
+_OF_FRAMES = ("number", "moment", "request", "lost", "frames", "state", "answer", "begun_by")
 _RENEW = Statement(
     update(_TABLE)
     .where(_NAMED, _LIVES, _C.revision == bindparam("known"))
-    .values(
-        {name: bindparam(name) for name in ("number", "moment", "request", "lost", "frames", "state", "answer")}
-        | {"used": seconds_now(), "revision": _C.revision + 1}
-    )
+    .values({name: bindparam(name) for name in _OF_FRAMES} | {"used": seconds_now(), "revision": _C.revision + 1})
 )
 _BY_USE = Statement(select(*_HEAD).where(_IN_TIME).order_by(_C.used.desc(), _C.id))
 _END = Statement(update(_TABLE).where(_NAMED, _LIVES).values(_ENDING))

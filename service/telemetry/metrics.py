@@ -11,12 +11,23 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from core.judgement.verdict import Verdict
+from service.telemetry.history import LoadHistory
 from service.telemetry.latencies import RecentLatencies
 
 FAST = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5)
 SECONDS = (*FAST, 5.0, 10.0, 30.0)
 SCORES = tuple(round(0.05 * step, 2) for step in range(-2, 21))
 ITEMS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+
+
+MOST_MAPS = 100
+"""Maps that have series of their own; the others are counted together."""
+
+MOST_REQUEST_SERIES = 200
+"""Routes, methods and statuses that have a series of their own; the others are counted by their status alone."""
+
+OTHERS = "_others"
+"""The label of what is counted together; no map and no route is called so."""
 
 
 class MapCollector(Collector):
@@ -32,8 +43,11 @@ class MapCollector(Collector):
 
     def collect(self) -> Iterable[Metric]:
         places = GaugeMetricFamily("placerec_map_places", "Places of a map.", labels=["map"])
-        for name, count in self._count_places().items():
+        counts = sorted(self._count_places().items(), key=lambda one: (-one[1], one[0]))
+        for name, count in counts[:MOST_MAPS]:
             places.add_metric([name], count)
+        if len(counts) > MOST_MAPS:
+            places.add_metric([OTHERS], sum(count for _, count in counts[MOST_MAPS:]))
         yield places
         quarantined = GaugeMetricFamily("placerec_quarantined_maps", "Maps that are damaged and out of service.")
         quarantined.add_metric([], self._count_quarantined())
@@ -46,10 +60,12 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry(auto_describe=False)
         self._requests: dict[tuple[str, str, int], Histogram] = {}
+        self._maps: set[str] = set()  # with series of their own
         self._stages: dict[str, Histogram] = {}
         self._verdicts: dict[tuple[str, str], Counter] = {}
         self._scores: dict[str, Histogram] = {}
         self.latencies = RecentLatencies()
+        self.history: LoadHistory | None = None
         ProcessCollector(registry=self.registry)
         self.requests = Histogram(
             "placerec_request_seconds",
@@ -97,12 +113,19 @@ class Metrics:
             "placerec_verdicts", "Queries by their verdict.", ["map", "verdict"], registry=self.registry
         )
 
-    def observe_request(self, route: str, method: str, status: int, seconds: float) -> None:
-        """Count a request and its duration."""
-        self.latencies.observe(method, route, status, seconds)
+    def observe_request(
+        self, route: str, method: str, status: int, seconds: float, *, by_console: bool = False
+    ) -> None:
+        """Count a request and its duration; those of the console itself are not what its operator asks after."""
+        if not by_console:
+            self.latencies.observe(method, route, status, seconds)
+            if self.history is not None:
+                self.history.observe_request(route, status, seconds)
         key = (route, method, status)
+        if key not in self._requests and len(self._requests) >= MOST_REQUEST_SERIES:
+            key = (OTHERS, OTHERS, status)
         if key not in self._requests:  # looking up a series costs more than counting in it
-            self._requests[key] = self.requests.labels(route, method, str(status))
+            self._requests[key] = self.requests.labels(key[0], key[1], str(status))
         self._requests[key].observe(seconds)
 
     def requests_under_way(self) -> float:
@@ -118,6 +141,13 @@ class Metrics:
 
     def observe_answer(self, map_id: str, verdict: str, score: float | None) -> None:
         """Count the answer to a query."""
+        if self.history is not None:
+            self.history.observe_answer(verdict)
+        if map_id not in self._maps:
+            if len(self._maps) < MOST_MAPS:
+                self._maps.add(map_id)
+            else:
+                map_id = OTHERS
         key = (map_id, verdict)
         if key not in self._verdicts:
             self._verdicts[key] = self.verdicts.labels(map_id, verdict)
@@ -129,6 +159,7 @@ class Metrics:
 
     def forget_map(self, map_id: str) -> None:
         """Drop the series of a deleted map."""
+        self._maps.discard(map_id)
         self._scores.pop(map_id, None)
         with suppress(KeyError):
             self.scores.remove(map_id)

@@ -94,6 +94,9 @@ UNMATCHED = "(none)"
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}
 
+CONSOLE = b"x-placerec-console"
+"""The header by which the console marks its requests, which the latencies that it shows leave out."""
+
 LONGEST_PATH = 300
 LONGEST_TEXT, LONGEST_TRACEBACK = 4096, 32_768
 """Most characters of one value in a log line, so that no request makes a line of megabytes."""
@@ -260,7 +263,9 @@ class Telemetry:
         state = scope["state"]
         route = getattr(scope.get("route"), "path", UNMATCHED)
         counted = method if method in METHODS else "OTHER"
-        self.metrics.observe_request(route, counted, status, time.monotonic() - state["started"])
+        by_console = any(name == CONSOLE for name, _ in scope["headers"])
+        seconds = time.monotonic() - state["started"]
+        self.metrics.observe_request(route, counted, status, seconds, by_console=by_console)
         if "problem" in state:
             self.metrics.problems.labels(state["problem"]).inc()
         self._log("request", scope, method, status, {"bytes_in": state.get("bytes_in", 0), "bytes_out": sent})

@@ -24,6 +24,8 @@ from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames
 from service.errors.problems import problem_of
 from service.jobs.context import JobContext, yield_to_requests
+from service.maps.self_calibration import calibrate_by_traverse
+from service.queries.statistics import QueryStatistics
 
 KIND = "align"
 
@@ -33,15 +35,17 @@ MOST_LISTED = 200
 Rows = NDArray[np.int64]
 
 
-def align(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Find what the traverse shares with others, and store it unless ``dry_run`` is set.
+def align(engine: Engine, statistics: QueryStatistics, context: JobContext) -> Mapping[str, Any]:
+    """Find what the traverse shares with others, and store it unless ``dry_run`` is set; the map then calibrates itself
+    by it.
 
     Raises:
         UnknownMap, UnknownSequence, TooFewFrames, UnknownPlace, StorageFull, StorageFailure: the map is what it was.
         JobCancelled, JobInterrupted.
     """
     options = context.arguments
-    return align_sequence(engine, context, options["sequence"], options["with"], options["poses"], options["dry_run"])
+    told = align_sequence(engine, context, options["sequence"], options["with"], options["poses"], options["dry_run"])
+    return _calibrated(engine, statistics, context, told)
 
 
 def align_sequence(
@@ -89,10 +93,13 @@ def align_sequence(
     return _report(traverses, sequence, first, found, change) | {"compared": total, "stored": not dry_run}
 
 
-def align_enrolled(engine: Engine, context: JobContext, sequences: Sequence[str]) -> list[dict[str, Any]]:
+def align_enrolled(
+    statistics: QueryStatistics, engine: Engine, context: JobContext, sequences: Sequence[str]
+) -> list[dict[str, Any]]:
     """Align traverses that the job has enrolled with all others of its map; a report for each.
 
-    Instead of the report of a traverse that is too short, or gone by now, there is the problem.
+    Instead of the report of a traverse that is too short, or gone by now, there is the problem.  By the traverse that
+    shares most the map then calibrates itself.
 
     Raises:
         As :func:`align`, without UnknownSequence and TooFewFrames.
@@ -103,7 +110,20 @@ def align_enrolled(engine: Engine, context: JobContext, sequences: Sequence[str]
             reports.append(align_sequence(engine, context, sequence))
         except (UnknownSequence, TooFewFrames) as error:
             reports.append({"sequence": sequence, "problem": problem_of(error).model_dump(exclude_none=True)})
+    most = max(range(len(reports)), key=lambda number: reports[number].get("paired", 0), default=None)
+    if most is not None:
+        reports[most] = _calibrated(engine, statistics, context, reports[most])
     return reports
+
+
+def _calibrated(
+    engine: Engine, statistics: QueryStatistics, context: JobContext, told: dict[str, Any]
+) -> dict[str, Any]:
+    """The report of a traverse, with what became of the calibration if something that it shares was stored."""
+    if not told.get("paired") or not told["stored"]:
+        return told
+    found = calibrate_by_traverse(engine, statistics, context, told["sequence"])
+    return told if found is None else told | {"calibration": found}
 
 
 def check_request(map_: Map, sequence: str, others: Sequence[str] | None) -> None:

@@ -37,6 +37,7 @@ from service.upkeep.schemas import (
     SilentPlaces,
     StopView,
     StretchView,
+    TrendsView,
     TrendView,
     WeekView,
 )
@@ -82,12 +83,15 @@ class _Aliasing:
     routes: list[SharedRoute]
 
 
-def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds: float, limit: int) -> MapHealth:
+def examine_health(
+    map_: Map, encoder: Encoder, statistics: Statistics, trends: TrendsView, seconds: float, limit: int
+) -> MapHealth:
     """Make the health report of a map.
 
     Args:
         encoder: the map's encoder.
         statistics: the counted answers of the map.
+        trends: what the histories of its places tell.
         seconds: how long to examine the map's frames; of a large map only a part is examined, spread over the map.
         limit: how many places, gaps and stretches are listed at most, each.
 
@@ -138,6 +142,7 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         stop_count=len(stopped),
         retraverse=again[:limit],
         retraverse_count=len(again),
+        trends=trends,
         shared_routes=_shared_routes(own, aliasing),
     )
 

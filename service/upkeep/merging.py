@@ -46,6 +46,7 @@ class MergePlan:
 
     coming: the places and looks of the other map that are copied, each with its id in this map.
     known: how many places this map has already, with the same frame.
+    frames: the digests of the frames of the places that are in both maps, or will be, by their ids in this map.
     skipped: ids of places that are not copied, because the id belongs to another frame here.
     renamed: how many places get another id.
     sequences, cameras: the new names of sequences and cameras of the other map, by their names there.
@@ -54,6 +55,7 @@ class MergePlan:
 
     coming: Sequence[tuple[Outline, str]]
     known: int
+    frames: Mapping[str, bytes]
     skipped: Sequence[str]
     renamed: int
     sequences: Mapping[str, str]
@@ -127,6 +129,7 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
     skipped, conflicts, known, renamed = [], [], 0, 0
     clashing: list[str] = []
     unnamed: list[Outline] = []  # places that should be copied, but have no free id
+    frames: dict[str, bytes] = {}
     called: dict[str, str] = {}  # the ids here of the places that are, or will be, in both maps
     for place in other.transfer.outline(looks=True):
         if place.is_look:
@@ -156,6 +159,8 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
         else:
             clashing.append(place.id)
             unnamed.append(place)
+        if place.id in called:
+            frames[called[place.id]] = place.digest
     if clashing:
         conflicts.append(f"{len(clashing)} ids belong to other frames here: {_listed(clashing)}.")
     given = {name for _, name in coming}
@@ -163,7 +168,7 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
         conflicts.append(f"{len(coming) - len(given)} places would get the id of another place; choose another prefix.")
     wanted = [place for place, _ in coming] + unnamed
     sequences, cameras = _new_names(map_, other, options, before, wanted, conflicts)
-    return MergePlan(coming, known, skipped, renamed, sequences, cameras, conflicts)
+    return MergePlan(coming, known, frames, skipped, renamed, sequences, cameras, conflicts)
 
 
 def _new_names(
@@ -249,7 +254,7 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         cameras = _new_cameras(map_, other, plan)
         context.remember(after=after, report=report, cameras=cameras, coming=coming)
     try:
-        _copy_places(engine, context, map_, other)
+        refused = _copy_places(engine, context, map_, other)
     except JobInterrupted:
         raise
     except BaseException as error:
@@ -257,7 +262,8 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
             _remove_copies(context, map_, other, error)
         raise
     tell_change(engine, map_, "created", context.notes["report"]["coming"])
-    return dict(context.notes["report"]) | {"places": map_.count_places()}
+    looks = context.notes["report"]["looks"] - refused
+    return dict(context.notes["report"]) | {"looks": looks, "places": map_.count_places()}
 
 
 def _new_cameras(map_: Map, other: Map, plan: MergePlan) -> list[str]:
@@ -271,14 +277,19 @@ def _places_before(context: JobContext, map_: Map) -> list[Outline]:
     return [place for place in map_.transfer.outline(looks=True) if place.number <= context.notes["after"]]
 
 
-def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
-    """Copy the places that are missing, then those that changed in the other map meanwhile, and their stations."""
+def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> int:
+    """Copy the places that are missing, then those that changed in the other map meanwhile, and their stations.
+
+    Returns:
+        How many looks were left out, because their places are gone here, or cannot have them.
+    """
+    refused: set[str] = set()
     for _ in range(ROUNDS):
         context.check_cancelled()
         here = {place.id: place.digest for place in map_.transfer.outline(looks=True)}
         plan = plan_merge(map_, other, context.arguments, _places_before(context, map_))
         coming = [(place, name) for place, name in plan.coming if name in context.notes["coming"]]
-        due = [(place, name) for place, name in coming if here.get(name) != place.digest]
+        due = [(place, name) for place, name in coming if here.get(name) != place.digest and name not in refused]
         if not due:
             break
         names = context.notes["report"]["renamed"]
@@ -291,20 +302,33 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
             yield_to_requests(engine, context)
             # No place may be enrolled under one of the ids between this check and the commit.
             with engine.writing(map_.record.id):
-                free = _still_free(context, map_, due[first : first + PLACES_PER_COMMIT])
-                _copy(context, map_, other, snapshot, free)
+                free = _still_free(context, map_, plan, due[first : first + PLACES_PER_COMMIT], refused)
+                refused.update(_copy(context, map_, other, snapshot, free))
             context.progress(len(coming) - len(due) + min(first + PLACES_PER_COMMIT, len(due)), len(coming))
     map_.counterparts.copy(other.counterparts, {place.id: name for place, name in coming})
+    return len(refused)
 
 
-def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str]]) -> list[tuple[Outline, str]]:
-    """Those of the places whose ids nobody has given to another frame since the merge began.
+def _still_free(
+    context: JobContext, map_: Map, plan: MergePlan, due: Sequence[tuple[Outline, str]], refused: set[str]
+) -> list[tuple[Outline, str]]:
+    """Those of the places whose ids nobody has given to another frame since the merge began, with their looks.
+
+    Args:
+        refused: gets the looks of other places.
 
     Raises:
         MergeConflict: an id was given to another frame, and the request does not say to skip such places.
     """
     free: list[tuple[Outline, str]] = []
     for place, name in due:
+        if place.is_look:
+            of = place_and_look(name)[0]
+            if map_.digest(of) in (None, plan.frames[of]):  # it may come with its place
+                free.append((place, name))
+            else:
+                refused.add(name)
+            continue
         digest = map_.digest(name)
         if digest is None or digest.hex() == context.notes["coming"][name]:
             free.append((place, name))
@@ -313,8 +337,10 @@ def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str
     return free
 
 
-def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
-    """Copy some places in one commit; nobody else may enrol meanwhile.
+def _copy(
+    context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]
+) -> list[str]:
+    """Copy some places in one commit; nobody else may enrol meanwhile.  Returns the looks that were left out.
 
     The first commit that copies a place of a sequence keeps as many positions at its end here as the sequence has
     there, so that what is enrolled between the commits is at other positions.  If the job is interrupted before it has
@@ -361,9 +387,10 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             stored.picture, ordinal if ordinal < behind else None, stored.created_at, stored.updated_at, behind
         )
         items.append((item, history))
-    map_.transfer.adopt(items)
+    refused = map_.transfer.adopt(items)
     if ranges != context.notes.get("ranges"):
         context.remember(ranges=ranges)
+    return refused
 
 
 def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: BaseException) -> None:

@@ -119,23 +119,34 @@ class _Reencoding:
             return self._publish()
 
     def _differences(self) -> tuple[list[Outline], dict[str, Outline], dict[str, bytes]]:
-        """The places to copy, the places of the new map by id, and the digests of those to remove by id."""
-        ours, theirs = self.source.transfer.outline(looks=True), self._outline_of_made()
-        ids = {place.id for place in ours}
-        due = [place for place in ours if not (self._is_left_out(place) or _is_same(place, theirs.get(place.id)))]
-        gone = {place.id: place.digest for place in theirs.values() if place.id not in ids}
-        self.context.progress(len(ours) - len(due), len(ours))
+        """The places to copy, the places of the new map by id, and the digests of those to remove by id.
+
+        What is to be encoded again is both: a place with another frame or camera now, which takes its looks along.
+        """
+        listed, theirs = self.source.transfer.outline(looks=True), self._outline_of_made()
+        ours = {place.id: place for place in listed}
+        self.left_out = {
+            name: (place, why)
+            for name, (place, why) in self.left_out.items()
+            if name in ours and place.same_frame(ours[name])
+        }
+        changed = {place.id for place in listed if place.id in theirs and not place.same_frame(theirs[place.id])}
+        stale = {place.id for place in listed if place.id in theirs and (place.id in changed or _of(place) in changed)}
+        due = [
+            place
+            for place in listed
+            if not self._is_left_out(place) and (place.id in stale or not _is_same(place, theirs.get(place.id)))
+        ]
+        gone = {place.id: place.digest for place in theirs.values() if place.id in stale or place.id not in ours}
+        self.context.progress(len(listed) - len(due), len(listed))
         return due, theirs, gone
 
     def _outline_of_made(self) -> dict[str, Outline]:
         return {place.id: place for place in self.made.transfer.outline(looks=True)}
 
     def _is_left_out(self, place: Outline) -> bool:
-        """Whether the place was left out, or it is a look of a place that was."""
-        known = self.left_out.get(place.id)
-        if known is not None and known[0].same_frame(place):
-            return True
-        return place.is_look and place_and_look(place.id)[0] in self.left_out
+        """Whether the place was left out with the frame that it has, or it is a look of a place that was."""
+        return place.id in self.left_out or _of(place) in self.left_out
 
     def _is_up_to_date(self) -> bool:
         due, _, gone = self._differences()
@@ -146,19 +157,20 @@ class _Reencoding:
         due, theirs, gone = self._differences()
         if missing := sum(place.picture != "image" for place in due):
             raise ImagesMissing(f"{missing} places of the map {self.source.record.id} no longer keep an image.")
-        # A place that has another frame or camera now is encoded again.
-        stale = {p.id: theirs[p.id].digest for p in due if p.id in theirs and not p.same_frame(theirs[p.id])}
-        self.made.transfer.forget({**gone, **stale})
+        self.made.transfer.forget(gone)
         total = len(theirs) + len(due)
         for first in range(0, len(due), PLACES_PER_COMMIT):
             self.context.check_cancelled()
             chunk = [place for place in due[first : first + PLACES_PER_COMMIT] if not self._is_left_out(place)]
-            known = [place for place in chunk if place.id in theirs and place.id not in stale]
+            known = [place for place in chunk if place.id in theirs and place.id not in gone]
             self._copy([place for place in chunk if place not in known], known)
             self.context.progress(min(total - len(due) + first + PLACES_PER_COMMIT, total), total)
 
     def _copy(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
-        """Copy places in one commit: encode the frames of new ones, update the fields and order of known ones."""
+        """Copy places in one commit: encode the frames of new ones, update the fields and order of known ones.
+
+        A look whose place is not in the new map, as it was changed since it was listed, is left to the next round.
+        """
         images = {place.id: self.source.picture(place.id) for place in new}
         # This is read after the images: if a place still has its row, its image is that of the same frame.  Places
         # that were changed or forgotten since they were listed are left to the next round.
@@ -170,6 +182,8 @@ class _Reencoding:
         outcomes = encode_after_requests(self.engine, self.context, self.identity, frames, masks) if ready else []
         items: list[tuple[Enrolment, History]] = []
         for place, image, found, outcome in zip(ready, frames, keypoints, outcomes, strict=True):
+            if self._is_left_out(place):  # its place was, a moment ago
+                continue
             try:
                 if isinstance(outcome, Exception):
                     raise outcome
@@ -227,6 +241,11 @@ class _Reencoding:
         self.context.remember(result=result, made=creation_time(self.made))
         self.engine.maps.publish(self.target)
         return result
+
+
+def _of(place: Outline) -> str:
+    """The id of a place, or of the place of a look."""
+    return place_and_look(place.id)[0]
 
 
 def _is_same(place: Outline, other: Outline | None) -> bool:

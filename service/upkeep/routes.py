@@ -33,10 +33,12 @@ from service.jobs.schemas import JobView
 from service.maps import storage_jobs
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
-from service.queries.statistics import map_key
-from service.upkeep import alignment, keypoints, merging, pruning, reencoding
+from service.queries.counts import Statistics
+from service.queries.statistics import QueryStatistics, map_key
+from service.upkeep import alignment, erasure, keypoints, merging, pruning, reencoding
 from service.upkeep.health import examine_health
-from service.upkeep.schemas import Aligning, MapHealth, Merging, Pruning, Reencoding
+from service.upkeep.schemas import Aligning, Erasing, MapHealth, Merging, Pruning, Reencoding, TrendsView
+from service.upkeep.trends import trends_of, trends_view
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -110,6 +112,24 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.maps.get(map_id))
 
 
+@router.post(
+    "/erase", status_code=202, dependencies=[Depends(json_body)], responses=problem_documentation(*JOB_PROBLEMS)
+)
+def erase_frames(map_id: MapId, order: Erasing, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
+    """Erase frames for good: places, what was stored of them, and what they have left in files.
+
+    The job deletes the places and looks, the frames for review and the latest answers that are about them, and
+    overwrites or removes their pictures, descriptors, keypoints and codes, so that no file of the map has them any
+    more. It ends the session that is named, whose run teaches the map nothing. It waits for exports and checks that
+    read the map; writes to the map wait for parts of it. An empty order erases what places that were deleted before
+    have left. Bags that wait to be enrolled are named in the result, and removed if the order says so.
+    """
+    if order.filter is not None:
+        order.filter.wanted()
+    arguments = order.model_dump(mode="json")
+    return submit(engine, jobs, response, erasure.KIND, arguments, engine.maps.get(map_id))
+
+
 @router.post("/keypoints", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
 def fill_keypoints(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
     """Find the keypoints of the places that have none, such as those enrolled before the map stored keypoints.
@@ -130,15 +150,23 @@ async def check_health(
 ) -> MapHealth:
     """Report the health of a map, and which stretches of it should be recorded again.
 
-    The report lists places that never match, places that match too often, gaps in each sequence, and how the answers
-    changed from week to week. Answers are counted in memory and saved from time to time: a crash loses the last
-    counts.
+    The report lists places that never match, places that match too often, gaps in each sequence, how the answers
+    changed from week to week, and which places get worse or have changed. Answers are counted in memory and saved from
+    time to time: a crash loses the last counts.
     """
     map_ = await engine.map(map_id)
     encoder = await engine.queue.load(map_.record.encoder)
-    counted = await in_thread(statistics.read, map_key(map_))
-    examine = partial(examine_health, map_, encoder, counted, options.seconds, options.limit)
+    counted, trends = await in_thread(_counted, map_, statistics, options.limit)
+    examine = partial(examine_health, map_, encoder, counted, trends, options.seconds, options.limit)
     return await to_thread.run_sync(examine, limiter=one_at_a_time)
+
+
+def _counted(map_: Map, statistics: QueryStatistics, limit: int) -> tuple[Statistics, TrendsView]:
+    """The counted answers of a map, and what they tell of its places over time."""
+    key = map_key(map_)
+    counted = statistics.read(key)
+    found = trends_of(map_, statistics.histories(key), counted.places)
+    return counted, trends_view(map_.record, found, statistics.alarms(key), limit)
 
 
 @router.post(

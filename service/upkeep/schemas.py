@@ -5,15 +5,56 @@ from __future__ import annotations
 from datetime import date
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.maps import AlarmName
 from core.names import words
 from core.places import Sequence, Timestamp
 from core.upkeep.coverage import Measure
 from core.upkeep.revisits import Reason
 from service.http.schemas import Milliseconds
+from service.places.filters import MOST_DELETED, PlaceConditions
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
+
+
+class Erasing(BaseModel):
+    """Which frames are erased; without any, what places that were deleted before have left."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"filter": {"sequence": "monday"}}, {"ids": ["p7"]}, {"session": "S1"}, {}]},
+    )
+
+    ids: list[Annotated[str, Field(max_length=145)]] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=MOST_DELETED,
+        description="Places of these ids, with their looks; `p7/8f3a0c52d41b9e07` is one look of `p7`.",
+    )
+    filter: PlaceConditions | None = Field(
+        default=None,
+        description="Places that fulfil these conditions, at least one. With a time or a camera, and no traverse or "
+        "metadata, also looks, frames for review, answers and notes of runs of that time and camera.",
+    )
+    session: str | None = Field(
+        default=None,
+        max_length=128,
+        description="Frames for review, answers and notes of this session, which ends, and the looks that the map has "
+        "learnt from it; also if it ended long ago.",
+    )
+    bags: bool = Field(
+        default=False,
+        strict=True,
+        description="Also remove the bags of the map that wait to be enrolled, whatever they have. Otherwise, and "
+        "where a job or an upload uses one, the result names them as `waiting_bags`: what they have is not looked at.",
+    )
+
+    @model_validator(mode="after")
+    def _says_which(self) -> Erasing:
+        if self.ids is not None and self.filter is not None:
+            raise ValueError("give either ids or a filter")
+        return self
 
 
 class Reencoding(BaseModel):
@@ -248,6 +289,85 @@ class StretchView(BaseModel):
     weight: float = Field(description="How strong the reasons are; stretches are listed in this order.")
 
 
+class WorsePlaceView(BaseModel):
+    """A place that gets worse: a day is good if at least half of its frames were recognized there."""
+
+    place: str
+    days: int = Field(description="The days of the last seven on which robots were there.")
+    good_days: int
+    days_before: int
+    good_days_before: int
+    chance: float = Field(description="The probability of so few good days, or fewer, if nothing has changed.")
+    sentence: str
+
+
+class ChangedPlaceView(BaseModel):
+    """A place that has changed: runs pass it surely, while single frames fail and geometry finds little."""
+
+    place: str
+    passed: int = Field(description="Frames of the last seven days of runs that were sure to be there.")
+    missed: int = Field(description="How many of them were not recognized alone.")
+    inliers: float | None = Field(description="Mean of the best matches with it; null if none was verified.")
+    usual_inliers: float | None = Field(description="The mean of all places of the map.")
+    sentence: str
+
+
+class QuietStretchView(BaseModel):
+    """A stretch of a sequence that nobody drives any more."""
+
+    sequence: str
+    first: str
+    last: str
+    places: int
+    since: date = Field(description="When a robot was last there.")
+    sentence: str
+
+
+class RaisedAlarm(BaseModel):
+    """An alarm of the map that is raised."""
+
+    alarm: AlarmName
+    count: int = Field(description="How many places or stretches there were when it was raised.")
+    since: Timestamp
+
+
+class TrendsView(BaseModel):
+    """Trends of the map's places over time, by all answers and the runs of robots."""
+
+    worse: list[WorsePlaceView] = Field(description="Places that get worse; those that chance explains least first.")
+    worse_count: int
+    changed: list[ChangedPlaceView] = Field(description="Places that have changed; those missed most often first.")
+    changed_count: int
+    quiet: list[QuietStretchView] = Field(description="Stretches that nobody drives any more, the longest ago first.")
+    quiet_count: int
+    advice: dict[AlarmName, str] = Field(description="What to do about each trend of which there is something.")
+    alarms: list[RaisedAlarm] = Field(description="The alarms that are raised; see the map's setting `alarms`.")
+
+
+TRENDS_EXAMPLE: dict[str, Any] = {
+    "worse": [],
+    "worse_count": 0,
+    "changed": [
+        {
+            "place": "p12",
+            "passed": 31,
+            "missed": 27,
+            "inliers": 4.5,
+            "usual_inliers": 61.0,
+            "sentence": "p12 has changed: robots that were sure to be there passed it with 31 frames in the last 7 "
+            "days, and 27 of them were not recognized.",
+        }
+    ],
+    "changed_count": 1,
+    "quiet": [],
+    "quiet_count": 0,
+    "advice": {
+        "changed_places": "Add a look of each place as it is now, or set the map's learning to propose, so that runs "
+        "propose such looks."
+    },
+    "alarms": [{"alarm": "changed_places", "count": 1, "since": "2026-11-24T06:10:00Z"}],
+}
+
 HEALTH_EXAMPLE: dict[str, Any] = {
     "map": "lab",
     "places": 111,
@@ -299,6 +419,7 @@ HEALTH_EXAMPLE: dict[str, Any] = {
     "stop_count": 1,
     "retraverse": [{"sequence": "monday", "first": "p39", "last": "p42", "reasons": ["distance-gap"], "weight": 3.0}],
     "retraverse_count": 1,
+    "trends": TRENDS_EXAMPLE,
     "shared_routes": [{"sequence": "tuesday", "other": "monday", "frames": 42}],
 }
 
@@ -321,6 +442,7 @@ class MapHealth(BaseModel):
     stop_count: int
     retraverse: list[StretchView] = Field(description="Stretches that should be recorded again, the most urgent first.")
     retraverse_count: int
+    trends: TrendsView
     shared_routes: list[SharedRouteView] = Field(description="Traverses to align; those of most frames come first.")
 
 

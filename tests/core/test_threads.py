@@ -8,13 +8,27 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from threadpoolctl import ThreadpoolController
 
-from core.threads import SPINS, compute_alone, cores, each, keep_to, share_cores, wait_briefly
+from core import threads as sharing
+from core.networks.torch_network import follow_threads
+from core.threads import (
+    SPINS,
+    allowed_threads,
+    compute_alone,
+    cores,
+    each,
+    keep_to,
+    processors,
+    share_cores,
+    use_threads,
+    wait_briefly,
+)
 
 
 @pytest.mark.parametrize(
@@ -68,25 +82,55 @@ def test_results_stand_in_the_order_of_the_items_and_errors_are_raised() -> None
 
 
 def test_several_threads_work_each_alone_and_the_caller_keeps_its_own() -> None:
-    before = torch.get_num_threads()
+    before = allowed_threads()
     together = threading.Barrier(2, timeout=60)
 
     def work(_: int) -> tuple[str, int]:
         together.wait()  # only if two run at one time
-        return threading.current_thread().name, torch.get_num_threads()
+        return threading.current_thread().name, allowed_threads()
 
     found = each(work, [0, 1], 2)
     assert len({name for name, _ in found}) == 2
     assert [threads for _, threads in found] == [1, 1]
-    assert torch.get_num_threads() == before
+    assert allowed_threads() == before
     assert each(lambda _: threading.current_thread(), [0, 1], 1) == [threading.current_thread()] * 2
 
 
-def test_threads_are_shared_out() -> None:
+@pytest.mark.parametrize(
+    ("said", "wanted"),
+    [("50000 100000", 1), ("100000 100000", 1), ("110000 100000", 2), ("99900000 100000", None), ("max 100000", None)],
+)
+def test_a_containers_quota_bounds_the_cores(
+    said: str, wanted: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cpu.max").write_text(f"{said}\n")
+    monkeypatch.setattr(sharing, "CGROUP", tmp_path / "cpu.max")
+    assert cores() == min(wanted or processors(), processors())
+    monkeypatch.setattr(sharing, "CGROUP", tmp_path / "missing")
+    assert cores() == processors()
+
+
+def test_torch_and_faiss_follow_the_thread_that_they_compute_in() -> None:
+    def found() -> list[int]:
+        use_threads(3)
+        follow_threads()
+        openmp = [library for library in ThreadpoolController().info() if library["user_api"] == "openmp"]
+        return [allowed_threads(), torch.get_num_threads(), *(library["num_threads"] for library in openmp)]
+
     before = torch.get_num_threads()
     try:
+        with ThreadPoolExecutor(1) as pool:
+            told = pool.submit(found).result()
+        assert len(told) >= 3 and set(told) == {3}
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_threads_are_shared_out() -> None:
+    before = allowed_threads()
+    try:
         share_cores(1)
-        assert torch.get_num_threads() == 1
+        assert allowed_threads() == 1
         blas = [library for library in ThreadpoolController().lib_controllers if "numpy" in library.filepath]
         assert blas and all(library.num_threads == 1 for library in blas if library.user_api == "blas")
         np.testing.assert_allclose(np.ones((3, 3)) @ np.ones((3, 3)), 3)
@@ -105,7 +149,7 @@ def test_a_thread_keeps_to_its_core_and_what_it_begins_does_not() -> None:
 
             def begin() -> tuple[set[int], int]:
                 with ThreadPoolExecutor(1, initializer=compute_alone) as inner:
-                    return inner.submit(lambda: (os.sched_getaffinity(0), torch.get_num_threads())).result()
+                    return inner.submit(lambda: (os.sched_getaffinity(0), allowed_threads())).result()
 
             return *own, *outer.submit(begin).result()
 

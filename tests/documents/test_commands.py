@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import typer.main
 
-from service.commands import application
+from service.commands.application import application
 from tests.service.command_forks import ForkedCommands
 from tests.service.server import ROOT, Server
 
@@ -48,6 +48,7 @@ LONG = (
     "docs/how-to/calibrate-a-map",
     "docs/how-to/enrol-bags-and-videos",
     "docs/how-to/evaluate",
+    "docs/how-to/erase-frames",
     "docs/how-to/look-after-maps",
     "docs/how-to/tune-for-a-machine",
     "docs/tutorials/from-bag-to-robot",

@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from service.ray_serve.metrics import CallMetrics
 from tests.documents.reference import FOLDER, PAGES
+from tests.service.map_jobs import finished
 from tests.service.server import Server
 
 
@@ -20,8 +21,9 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 
 @pytest.mark.thorough
 def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
-    service = Server(tmp_path / "service").wait()
+    service = Server(tmp_path / "service", {"backup_dir": tmp_path / "backups"}).wait()
     try:
+        finished(service, service.client.post("/v1/backups").raise_for_status().json())
         with_ray = CollectorRegistry()
         CallMetrics(with_ray)
         text = service.client.get("/metrics").text + generate_latest(with_ray).decode()

@@ -189,7 +189,11 @@ class MapModel:
             self.places[place_id] = made
         else:
             known.shown, known.kept = shown, kept
-            known.looks = {name: look for name, look in known.looks.items() if look.run is None}
+            known.looks = {
+                name: look
+                for name, look in known.looks.items()
+                if look.run is None and look.shown.digest != shown.digest
+            }
             self._place_in(known, fields, replaced=True)
             known.track = known.pose_of = None
             made = known
@@ -257,8 +261,8 @@ class MapModel:
         """Apply a merge patch to the fields of a place."""
         return self.set_fields(place_id, merged(self.place(place_id).fields, changes))
 
-    def adopt(self, place_id: str, of: PlaceModel, ordinal: int | None) -> None:
-        """Take over a place of another map with its history."""
+    def adopt(self, place_id: str, of: PlaceModel, ordinal: int | None) -> list[str]:
+        """Take over a place of another map with its history; returns what is left out, which no place is."""
         before = self.places.get(place_id)
         same = before is not None and before.shown.digest == of.shown.digest
         self.enrol(place_id, of.shown, of.fields, of.kept, of.keypoints, ordinal)
@@ -268,6 +272,7 @@ class MapModel:
             place.descriptor = of.descriptor
         place.ordinal = place.ordinal if ordinal is None else ordinal
         self.ends[place.sequence] = max(self.ends[place.sequence], place.ordinal + 1)
+        return []
 
     def fill_in(self, limit: int) -> int:
         """Find the keypoints of the first places that have none and keep a picture; how many were stored."""

@@ -65,6 +65,7 @@ def test_it_draws_frames_of_its_own(service: Server) -> None:
     assert len(done.stdout.splitlines()) == 4
 
 
+@pytest.mark.thorough
 def test_it_stops_where_no_frame_will_be_answered(service: Server) -> None:
     done = run("examples/robot.py", "--url", service.client.base_url, "--map", "nowhere")
     assert done.returncode == 1

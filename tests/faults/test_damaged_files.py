@@ -223,11 +223,13 @@ def test_a_damaged_database_with_a_log_is_found(crashed: Sound, tmp_path: Path) 
     run_cases(crashed, tmp_path, paths, 8)
 
 
+@pytest.mark.thorough
 def test_damaged_descriptors_are_found(closed: Sound, tmp_path: Path) -> None:
     outcomes = run_cases(closed, tmp_path, kind(closed, ".seg"), 8)
     assert outcomes["quarantined"]
 
 
+@pytest.mark.thorough
 def test_a_damaged_cache_is_made_again(closed: Sound, tmp_path: Path) -> None:
     """Every file of the index, each in another way: the answers stay the same, and the file is made again."""
     chosen = random.Random(SEED)

@@ -239,6 +239,7 @@ DAMAGED_FILES = {
     "jobs.sqlite": b"SQLite format 3\x00" + b"\xff" * 8176,
     "sessions.sqlite": b"\x00" * 4096,
     "statistics.sqlite": b"no database at all",
+    "history.sqlite": b"\x01" * 4096,
 }
 
 
@@ -256,6 +257,7 @@ def test_damaged_files_at_the_start(server: Server) -> None:
     assert client.get("/v1/jobs").status_code == 200
     assert client.post("/v1/maps/sound/sessions", json={}).status_code == 201
     assert client.get("/v1/maps/sound/health").status_code == 200
+    assert client.get("/v1/service/history").status_code == 200
     for name in DAMAGED_FILES:
         assert list(server.data_dir.glob(f"{name}.damaged*")), f"{name} is put aside, not deleted"
     assert DEFAULT_ENCODER in {one["name"] for one in client.get("/v1/encoders").json()["items"]}

@@ -28,6 +28,7 @@ from service.queries.count_tables import statistics_file
 from service.queries.counts import Statistics
 from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
+from service.telemetry.history import LoadHistory
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map
@@ -91,7 +92,20 @@ def use_export(folder: Path) -> object:
     return True
 
 
+def use_history(folder: Path) -> object:
+    """Read the load of the last day, then count one more answer."""
+    history = LoadHistory(folder)
+    history.start()
+    try:
+        found = sum(one.recognized for one in history.read(1440)[1])
+        history.observe_answer("recognized")
+        return found
+    finally:
+        history.close()
+
+
 USES: dict[str, Use] = {
+    "history.sqlite": use_history,
     "jobs.sqlite": use_jobs,
     "sessions.sqlite": use_sessions,
     "statistics.sqlite": use_statistics,
@@ -105,7 +119,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one file of each kind, used several times."""
     folder = tmp_path_factory.mktemp("small")
     for _ in range(4):
-        for use in (use_jobs, use_sessions, use_statistics):
+        for use in (use_jobs, use_sessions, use_statistics, use_history):
             use(folder)
     store = Keys.of(folder)
     for name in ("robot", "operator"):

@@ -153,6 +153,7 @@ def test_a_disk_that_is_full_for_a_while(scripts: ScriptProcesses, points: list[
         inject(scripts, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO"]), chosen.randint(2, 12))
 
 
+@pytest.mark.thorough
 def test_a_directory_that_is_read_only_for_a_while(
     scripts: ScriptProcesses, points: list[Point], tmp_path: Path
 ) -> None:

@@ -107,6 +107,22 @@ def fuzz_streams(options: argparse.Namespace) -> int:
     return int(bool(wrong))
 
 
+def fuzz_files(options: argparse.Namespace) -> int:
+    """Damaged files of some kinds; 1 if one was not read or refused as it should be."""
+    from tests.fuzz import files  # with it come the readers of all kinds
+
+    status = 0
+    for kind in options.kinds or files.KINDS:
+        last = sys.maxsize if options.count is None else options.first + options.count
+        numbers = iter(range(options.first, last))
+        found = files.run(kind, options.seed, numbers, 60 * options.minutes, options.out / "wrong")
+        print(f"{kind}: {sum(found.ends.values())} files, seed {options.seed}: {dict(found.ends)}")
+        for complaint in found.wrong[:20]:
+            print(f"WRONG: {complaint}")
+        status |= bool(found.wrong)
+    return status
+
+
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="scripts/fuzz", description=__doc__)
@@ -132,6 +148,14 @@ def main() -> int:
     sockets = commands.add_parser("streams", help="nonsense over the WebSocket of a session")
     sockets.add_argument("--count", type=int, default=2000)
     sockets.set_defaults(do=fuzz_streams)
+    read = commands.add_parser("files", help="damaged files of every other kind that is read")
+    read.add_argument("kinds", nargs="*", metavar="KIND", help="such as archives, bags, onnx; default: all")
+    read.add_argument("--minutes", type=float, default=1, help="for each kind")
+    read.add_argument("--count", type=int, help="end after so many of each kind")
+    read.add_argument("--first", type=int, default=0, help="number of the first file: to replay one")
+    read.add_argument("--seed", type=int, default=0)
+    read.add_argument("--out", type=Path, default=Path("runs/fuzz"))
+    read.set_defaults(do=fuzz_files)
     for one in (whole, raw, sockets):
         one.add_argument("--seed", type=int, default=0)
         one.add_argument("--url", help="of a service that runs; default: one of our own")

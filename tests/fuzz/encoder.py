@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 
 from core.frames.preprocessing import InputDefinition
 from core.method.catalogue import NETWORK_SUFFIX
@@ -46,12 +47,10 @@ def install_small_encoder(folder: Path) -> str:
     return install(folder, SMALL, extractor, DEFINITION, SMALL)
 
 
-def _weights() -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    weights, channels = {}, 3
-    for layer in NETWORK.convolutions():
-        shape = (layer.channels, channels, layer.kernel, layer.kernel)
-        weights[f"{layer.name}.weight"] = torch.randn(shape, generator=generator) / math.sqrt(math.prod(shape[1:]))
-        weights[f"{layer.name}.bias"] = torch.zeros(layer.channels)
-        channels = layer.channels
+def _weights() -> dict[str, NDArray[np.float32]]:
+    random = np.random.default_rng(0)
+    weights = {}
+    for name, shape in NETWORK.weight_shapes().items():
+        drawn = random.standard_normal(shape, np.float32) / np.float32(math.sqrt(math.prod(shape[1:])))
+        weights[name] = drawn if name.endswith("weight") else np.zeros(shape, np.float32)
     return weights

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+
 import pytest
 
 from tests.fuzz import images, streams
@@ -9,6 +12,9 @@ from tests.fuzz.http import MALFORMED, NOT_IMPLEMENTED, complaint, mangled, spok
 from tests.fuzz.pictures.originals import originals
 from tests.fuzz.sending import MAP
 from tests.service.server import Server
+
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "0"))
+"""A longer run of messages; 0: a few."""
 
 
 @pytest.mark.parametrize("name", MALFORMED)
@@ -27,4 +33,8 @@ def test_mangled_requests_hurt_nobody(fuzzed: Server) -> None:
 
 def test_a_stream_of_nonsense_is_answered(fuzzed: Server) -> None:
     images.prepare(fuzzed.client)
-    assert streams.run(str(fuzzed.client.base_url), MAP, originals(), seed=2, count=120) == []
+    url, end, seed = str(fuzzed.client.base_url), time.monotonic() + SECONDS, 2
+    assert streams.run(url, MAP, originals(), seed, count=120) == []
+    while time.monotonic() < end:
+        seed += 1
+        assert streams.run(url, MAP, originals(), seed, count=120) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections import Counter
 
 import pytest
@@ -15,6 +17,8 @@ from tests.fuzz.pictures.originals import originals
 from tests.service.server import Server
 
 ORIGINALS = originals()
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "0"))
+"""A longer run; 0: a few pictures."""
 
 
 def test_a_mutant_is_made_again_by_its_number() -> None:
@@ -49,6 +53,7 @@ def test_damaged_pictures_are_decoded_or_refused() -> None:
 
 @pytest.mark.thorough
 def test_the_service_answers_each_and_stands_as_it_stood(fuzzed: Server) -> None:
-    report = images.run(str(fuzzed.client.base_url), fuzzed.process.pid, ORIGINALS, seed=5, count=120, threads=3)
+    url, many = str(fuzzed.client.base_url), 10**6 if SECONDS else 120
+    report = images.run(url, fuzzed.process.pid, ORIGINALS, seed=5, count=many, threads=3, seconds=SECONDS or math.inf)
     assert report.wrong == [] and report.complaints == [], report.table()
     assert {200, 422} <= {sent.status for sent in report.sent}

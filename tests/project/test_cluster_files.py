@@ -79,7 +79,7 @@ def settings_in(variables: dict[str, Any]) -> set[str]:
 
 
 def test_compose_files_are_valid() -> None:
-    for path in (COMPOSE, DOCKER / "compose.yaml"):
+    for path in (COMPOSE, DOCKER / "compose.yaml", DOCKER / "compose.tls.yaml"):
         found = PyCompose.from_yaml(yaml.safe_dump(yaml.safe_load(path.read_text())))
         found.validate_networks()
         found.validate_volumes()
@@ -98,6 +98,7 @@ def test_only_nginx_is_published_and_on_this_machine_alone() -> None:
     assert all(port.startswith("127.0.0.1:") for port in published["nginx"])
 
 
+@pytest.mark.thorough
 def test_every_container_is_confined_and_returns() -> None:
     for name, found in compose()["services"].items():
         assert found["restart"] == "unless-stopped" and found["cap_drop"] == ["ALL"], name
@@ -374,6 +375,7 @@ def run_as(name: str, **variables: str) -> str:
     ).stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.postgres
 @pytest.mark.skipif(shutil.which("pg_dump") is None, reason="PostgreSQL's programs are not installed")
 def test_jobs_make_a_key_back_it_up_and_restore_it(postgres: Postgres, tmp_path: Path) -> None:

@@ -107,16 +107,18 @@ CLIENT_PROJECT = tomllib.loads((CLIENT / "pyproject.toml").read_text())["project
 FOR_TYPES = {"numpy"}
 """What the client imports for types alone: a caller who gives arrays has it."""
 
-OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py"}
+OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"}
 """What runs in .venv-ros, whose packages are not here."""
 
 EXTRAS = {
     "core/ledger/postgres": {"cluster"},
+    "core/maps/formats/mcap": {"bags"},
     "core/milvus": {"milvus"},
     "core/postgres": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
     "lab": {"lab"},
+    "scripts/manifests": {"dev"},
     "service/peers/differences": {"cluster"},
     "service/peers/replica": {"cluster"},
     "service/ray_serve": {"ray"},

@@ -36,10 +36,11 @@ esac
 """
 
 
-def installed(folder: Path, **given: str) -> tuple[list[str], str, int]:
+def installed(folder: Path, backend: str = "cpu", **given: str) -> tuple[list[str], str, int]:
     """What ``packages.py service`` installs, what it says, and its status.
 
     Args:
+        backend: the build of torch.
         given: ``no_uv``: uv cannot be had; ``full``: nothing can be installed; ``cpu``: why uv does not find that build
             of torch; ``pip``: more of pip's configuration.
     """
@@ -51,7 +52,7 @@ def installed(folder: Path, **given: str) -> tuple[list[str], str, int]:
         Path(f"{log}.{what}").write_text(text)
     code = f"import sys; sys.executable = {str(stub)!r}; from scripts.packages import main; sys.exit(main('service'))"
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("UV_", "PIP_"))}
-    environment |= {"LOG": str(log), "TORCH_BACKEND": "cpu", "PYTHONPATH": str(ROOT)}
+    environment |= {"LOG": str(log), "TORCH_BACKEND": backend, "PYTHONPATH": str(ROOT)}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
     return log.read_text().splitlines(), run.stderr, run.returncode
 
@@ -92,6 +93,10 @@ def test_without_uv_pip_installs(tmp_path: Path) -> None:
     lines, said, status = installed(tmp_path, no_uv="")
     assert lines == ["pip torch.lock", "pip service.lock", "pip torch.lock"]
     assert "uv could not install" in said and status == 0
+
+
+def test_an_image_may_do_without_torch(tmp_path: Path) -> None:
+    assert installed(tmp_path, backend="none") == (["pip installer.lock", "uv service.lock"], "", 0)
 
 
 def test_a_failure_is_reported(tmp_path: Path) -> None:

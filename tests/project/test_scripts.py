@@ -12,10 +12,12 @@ import pytest
 ROOT = Path(__file__).parents[2]
 RUNNABLE = [
     ".ci/run",
-    "docker/entrypoint",
     *(
         f"scripts/{name}"
-        for name in ("arm64", "cluster", "fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")
+        for name in (
+            *("advisories", "arm64", "chart", "cluster", "fixtures", "fuzz", "lint", "lock", "openapi", "reference"),
+            *("release", "reproduce", "sbom", "serve", "soak", "test", "wheel"),
+        )
     ),
 ]
 
@@ -120,6 +122,7 @@ def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
     assert checkout.log.read_text().split() == ["venv", "development", "cpu", "."]
 
 
+@pytest.mark.thorough
 def test_an_interrupted_installation_is_repeated(checkout: Checkout) -> None:
     checkout.prepare("service")
     (checkout.folder / "requirements/service.lock").write_text("newer\n")

@@ -18,8 +18,7 @@ from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.projection import Projection, fit_projection
 from core.method.vocabulary import train_vocabulary
-from core.networks.backbone import Backbone
-from core.networks.network import load_network
+from core.networks.network import ShallowNetwork, load_network
 from tests.service.scenes import scene, seen_again
 
 COARSE = "coarse"
@@ -77,7 +76,7 @@ def _packaged_network() -> str:
     return network
 
 
-def _packaged_backbone(layers: tuple[str, ...]) -> Backbone:
+def _packaged_backbone(layers: tuple[str, ...]) -> ShallowNetwork:
     return load_network(EncoderCatalogue().network_file(_packaged_network()), layers)
 
 

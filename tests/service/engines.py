@@ -23,9 +23,9 @@ ENCODER = "some@" + "0" * 64
 
 
 @contextmanager
-def runtime_at(folder: Path) -> Iterator[Runtime]:
+def runtime_at(folder: Path, **settings: Any) -> Iterator[Runtime]:
     """A runtime whose event loop does not run."""
-    runtime = Runtime(Settings(data_dir=folder / "data"), Metrics())
+    runtime = Runtime(Settings(data_dir=folder / "data", **settings), Metrics())
     runtime.jobs.start()
     try:
         yield runtime

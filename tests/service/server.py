@@ -68,6 +68,7 @@ class Server:
         folder.mkdir(parents=True, exist_ok=True)
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
         own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, "rehearsal": False}
+        own |= {"disk_reserve_bytes": 0}
         own |= settings or {}
         environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
         self.process: ForkedServer | subprocess.Popen[bytes]

@@ -108,3 +108,12 @@ def test_addresses_of_no_database(monkeypatch: pytest.MonkeyPatch, address: str)
 def test_addresses_of_a_database(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
     monkeypatch.setenv("PLACEREC_DATABASE", address)
     assert read_settings().engine == "postgres"
+
+
+def test_a_file_is_no_folder_for_backups(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "saved").write_text("")
+    monkeypatch.setenv("PLACEREC_BACKUP_DIR", str(tmp_path / "saved"))
+    with pytest.raises(SettingsError, match="PLACEREC_BACKUP_DIR is no folder"):
+        read_settings()
+    monkeypatch.setenv("PLACEREC_BACKUP_DIR", str(tmp_path / "made-when-it-is-needed"))
+    assert read_settings().backup_dir == tmp_path / "made-when-it-is-needed"

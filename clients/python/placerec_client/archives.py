@@ -27,6 +27,16 @@ def partial_tag(path: Path) -> str | None:
     return tag if seal.split()[:1] == [tag.encode()] else None
 
 
+def map_id_of(path: Path) -> str | None:
+    """The id of the map that a file states; None if its beginning is not that of a map's file."""
+    try:
+        with tarfile.open(path, "r:") as tar:
+            found = json.loads(_content(tar, MANIFEST))["map"]["id"]
+    except (OSError, tarfile.TarError, TransferFailed, EOFError, ValueError, KeyError, TypeError):
+        return None
+    return found if isinstance(found, str) else None
+
+
 def check_archive(path: Path, expected: str | None = None) -> str:
     """Compare all parts of a file with the SHA-256 in its manifest; return that of the manifest.
 

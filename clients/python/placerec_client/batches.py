@@ -17,7 +17,7 @@ from placerec_client.errors import (
     Problem,
     UnexpectedAnswer,
 )
-from placerec_client.frames import Frame, frame_bytes
+from placerec_client.frames import Frame, frame_bytes, shown
 from placerec_client.requests import dumps, fields, name_of
 
 FIRST_BATCH, LARGEST_BATCH, FASTEST_GROWTH = 16, 128, 8
@@ -61,6 +61,9 @@ class NewPlace:
     frame: Frame | Callable[[], Frame]
     fields: Mapping[str, Any] | Callable[[bytes], Mapping[str, Any]] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.id!r}, {shown(self.frame)}, {self.fields!r})"
+
 
 @dataclass(frozen=True)
 class Enrolled:
@@ -90,6 +93,10 @@ class Located:
     frame: Frame
     answer: models.QueryAnswer | None
     error: PlacerecError | None = None
+
+    def __repr__(self) -> str:
+        outcome = f"answer={self.answer!r}" if self.error is None else f"error={self.error!r}"
+        return f"{type(self).__name__}({shown(self.frame)}, {outcome})"
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,9 @@ class Picture:
     encoding: Encoding = "png"
     quality: int = 90
 
+    def __repr__(self) -> str:
+        return shown(self)
+
     def __post_init__(self) -> None:
         if self.order not in ("bgr", "rgb"):
             raise InvalidFrame(f"The order of channels is 'bgr' or 'rgb', not {ascii(self.order)[:140]}.")
@@ -95,6 +98,16 @@ def frame_bytes(frame: Frame) -> bytes:
     if not isinstance(data, bytes):
         raise InvalidFrame("The frame's file is not opened in binary mode.")
     return data
+
+
+def shown(frame: object) -> str:
+    """A frame as errors and interpreters show it: bytes and pixels by their number."""
+    if isinstance(frame, bytes | bytearray | memoryview | array):
+        return f"<{memoryview(frame).nbytes} bytes>"
+    if isinstance(frame, Picture):
+        return f"Picture({shown(frame.pixels)}, {frame.order!r}, {frame.encoding!r}, quality={frame.quality})"
+    shape = getattr(frame, "shape", None)
+    return repr(frame) if shape is None else f"<{type(frame).__name__} of shape {list(shape)}>"
 
 
 def media_type(data: bytes) -> str:

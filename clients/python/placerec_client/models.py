@@ -52,6 +52,14 @@ class AgreementDefinition(Model):
     taught: bool | None = None
 
 
+class AlarmSetting(Model):
+    """From which numbers on the trends of a map raise an alarm; null: never."""
+
+    worse_places: int | None = None
+    changed_places: int | None = None
+    quiet_stretches: int | None = None
+
+
 class AliasView(Model):
     """A place that looks more like another place than like its own neighbours; each pair is listed once."""
 
@@ -144,6 +152,35 @@ class AuditPage(Model):
     source: Known[Literal["database", "file", "memory"]]
 
 
+class BackupSchedule(Model):
+    """How often all maps are saved, and how many backups are kept."""
+
+    hours: float | None = 24
+    keep: int = 7
+
+
+class BackupView(Model):
+    """A backup of all maps."""
+
+    id: str
+    at: datetime
+    maps: int
+    places: int
+    bytes: int
+
+
+class BackupList(Model):
+    """The backups that the service makes, the newest first, and when it makes the next one."""
+
+    enabled: bool
+    schedule: BackupSchedule | None = None
+    next_at: datetime | None = None
+    running: str | None = None
+    problem: str | None = None
+    items: list[BackupView]
+    next_cursor: None = None
+
+
 class Problem(Model, extra="allow"):
     """A problem, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
 
@@ -153,6 +190,15 @@ class Problem(Model, extra="allow"):
     detail: str
     instance: str | None = None
     request_id: str | None = None
+
+
+class ChangeView(Model):
+    """Whether a frame shows the map as it is, as it was, or something that the map does not have."""
+
+    verdict: Known[Literal["known", "changed", "new"]]
+    known: float
+    changed: float
+    new: float
 
 
 class EstimatedPose(Model, extra="allow"):
@@ -175,9 +221,11 @@ class EstimatedPose(Model, extra="allow"):
 
 
 class Pose(Model):
-    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``heading`` is in
-    degrees: counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is
-    normalized to [0, 360).
+    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``z`` is in metres: in
+    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. There it is a
+    statement that is handed on; distances on the Earth are those along the ground. ``heading`` is in degrees:
+    counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is normalized to
+    [0, 360).
     """
 
     x: float | None = None
@@ -305,6 +353,7 @@ class QueryAnswer(Model):
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
     place: PlaceView | None = None
     probability: float | None = None
+    change: ChangeView | None = None
     pose: EstimatedPose | None = None
     score: float | None = None
     margin: float | None = None
@@ -476,7 +525,7 @@ class Held(Model):
 
 
 class Point(Model):
-    """The effect of one threshold on the decision value, on all frames; the margin is not applied."""
+    """The effect of one threshold on the decision value of two stages, on all frames; the margin is not applied."""
 
     threshold: float
     precision: float
@@ -515,7 +564,7 @@ class CalibrationReport(Model):
 
     map: str
     encoder: str
-    method: Known[Literal["frames", "sequence", "map", "labels"]]
+    method: Known[Literal["frames", "sequence", "map", "labels", "runs"]]
     target: Target
     stored: bool
     calibration: Calibration
@@ -604,12 +653,24 @@ class CameraList(Model):
     next_cursor: None = None
 
 
+class ChangedPlaceView(Model):
+    """A place that has changed: runs pass it surely, while single frames fail and geometry finds little."""
+
+    place: str
+    passed: int
+    missed: int
+    inliers: float | None = None
+    usual_inliers: float | None = None
+    sentence: str
+
+
 class ClosureAnswer(Model):
     """Where a frame was taken, and the new place if it was unknown."""
 
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
     place: PlaceView | None = None
     probability: float | None = None
+    change: ChangeView | None = None
     pose: EstimatedPose | None = None
     score: float | None = None
     margin: float | None = None
@@ -623,7 +684,7 @@ class ClosureAnswer(Model):
     explanation: MatchExplanation | None = None
     encoder: str
     milliseconds: dict[str, float]
-    change: Known[Literal["created", "unchanged"]] | None = None
+    enrolment: Known[Literal["created", "unchanged"]] | None = None
     enrolled: PlaceView | None = None
 
 
@@ -634,6 +695,40 @@ class ComparedTraverse(Model):
     places: list[str]
 
 
+class CoverageGap(Model):
+    """Two successive places of a traverse between which a pose is, too far from either."""
+
+    before: str
+    after: str
+    metres: float
+    aside: float
+
+
+class NearPlace(Model):
+    """A place near a pose."""
+
+    place: str
+    distance: float
+    turn: float | None = None
+    sequence: str | None = None
+
+
+class CoverageView(Model):
+    """Whether a pose is in a map, and how well."""
+
+    map: str
+    state: Known[Literal["covered", "other-direction", "gap", "outside"]]
+    radius: float
+    places: int
+    looks: int
+    sequences: list[str]
+    directions: list[int]
+    distance: float | None = None
+    turn: float | None = None
+    nearest: list[NearPlace]
+    gap: CoverageGap | None = None
+
+
 class CreatedKey(Model):
     """A new key with its secret."""
 
@@ -641,6 +736,7 @@ class CreatedKey(Model):
     name: str
     role: Known[Literal["query", "enrol", "admin"]]
     maps: list[str] | None = None
+    learn: bool
     state: Known[Literal["in force", "revoked", "expired"]]
     created_at: datetime
     expires_at: datetime | None = None
@@ -781,6 +877,60 @@ class ExportedLabel(Model):
     labelled_by: str | None = None
 
 
+class FleetAlarm(Model):
+    """An alarm of a map, by its setting `alarms`."""
+
+    map: str
+    alarm: Known[Literal["worse_places", "changed_places", "quiet_stretches"]]
+    raised: bool
+    count: int
+    since: datetime
+    sentence: str
+
+
+class HourCount(Model):
+    """How many answers had each verdict within an hour."""
+
+    recognized: int = 0
+    ambiguous: int = 0
+    unknown: int = 0
+    hour: datetime
+
+
+class FleetMap(Model):
+    """The demand of robots on one map."""
+
+    map: str
+    sessions: int
+    hours: list[HourCount]
+
+
+class FleetRobot(Model):
+    """One robot: an open session, or what one key or camera has asked without one."""
+
+    map: str
+    name: str | None = None
+    session: str | None = None
+    camera: str | None = None
+    last_at: datetime
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
+    place: str | None = None
+    pose: EstimatedPose | None = None
+    recognized_at: datetime | None = None
+    lost_since: datetime | None = None
+    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]]
+    answers: int
+
+
+class FleetState(Model):
+    """Robots, the one that was heard last first, and the maps that the key may use and that were asked, by id."""
+
+    at: datetime
+    maps: list[FleetMap]
+    robots: list[FleetRobot]
+    alarms: list[FleetAlarm]
+
+
 class FrameReport(Model):
     """The status of one frame."""
 
@@ -803,19 +953,91 @@ class GapView(Model):
     severity: float
 
 
+class GeoAccuracy(Model):
+    """Standard deviations of the errors."""
+
+    position: float
+    orientation: float
+
+
+class GeoAngles(Model):
+    """The same rotation in degrees."""
+
+    yaw: float
+    pitch: float
+    roll: float
+
+
+class GeoPosition(Model):
+    """A position of a GeoPose."""
+
+    lat: float
+    lon: float
+    h: float
+
+
+class GeoQuaternion(Model):
+    """A rotation from the axes east, north and up to those of the camera: ahead, left and up."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class GeoPose(Model):
+    """Where a frame was taken, as Basic-Quaternion or Basic-YPR of OGC GeoPose 1.0, with members beside the pose."""
+
+    position: GeoPosition
+    quaternion: GeoQuaternion | None = None
+    angles: GeoAngles | None = None
+    accuracy: GeoAccuracy
+    map: str
+    place: str
+    probability: float | None = None
+    height_known: bool
+
+
+class GroundFrameView(Model):
+    """A frame of a stretch, and the place that it would become."""
+
+    frame: int
+    place: str
+    pose: Pose
+    spread: float
+    heading_spread: float
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    taken: datetime | None = None
+
+
+class GroundStretchView(Model):
+    """A stretch of a run off the map."""
+
+    id: str
+    run: str
+    at: datetime
+    why: str
+    leaves: str
+    returns: str
+    length: float
+    misclosure: float
+    misclosure_heading: float
+    recognized_elsewhere: int
+    missing: int
+    frames: list[GroundFrameView]
+
+
+class GroundStretchList(Model):
+    """All stretches that wait for review, the oldest first, on one page."""
+
+    items: list[GroundStretchView]
+    next_cursor: None = None
+
+
 class Health(Model):
     """The process is alive."""
 
     status: str = "ok"
-
-
-class HourCount(Model):
-    """How many answers had each verdict within an hour."""
-
-    recognized: int = 0
-    ambiguous: int = 0
-    unknown: int = 0
-    hour: datetime
 
 
 class Recall(Model):
@@ -890,6 +1112,7 @@ class KeyView(Model):
     name: str
     role: Known[Literal["query", "enrol", "admin"]]
     maps: list[str] | None = None
+    learn: bool
     state: Known[Literal["in force", "revoked", "expired"]]
     created_at: datetime
     expires_at: datetime | None = None
@@ -958,12 +1181,42 @@ class Layer(Model):
     columns: int
 
 
+class RejectedGround(Model):
+    """A stretch of new ground that a person has rejected."""
+
+    stretch: str
+    run: str
+    at: datetime
+    poses: list[Pose]
+
+
 class LearningSetting(Model):
     """The setting by which a map learns from the runs of its robots."""
 
     mode: Known[Literal["off", "propose", "auto"]] = "off"
     least_probability: float = 0.95
     most_looks: int = 3
+    most_places: int | None = None
+    new_ground: bool = False
+    calibration: Known[Literal["off", "propose", "auto"]] = "propose"
+    rejected_ground: list[RejectedGround] = Field(default_factory=list)
+
+
+class LoadView(Model):
+    """The load over time in columns: one entry of each for every step in which the service ran."""
+
+    step_seconds: int
+    at: list[datetime]
+    recognized: list[int]
+    ambiguous: list[int]
+    unknown: list[int]
+    requests: list[int]
+    errors: list[int]
+    p50: list[float | None]
+    p99: list[float | None]
+    resident: list[int | None]
+    disk_free: list[int | None]
+    disk_total: list[int | None]
 
 
 class LookView(Model):
@@ -997,6 +1250,7 @@ class MapAnswer(Model):
     status: int
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
     probability: float | None = None
+    change: ChangeView | None = None
     score: float | None = None
     margin: float | None = None
     decision: float | None = None
@@ -1046,6 +1300,50 @@ class StretchView(Model):
     weight: float
 
 
+class QuietStretchView(Model):
+    """A stretch of a sequence that nobody drives any more."""
+
+    sequence: str
+    first: str
+    last: str
+    places: int
+    since: date
+    sentence: str
+
+
+class RaisedAlarm(Model):
+    """An alarm of the map that is raised."""
+
+    alarm: Known[Literal["worse_places", "changed_places", "quiet_stretches"]]
+    count: int
+    since: datetime
+
+
+class WorsePlaceView(Model):
+    """A place that gets worse: a day is good if at least half of its frames were recognized there."""
+
+    place: str
+    days: int
+    good_days: int
+    days_before: int
+    good_days_before: int
+    chance: float
+    sentence: str
+
+
+class TrendsView(Model):
+    """Trends of the map's places over time, by all answers and the runs of robots."""
+
+    worse: list[WorsePlaceView]
+    worse_count: int
+    changed: list[ChangedPlaceView]
+    changed_count: int
+    quiet: list[QuietStretchView]
+    quiet_count: int
+    advice: dict[str, str]
+    alarms: list[RaisedAlarm]
+
+
 class MapHealth(Model):
     """The health of a map, judged by its own frames and by its answers."""
 
@@ -1062,6 +1360,7 @@ class MapHealth(Model):
     stop_count: int
     retraverse: list[StretchView]
     retraverse_count: int
+    trends: TrendsView
     shared_routes: list[SharedRouteView]
 
 
@@ -1116,6 +1415,7 @@ class MapView(Model):
     verification: bool
     review: ReviewSetting | None = None
     learning: LearningSetting
+    alarms: AlarmSetting
     calibration: Calibration | None = None
     index: IndexStatus
     storage: StorageStatus
@@ -1179,6 +1479,7 @@ class OwnKey(Model):
     name: str
     role: Known[Literal["open", "query", "enrol", "admin"]]
     maps: list[str] | None = None
+    learn: bool
     expires_at: datetime | None = None
     keys_needed: bool
 
@@ -1197,6 +1498,7 @@ class PlaceMatchView(Model):
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
     probability: float | None = None
     place: str | None = None
+    change: ChangeView | None = None
     pose: EstimatedPose | None = None
     score: float | None = None
     margin: float | None = None
@@ -1288,6 +1590,7 @@ class RecentAnswerView(Model):
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
     probability: float | None = None
     place: str | None = None
+    change: ChangeView | None = None
     pose: EstimatedPose | None = None
     score: float | None = None
     margin: float | None = None
@@ -1315,6 +1618,13 @@ class RecentAnswerList(Model):
     hours: list[HourCount]
 
 
+class RecordingView(Model):
+    """The part of a recording that is here."""
+
+    id: str
+    bytes: int
+
+
 class Region(Model):
     """One region of interest."""
 
@@ -1338,14 +1648,17 @@ class RegionsView(Model):
 
 
 class RemovedLooks(Model):
-    """Looks that were removed together."""
+    """Looks and places of one run that were removed together."""
 
-    run: str
+    run: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
     looks: int
+    places: int
 
 
 class RequestsState(Model):
-    """The requests of the last minutes."""
+    """The requests of the last minutes, without those of the console."""
 
     seconds: int
     under_way: int
@@ -1421,6 +1734,7 @@ class SessionAnswer(Model):
     session: str
     frame: int | None = None
     frames: int
+    change: ChangeView | None = None
     earlier: EarlierBelief | None = None
     motion: Known[Literal["first", "sequence", "speed-limit", "odometry"]]
     view: Known[Literal["covered", "constant"]] | None = None
@@ -1552,5 +1866,5 @@ class Version(Model):
     api: str = "v1"
     encoder: str
     python: str
-    torch: str
+    torch: str | None = None
     faiss: str

@@ -20,7 +20,7 @@ class Query(TypedDict, total=False):
     """Metres in the map's frame; with x."""
 
     z: float | None
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: float | None
     """Degrees, WGS 84."""
@@ -95,6 +95,11 @@ class Query(TypedDict, total=False):
     encoder: str | None
     """Name or identity that the map's encoder must have (409 otherwise)."""
 
+    format: Literal["json", "geopose", "geopose-ypr"] | None
+    """geopose: an OGC GeoPose with a quaternion; geopose-ypr: with yaw, pitch and roll. If left out, the Accept
+    header decides (`application/geopose+json`), and json is the default.
+    """
+
 
 class QueryBatch(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/query:batch``."""
@@ -106,7 +111,7 @@ class QueryBatch(TypedDict, total=False):
     """Metres in the map's frame; with x."""
 
     z: float | None
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: float | None
     """Degrees, WGS 84."""
@@ -203,7 +208,7 @@ class EnrolPlace(TypedDict, total=False):
     """Metres in the map's frame; with x."""
 
     z: float | None
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: float | None
     """Degrees, WGS 84."""
@@ -280,6 +285,13 @@ class ListSequences(TypedDict, total=False):
     """Most items on a page."""
 
 
+class UploadRecording(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/recordings/{recording}``."""
+
+    offset: int
+    """Where the piece begins."""
+
+
 class AddLook(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/places/{place}/looks``."""
 
@@ -306,6 +318,15 @@ class ListAllLooks(TypedDict, total=False):
 class DeleteLearntLooks(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/looks``."""
 
+    run: str | None
+    """Those that were learnt from this run."""
+
+    since: datetime | str | None
+    """Those that were added to the map at this time or later (ISO 8601; UTC without a zone)."""
+
+    until: datetime | str | None
+    """Those that were added before this time."""
+
 
 class ReadPlan(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/plan``."""
@@ -314,11 +335,36 @@ class ReadPlan(TypedDict, total=False):
     """List about one place in every `step`."""
 
 
+class CheckCoverage(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/coverage``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres. Beside x and y distances without it are those in the plane; on the Earth it does nothing."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    k: int
+    """How many of the nearest places to list."""
+
+
 class FollowMap(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/events``."""
 
     kinds: str | Sequence[str] | None
-    """The kinds of events, separated by commas: query, enrolment, session, job, map; all if left out."""
+    """The kinds of events, separated by commas: query, enrolment, session, job, map, alarm; all if left out."""
 
     verdicts: str | Sequence[str] | None
     """Only queries with these verdicts, separated by commas: recognized, ambiguous, unknown; all if left out. Events
@@ -351,7 +397,7 @@ class QueryOrEnrol(TypedDict, total=False):
     """Metres in the map's frame; with x."""
 
     z: float | None
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: float | None
     """Degrees, WGS 84."""
@@ -437,7 +483,7 @@ class QueryMaps(TypedDict, total=False):
     """Metres in the map's frame; with x."""
 
     z: float | None
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: float | None
     """Degrees, WGS 84."""
@@ -510,6 +556,11 @@ class QueryMaps(TypedDict, total=False):
     verify: Literal["auto", "always", "never"]
     """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
     where the scores leave doubt.
+    """
+
+    format: Literal["json", "geopose", "geopose-ypr"] | None
+    """geopose: an OGC GeoPose with a quaternion; geopose-ypr: with yaw, pitch and roll. If left out, the Accept
+    header decides (`application/geopose+json`), and json is the default.
     """
 
 
@@ -748,6 +799,13 @@ class ReadAudit(TypedDict, total=False):
     """Only lines of this time or earlier."""
 
 
+class ReadHistory(TypedDict, total=False):
+    """Parameters of ``/v1/service/history``."""
+
+    hours: float
+    """Hours until now."""
+
+
 class NewMap(TypedDict, total=False):
     """The settings of a new map."""
 
@@ -778,6 +836,9 @@ class NewMap(TypedDict, total=False):
     learning: LearningSetting
     """How the map learns from the runs of its robots."""
 
+    alarms: AlarmSetting
+    """From which numbers on trends of the health report become events."""
+
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
 
@@ -806,6 +867,9 @@ class MapChanges(TypedDict, total=False):
 
     learning: LearningChanges | None
     """null: nothing is learnt from now on."""
+
+    alarms: AlarmChanges | None
+    """null: no alarm is raised from now on."""
 
     calibration: CalibrationChanges | None
 
@@ -892,6 +956,28 @@ class Pruning(TypedDict, total=False):
     """The largest number of queries."""
 
 
+class Erasing(TypedDict, total=False):
+    """Which frames are erased; without any, what places that were deleted before have left."""
+
+    ids: Sequence[str] | None
+    """Places of these ids, with their looks; `p7/8f3a0c52d41b9e07` is one look of `p7`."""
+
+    filter: PlaceConditions | None
+    """Places that fulfil these conditions, at least one. With a time or a camera, and no traverse or metadata, also
+    looks, frames for review, answers and notes of runs of that time and camera.
+    """
+
+    session: str | None
+    """Frames for review, answers and notes of this session, which ends, and the looks that the map has learnt from
+    it; also if it ended long ago.
+    """
+
+    bags: bool
+    """Also remove the bags of the map that wait to be enrolled, whatever they have. Otherwise, and where a job or an
+    upload uses one, the result names them as `waiting_bags`: what they have is not looked at.
+    """
+
+
 class Merging(TypedDict, total=False):
     """Which map is merged into this one, and how conflicts are solved."""
 
@@ -964,6 +1050,9 @@ class NewKey(TypedDict, total=False):
     maps: Sequence[str] | None
     """Limit it to these maps; null or left out: all maps."""
 
+    learn: bool
+    """Whether maps that learn do so from the runs of its holder. An option of the role enrol; admin includes it."""
+
     expires_at: datetime | str | None
     """When it expires; null or left out: never."""
 
@@ -976,6 +1065,9 @@ class KeyChanges(TypedDict, total=False):
 
     maps: Sequence[str] | None
     """Some of the present ones; null: all maps."""
+
+    learn: bool | None
+    """false: no map learns from its runs any more."""
 
     expires_at: datetime | str | None
     """Not later than now; null: never."""
@@ -1014,6 +1106,42 @@ class LabelOrder(TypedDict, total=False):
 
     discard: bool
     """It is thrown away."""
+
+
+class RecordingOrder(TypedDict, total=False):
+    """Which frames of a bag are enrolled, and how; as the options of ``placerec enrol``."""
+
+    sequence: str | None
+    """The traverse; null: as the file is called."""
+
+    id_prefix: str
+    """Before the ids, which are made of topic and stamp."""
+
+    camera: str | None
+    """Of the map; its mask is applied."""
+
+    topic: str | None
+
+    pose_topic: str | None
+
+    fixed_frame: str | None
+
+    moving_frame: str | None
+
+    largest_gap: float
+    """Seconds between poses that are bridged."""
+
+    every_metres: float | None
+
+    every_degrees: float | None
+
+    every_seconds: float | None
+
+    keep_standing: bool
+    """Also enrol frames in which nothing changes, as where the robot stood."""
+
+    align: bool
+    """Then find which frames show places that the map had already."""
 
 
 class Label(TypedDict):
@@ -1104,7 +1232,7 @@ class NewPlace(TypedDict):
     """Metres in the map's frame; with x."""
 
     z: NotRequired[float | None]
-    """Metres in the map's frame; beside x and y."""
+    """Metres: in the map's frame beside x and y; above the ellipsoid of WGS 84 beside a latitude."""
 
     latitude: NotRequired[float | None]
     """Degrees, WGS 84."""
@@ -1130,6 +1258,16 @@ class NewPlace(TypedDict):
     metadata: NotRequired[Mapping[str, Any]]
 
 
+class AlarmChanges(TypedDict):
+    """Changes of what raises an alarm; null: never."""
+
+    worse_places: NotRequired[int | None]
+
+    changed_places: NotRequired[int | None]
+
+    quiet_stretches: NotRequired[int | None]
+
+
 class CalibrationChanges(TypedDict):
     """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
@@ -1143,6 +1281,43 @@ class CalibrationChanges(TypedDict):
     """
 
 
+class Pose(TypedDict):
+    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``z`` is in metres: in
+    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. There it is a
+    statement that is handed on; distances on the Earth are those along the ground. ``heading`` is in degrees:
+    counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is normalized to
+    [0, 360).
+    """
+
+    x: NotRequired[float | None]
+
+    y: NotRequired[float | None]
+
+    z: NotRequired[float | None]
+
+    latitude: NotRequired[float | None]
+
+    longitude: NotRequired[float | None]
+
+    heading: NotRequired[float | None]
+
+
+class RejectedGround(TypedDict):
+    """A stretch of new ground that a person has rejected."""
+
+    stretch: str
+    """Its id."""
+
+    run: str
+    """The run that proposed it."""
+
+    at: datetime | str
+    """When it was rejected."""
+
+    poses: Sequence[Pose]
+    """Where it is, in the order of the run."""
+
+
 class LearningChanges(TypedDict):
     """Changes of how a map learns from runs; null restores a default."""
 
@@ -1151,6 +1326,15 @@ class LearningChanges(TypedDict):
     least_probability: NotRequired[float | None]
 
     most_looks: NotRequired[int | None]
+
+    most_places: NotRequired[int | None]
+
+    new_ground: NotRequired[bool | None]
+
+    calibration: NotRequired[Literal["off", "propose", "auto"] | None]
+
+    rejected_ground: NotRequired[Sequence[RejectedGround] | None]
+    """Those that stay rejected; null: none."""
 
 
 class ReviewChanges(TypedDict):
@@ -1161,6 +1345,19 @@ class ReviewChanges(TypedDict):
     most_frames: NotRequired[int | None]
 
     most_bytes: NotRequired[int | None]
+
+
+class AlarmSetting(TypedDict):
+    """From which numbers on the trends of a map raise an alarm; null: never."""
+
+    worse_places: NotRequired[int | None]
+    """Places that get worse."""
+
+    changed_places: NotRequired[int | None]
+    """Places that have changed: runs pass them, while single frames fail."""
+
+    quiet_stretches: NotRequired[int | None]
+    """Stretches that nobody drives any more."""
 
 
 class LearningSetting(TypedDict):
@@ -1176,7 +1373,29 @@ class LearningSetting(TypedDict):
     """How sure the rest of a run must be of a frame's place for the frame to be proposed."""
 
     most_looks: NotRequired[int]
-    """Looks that a place has at most by what it learns, its first included."""
+    """Looks that a place has at most by what it learns, its first and those that people added included."""
+
+    most_places: NotRequired[int | None]
+    """Places with learnt looks, and places of new ground, that the map has at most together: then it takes no look
+    for a further place by itself, and no stretch; null: no limit.
+    """
+
+    new_ground: NotRequired[bool]
+    """Whether stretches of runs that leave the map and come back are stored for review, too. A person accepts them,
+    whatever the mode; with the mode off there are none.
+    """
+
+    calibration: NotRequired[Literal["off", "propose", "auto"]]
+    """Whether the map calibrates itself: by a traverse, as soon as it is aligned with others, and by frames whose
+    place a run knows beyond doubt (with the mode off there are none). propose: what they would change is measured,
+    as by a dry run of `calibrate`. auto: it is stored, by runs once those of two robots, or two half a day apart,
+    tell it, unless a person has calibrated the map. off: neither.
+    """
+
+    rejected_ground: NotRequired[Sequence[RejectedGround]]
+    """Stretches that a person has rejected: no run proposes this ground again. One that is taken out of the list may
+    be proposed again.
+    """
 
 
 class ReviewSetting(TypedDict):

@@ -45,8 +45,16 @@ class RoleTooLow(Problem):
     """403 ``role-too-low``: The key's role does not allow this."""
 
 
+class SessionOfAnother(Problem):
+    """403 ``session-of-another``: The session belongs to another key."""
+
+
 class NoThumbnail(Problem):
     """404 ``no-thumbnail``: The map keeps no picture of the place."""
+
+
+class NotLocalized(Problem):
+    """404 ``not-localized``: The frame was not recognized."""
 
 
 class UnknownCamera(Problem):
@@ -85,12 +93,20 @@ class UnknownPlace(Problem):
     """404 ``unknown-place``: The place does not exist."""
 
 
+class UnknownRecording(Problem):
+    """404 ``unknown-recording``: Nothing of the recording is here."""
+
+
 class UnknownSequence(Problem):
     """404 ``unknown-sequence``: The sequence does not exist."""
 
 
 class UnknownSession(Problem):
     """404 ``unknown-session``: The session does not exist."""
+
+
+class UnknownStretch(Problem):
+    """404 ``unknown-stretch``: No such stretch waits for review."""
 
 
 class UnknownTopic(Problem):
@@ -101,8 +117,16 @@ class MethodNotAllowed(Problem):
     """405 ``method-not-allowed``: The resource does not support this method."""
 
 
+class NoGeopose(Problem):
+    """406 ``no-geopose``: The answer has no GeoPose."""
+
+
 class HeadTooSlow(Problem):
     """408 ``head-too-slow``: The request did not arrive in time."""
+
+
+class BackupFolderMissing(Problem):
+    """409 ``backup-folder-missing``: There is no folder for backups."""
 
 
 class BatchOutOfOrder(Problem):
@@ -141,6 +165,10 @@ class LastAdminKey(Problem):
     """409 ``last-admin-key``: No key could manage the service any more."""
 
 
+class LookNameTaken(Problem):
+    """409 ``look-name-taken``: Another frame of the place has the name of this look."""
+
+
 class MapExists(Problem):
     """409 ``map-exists``: A map of this id already exists."""
 
@@ -151,6 +179,14 @@ class MergeConflict(Problem):
 
 class PlaceTaken(Problem):
     """409 ``place-taken``: The place has another frame."""
+
+
+class RecordingInUse(Problem):
+    """409 ``recording-in-use``: A job reads the recording."""
+
+
+class RecordingOffset(Problem):
+    """409 ``recording-offset``: The piece does not continue the recording."""
 
 
 class RepeatedLook(Problem):
@@ -357,6 +393,10 @@ class UnknownTransferCoding(Problem):
     """501 ``unknown-transfer-coding``: The transfer coding is not known."""
 
 
+class BackupIncomplete(Problem):
+    """503 ``backup-incomplete``: Some maps could not be saved."""
+
+
 class DataDirectoryLocked(Problem):
     """503 ``data-directory-locked``: Another process uses the data directory."""
 
@@ -395,6 +435,10 @@ class JobQueueFull(Problem):
 
 class KeysUnreadable(Problem):
     """503 ``keys-unreadable``: The keys cannot be read."""
+
+
+class MapBusy(Problem):
+    """503 ``map-busy``: What is to be erased is still being read."""
 
 
 class MapQuarantined(Problem):
@@ -475,7 +519,9 @@ BY_SLUG: dict[str, type[Problem]] = {
     "foreign-page": ForeignPage,
     "map-forbidden": MapForbidden,
     "role-too-low": RoleTooLow,
+    "session-of-another": SessionOfAnother,
     "no-thumbnail": NoThumbnail,
+    "not-localized": NotLocalized,
     "unknown-camera": UnknownCamera,
     "unknown-explanation": UnknownExplanation,
     "unknown-frame": UnknownFrame,
@@ -485,11 +531,15 @@ BY_SLUG: dict[str, type[Problem]] = {
     "unknown-map": UnknownMap,
     "unknown-path": UnknownPath,
     "unknown-place": UnknownPlace,
+    "unknown-recording": UnknownRecording,
     "unknown-sequence": UnknownSequence,
     "unknown-session": UnknownSession,
+    "unknown-stretch": UnknownStretch,
     "unknown-topic": UnknownTopic,
     "method-not-allowed": MethodNotAllowed,
+    "no-geopose": NoGeopose,
     "head-too-slow": HeadTooSlow,
+    "backup-folder-missing": BackupFolderMissing,
     "batch-out-of-order": BatchOutOfOrder,
     "frame-needed": FrameNeeded,
     "frame-out-of-order": FrameOutOfOrder,
@@ -499,9 +549,12 @@ BY_SLUG: dict[str, type[Problem]] = {
     "key-exists": KeyExists,
     "key-widened": KeyWidened,
     "last-admin-key": LastAdminKey,
+    "look-name-taken": LookNameTaken,
     "map-exists": MapExists,
     "merge-conflict": MergeConflict,
     "place-taken": PlaceTaken,
+    "recording-in-use": RecordingInUse,
+    "recording-offset": RecordingOffset,
     "repeated-look": RepeatedLook,
     "stream-taken": StreamTaken,
     "too-many-keys": TooManyKeys,
@@ -553,6 +606,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "invalid-keypoints": InvalidKeypoints,
     "storage-failure": StorageFailure,
     "unknown-transfer-coding": UnknownTransferCoding,
+    "backup-incomplete": BackupIncomplete,
     "data-directory-locked": DataDirectoryLocked,
     "data-directory-too-new": DataDirectoryTooNew,
     "data-directory-too-old": DataDirectoryTooOld,
@@ -563,6 +617,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "job-lost": JobLost,
     "job-queue-full": JobQueueFull,
     "keys-unreadable": KeysUnreadable,
+    "map-busy": MapBusy,
     "map-quarantined": MapQuarantined,
     "memory-full": MemoryFull,
     "missing-extra": MissingExtra,

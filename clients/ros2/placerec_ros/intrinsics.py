@@ -72,7 +72,11 @@ def _distortion(message: Any) -> tuple[str, list[float]]:
     return model, used
 
 
-def camera_name(intrinsics: dict[str, Any]) -> str:
-    """A name that cameras with the same intrinsics share, and no others."""
+def camera_name(intrinsics: dict[str, Any], label: str = "") -> str:
+    """A name that cameras with the same intrinsics share, and no others.
+
+    Args:
+        label: the camera's name among those of a rig, which does not share its name with the others.
+    """
     text = json.dumps(intrinsics, sort_keys=True)
-    return "ros-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    return ("ros-" + hashlib.sha256(text.encode()).hexdigest()[:8] + (f"-{label}" if label else ""))[:64]

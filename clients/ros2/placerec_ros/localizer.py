@@ -11,23 +11,23 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from placerec_client import Client, DeadlineExceeded, InvalidOdometry, PlacerecError, Problem
-from placerec_ros.frame_queue import Frame, FrameQueue
+from placerec_ros.frame_queue import Frame, FrameQueue, Moments
 from placerec_ros.fusion import Fix, Fusion
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
 from placerec_ros.parameters import Settings
 from placerec_ros.pictures import UnfitPicture, picture_of
 from placerec_ros.planar import Planar
-from placerec_ros.pose import PoseEstimate, estimate, metric
-from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
+from placerec_ros.pose import PoseEstimate, estimate, estimate_of_rig, in_metres, metric
+from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, ask_together, client_of, moment_of
 from placerec_ros.track import Array
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
@@ -80,17 +80,17 @@ class Drive:
     """A drive on which the robot enrols images.
 
     origin: of its odometry; with another one it is over.
-    last: the pose by odometry of the last image that was enrolled.
+    last: the pose by odometry of the last image of each camera that was enrolled.
     """
 
     origin: str
-    last: Planar | None = None
+    last: dict[str, Planar] = field(default_factory=dict)
 
-    def goes_on(self, odom: Planar, metres: float, degrees: float) -> bool:
-        """Whether the robot has gone so many metres, or turned by so many degrees, since the last one."""
-        if self.last is None:
+    def goes_on(self, camera: str, odom: Planar, metres: float, degrees: float) -> bool:
+        """Whether the robot has gone so many metres, or turned by so many degrees, since the last one of a camera."""
+        if camera not in self.last:
             return True
-        step = self.last.inverse().then(odom)
+        step = self.last[camera].inverse().then(odom)
         return math.hypot(step.x, step.y) >= metres or abs(math.degrees(step.yaw)) >= degrees
 
 
@@ -105,22 +105,26 @@ class Localizer:
         self._settings, self._outlet, self._health = settings, outlet, health
         self.queue = FrameQueue(settings.queue_length)
         self.odometer = Odometer(settings.speed_limit)
-        self._latest: Frame | None = None
-        self._intrinsics: dict[str, Any] | None = None
+        self._moments: Moments | None = None
+        if settings.rig_query:
+            self._moments = Moments(settings.camera_names, round(settings.rig_tolerance * NANOSECONDS))
+        self._latest: dict[str, Frame] = {}
+        self._intrinsics: dict[str, dict[str, Any] | None] = {}
         self._camera_due = 0.0
-        self.mount: Planar | None = None
-        """Where the camera is on the robot, by /tf_static; None if that is not known. The node sets it."""
+        self.mounts: dict[str, Planar] = {}
+        """Where cameras are on the robot, by /tf_static, as far as that is known. The node sets it."""
         self._wanted = True
-        self._let_in = 0
+        self._let_in: dict[str, int] = {}
         self._commands: deque[tuple[Callable[[], Done], Future[Done]]] = deque()
         self._wake = threading.Event()
         self._active = self._stopped = False
         self._generation = 0
         # The fields below belong to the worker.
         self._client: Client | None = None
-        self._run: Run | None = None
+        self._runs: dict[str, Run] = {}
         self._run_generation = 0
-        self._sent: Frame | None = None
+        self._sent: dict[str, Frame] = {}
+        self._camera = ""  # that of the frame under way
         self._fusion = Fusion()
         self.fix: Fix | None = None
         """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
@@ -138,15 +142,16 @@ class Localizer:
 
     def add(self, frame: Frame) -> None:
         """Take in a frame; it is sent if frames are wanted, and not more often than they may be."""
-        self._latest = frame
+        self._latest[frame.camera] = frame
         if self._settings.on_demand and not self._wanted and self._driving is None:
             self._health.counts["frames not wanted"] += 1
             return
         if self._too_soon(frame):
             self._health.counts["frames above the rate limit"] += 1
             return
-        self.queue.put(frame)
-        self._wake.set()
+        for one in [frame] if self._moments is None else self._moments.add(frame):
+            self.queue.put(one)
+            self._wake.set()
 
     def want(self) -> None:
         """Send frames until it is known again where the robot is."""
@@ -155,15 +160,15 @@ class Localizer:
     def _too_soon(self, frame: Frame) -> bool:
         """Whether a frame comes too early after the last one that was let in; one of an earlier time does not."""
         now = frame.stamp or round(frame.arrived * NANOSECONDS)
-        if self._settings.rate_limit and 0 <= now - self._let_in < NANOSECONDS / self._settings.rate_limit * 0.999:
+        last = self._let_in.get(frame.camera, 0)
+        if self._settings.rate_limit and 0 <= now - last < NANOSECONDS / self._settings.rate_limit * 0.999:
             return True
-        self._let_in = now
+        self._let_in[frame.camera] = now
         return False
 
-    def camera(self, intrinsics: dict[str, Any] | None) -> None:
-        """Take in the camera's intrinsics; None if the message has none."""
-        self._intrinsics = intrinsics
-        self._camera_due = 0.0
+    def camera(self, intrinsics: dict[str, Any] | None, camera: str = "") -> None:
+        """Take in a camera's intrinsics; None if the message has none."""
+        self._intrinsics[camera] = intrinsics
 
     def change(self, settings: Settings) -> None:
         """Take in settings whose live parameters have changed."""
@@ -181,7 +186,9 @@ class Localizer:
         self._active = False
         self._generation += 1
         self.queue.clear()
-        self._latest = None
+        if self._moments is not None:
+            self._moments.clear()
+        self._latest.clear()
         self._wake.set()
 
     def stop(self, patience: float) -> None:
@@ -226,7 +233,7 @@ class Localizer:
                 self._wake.clear()
                 self._work_once()
         finally:
-            self._end_run()
+            self._end_runs()
             for _, future in self._commands:
                 future.set_result(Done(False, "The node was cleaned up before it came to this."))
             if self._client is not None:
@@ -247,8 +254,12 @@ class Localizer:
             elif time.monotonic() < self._paused_until:
                 return
             elif self._active and (frame := self.queue.take(time.monotonic() - self._settings.deadline)) is not None:
-                step = self._locate if self._driving is None else self._enrol_keyframe
-                self._guarded(lambda frame=frame, step=step: step(frame))  # type: ignore[misc]
+                if self._driving is not None:
+                    for one in frame.moment:
+                        self._guarded(lambda frame=one: self._enrol_keyframe(frame))  # type: ignore[misc]
+                else:
+                    step = self._locate if self._moments is None else self._locate_rig
+                    self._guarded(lambda frame=frame, step=step: step(frame))  # type: ignore[misc]
             else:
                 if time.monotonic() - self._heard >= IDLE_CHECK:
                     self._guarded(self._check_service)
@@ -276,7 +287,7 @@ class Localizer:
                 self._health.begins("service", str(reason), ERROR)
                 self._rest_longer()
         except Exception as error:  # the thread has to live on
-            self._run = None
+            self._runs.pop(self._camera, None)
             self._health.begins("node", f"The node failed with {type(error).__name__}: {error}", ERROR)
             self._rest_longer()
         else:
@@ -285,15 +296,15 @@ class Localizer:
     def _react(self, problem: Problem) -> None:
         """Decide what a problem means for the frames to come."""
         if problem.slug in SESSION_GONE:
-            self._run = None  # a new one begins with the next frame
+            self._runs.pop(self._camera, None)  # a new one begins with the next frame
             self._health.begins("session", f"The session ended: {problem}", OK)
-        elif problem.status in OF_THE_FRAME and self._run is not None:
+        elif problem.status in OF_THE_FRAME and self._camera in self._runs:
             self._health.frame(f"The service refused an image: {problem}")
         elif problem.status in (429, 503, 504):
             self._health.begins("load", f"The service has no room for a frame: {problem} ({problem.slug})")
             self._rest_longer(problem.retry_after or 0.0)
         else:
-            self._run = None  # a setting, a key or the map has to change; then a run can begin
+            self._runs.clear()  # a setting, a key or the map has to change; then runs can begin
             self._health.begins("map", f"The service refuses: {problem} ({problem.slug})", ERROR)
             self._rest_longer()
 
@@ -314,38 +325,90 @@ class Localizer:
     # ---- frames
 
     def _locate(self, frame: Frame) -> None:
-        if not self._in_order(frame):
+        self._camera = frame.camera
+        if not self._in_order(frame) or not self._is_placed(frame.camera):
             return
         generation = self._generation
         picture = picture_of(frame.message)
-        if self._settings.use_camera_info and self._intrinsics is None and time.monotonic() < self._camera_due:
-            self._health.counts["frames before the first CameraInfo"] += 1
+        if self._waits_for_info(frame.camera):
             return
-        run = self._running()
+        run = self._running(frame.camera)
         # Odometry's own pose: a frame without an answer may have reached the session, and its motion must count once.
-        odometry = self.odometer.odometry(frame.stamp, self._mount().yaw) if frame.stamp else None
+        odometry = self.odometer.odometry(frame.stamp, self._mount(frame.camera).yaw) if frame.stamp else None
         began = time.monotonic()
         answer = run.send(picture, frame.number, frame.stamp, odometry)
         took = time.monotonic() - began
+        self._was_answered((frame,))
+        if generation != self._generation:
+            return  # deactivated meanwhile
+        flat = in_metres(answer, self._settings.origin)
+        found = estimate(flat, run.radius)
+        self._remark_pose(flat, found)
+        of_robot = None if found is None else found.of_robot(self._mount(frame.camera))
+        self._give_out(frame, answer, of_robot, answer["single"].get("revision"), took)
+        self._annotate(frame, picture, run)
+
+    def _locate_rig(self, moment: Frame) -> None:
+        """Ask the frames of one moment in one query."""
+        frames, pictures, runs = [], {}, {}
+        for frame in moment.moment:
+            self._camera = frame.camera
+            if not self._in_order(frame) or not self._is_placed(frame.camera) or self._waits_for_info(frame.camera):
+                continue
+            try:
+                pictures[frame.camera] = picture_of(frame.message)
+            except UnfitPicture as error:
+                self._health.frame(f"{frame.camera}: {error}.")
+                continue
+            runs[frame.camera] = self._running(frame.camera)
+            frames.append(frame)
+        if not frames:
+            return
+        generation, first = self._generation, frames[0]
+        began = time.monotonic()
+        answer = ask_together(self._open(), self._settings, pictures, runs)
+        took = time.monotonic() - began
+        self._was_answered(frames)
+        if generation != self._generation:
+            return  # deactivated meanwhile
+        for one in answer["frames"]:
+            if one["problem"] is not None:
+                self._health.frame(f"The service refused an image of {one['frame']}: {one['problem']['detail']}")
+        flat, run = in_metres(answer, self._settings.origin), runs[first.camera]
+        mounts = {name: self._mount(name) for name in runs}
+        cameras = {name: one.camera for name, one in runs.items()}
+        yaw = None if self.fix is None else self.fix.track.robot.yaw
+        found = estimate_of_rig(flat, mounts, cameras, run.radius, yaw)
+        self._remark_pose(flat, found)
+        revision = answer["maps"][0]["revision"]
+        run.of_revision(revision)
+        self._give_out(replace(first, camera=",".join(pictures)), answer, found, revision, took)
+        self._annotate(first, pictures[first.camera], run)
+
+    def _waits_for_info(self, camera: str) -> bool:
+        """Whether the first CameraInfo of a camera is still waited for."""
+        waits = self._settings.use_camera_info and camera not in self._intrinsics
+        if waits and time.monotonic() < self._camera_due:
+            self._health.counts["frames before the first CameraInfo"] += 1
+            return True
+        return False
+
+    def _was_answered(self, frames: Sequence[Frame]) -> None:
+        """Note that the service has answered frames."""
         self._heard_from_service()
         for kind in ("map", "load", "session"):
             self._health.over(kind)
-        self._sent = frame
-        if generation != self._generation:
-            return  # deactivated meanwhile
-        answered = self._judged(frame, answer, run, took)
-        self._health.answered(took, None if answered.robot is None else str(moment_of(frame.stamp) or "no stamp"))
-        self._outlet.answered(answered)
-        self._annotate(frame, picture, run)
+        self._sent |= {frame.camera: frame for frame in frames}
 
     def _in_order(self, frame: Frame) -> bool:
         """Whether the frame was taken after the last one; a clock that was set back begins a new run."""
-        if self._sent is None or not frame.stamp or not self._sent.stamp or frame.stamp >= self._sent.stamp:
+        sent = self._sent.get(frame.camera)
+        if sent is None or not frame.stamp or not sent.stamp or frame.stamp >= sent.stamp:
             return True
-        if frame.stamp < self._sent.stamp - CLOCK_JUMP * NANOSECONDS:
+        if frame.stamp < sent.stamp - CLOCK_JUMP * NANOSECONDS:
             self._mapping = False
             self._forget()
-            self._end_run()
+            self._end_runs()
             return True
         self._health.counts["frames out of order"] += 1
         return False
@@ -356,46 +419,68 @@ class Localizer:
             self._run_generation = self._generation
             self._driving = None
             self._forget()
-            self._end_run()
+            self._end_runs()
 
-    def _running(self) -> Run:
-        """The present run; it begins if there is none, and anew when intrinsics come or change."""
+    def _is_placed(self, camera: str) -> bool:
+        """Whether a camera can be used: of several, one whose place on the robot is not known would turn it around."""
+        if not self._settings.camera_names or camera in self.mounts:
+            self._health.over(f"place of {camera}")
+            return True
+        self._health.counts["frames of cameras without a place on the robot"] += 1
+        self._health.begins(f"place of {camera}", f"The camera {camera} waits for /tf_static to say where it is.")
+        return False
+
+    def _running(self, camera: str) -> Run:
+        """The present run of a camera; it begins if there is none, and anew when intrinsics come or change."""
         self._renew()
-        known = self._intrinsics if self._settings.use_camera_info else None
-        if self._run is not None and known is not None and self._run.intrinsics != known:
-            self._end_run()
-        if self._run is None:
-            self._run = Run(self._open(), self._settings, self._health, known)
-        return self._run
+        known = self._intrinsics.get(camera) if self._settings.use_camera_info else None
+        run = self._runs.get(camera)
+        if run is not None and known is not None and run.intrinsics != known:
+            self._end_run(camera)
+            run = None
+        if run is None:
+            run = self._runs[camera] = Run(self._open(), self._settings, self._health, known, camera)
+        return run
 
-    def _judged(self, frame: Frame, answer: Mapping[str, Any], run: Run, took: float) -> Answered:
-        found = estimate(answer, run.radius)
-        if found is None and answer["verdict"] == "recognized":
-            pose = answer["place"]["pose"] if answer["place"] else None
-            kind = "no pose" if not pose else "a pose in degrees; only one in metres is published"
+    def _first(self) -> str:
+        """The camera by whose run the map is read where none is meant."""
+        return next(iter(self._settings.camera_names), "")
+
+    def _remark_pose(self, flat: Mapping[str, Any], found: PoseEstimate | None) -> None:
+        """Say so if a place is recognized, and has no pose in metres."""
+        if found is not None:
+            self._health.over("pose")
+        elif flat["verdict"] == "recognized":
+            pose = flat["place"]["pose"] if flat["place"] else None
+            kind = "no pose" if not pose else "a pose in degrees: the parameter datum makes metres of it"
             if not metric(pose):
                 self._health.begins("pose", f"The robot is recognized, but the place has {kind}.")
-        elif found is not None:
-            self._health.over("pose")
-        of_robot = None if found is None else found.of_robot(self._mount())
+
+    def _give_out(
+        self, frame: Frame, answer: Mapping[str, Any], of_robot: PoseEstimate | None, revision: int | None, took: float
+    ) -> None:
+        """Take in the robot's pose by an answer, None if it gives none, and hand everything to the outlet."""
         fix = self._fuse(frame, of_robot)
         if fix is not None and fix.is_within(self._settings.position_limit, self._settings.heading_limit):
             self._wanted = False
         self._health.fact("verdict", answer["verdict"])
+        self._health.answered(took, None if of_robot is None else str(moment_of(frame.stamp) or "no stamp"))
         report = {
             "stamp": frame.stamp / NANOSECONDS,
             "frame_id": frame.message.header.frame_id,
+            "camera": frame.camera,
             "number": frame.number,
             "map": self._settings.map,
-            "revision": answer["single"].get("revision"),
+            "revision": revision,
             "verdict": answer["verdict"],
             "probability": answer["probability"],
             "place": None if answer["place"] is None else answer["place"]["id"],
-            "pose_source": None if found is None else found.source,
+            "pose_source": None if of_robot is None else of_robot.source,
+            "filtered": None if fix is None else _filtered(fix),
             "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
-        return Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix)
+        self._outlet.answered(Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix))
 
     def _fuse(self, frame: Frame, found: PoseEstimate | None) -> Fix | None:
         """Take in where the robot is by one answer; where it was at its frame, None if odometry has nothing of then."""
@@ -407,9 +492,9 @@ class Localizer:
         self._health.counts["tracks replaced"] = self._fusion.replaced
         return self.fix
 
-    def _mount(self) -> Planar:
-        """Where the camera is on the robot, or only where it looks if the map has positions of the robot."""
-        known = self.mount
+    def _mount(self, camera: str) -> Planar:
+        """Where a camera is on the robot, or only where it looks if the map has positions of the robot."""
+        known = self.mounts.get(camera)
         if known is None:
             return Planar(0.0, 0.0, math.radians(self._settings.camera_yaw))
         return known if self._settings.poses_of == "camera" else Planar(0.0, 0.0, known.yaw)
@@ -436,9 +521,15 @@ class Localizer:
         if png is not None and generation == self._generation:
             self._outlet.picture(frame, png)
 
-    def _end_run(self) -> None:
-        """End the session, if the service lets us; it ends by itself otherwise."""
-        run, self._run, self._sent = self._run, None, None
+    def _end_runs(self) -> None:
+        """End the sessions of all cameras."""
+        for camera in [*self._runs, *self._sent]:
+            self._end_run(camera)
+
+    def _end_run(self, camera: str) -> None:
+        """End a camera's session, if the service lets us; it ends by itself otherwise."""
+        run = self._runs.pop(camera, None)
+        self._sent.pop(camera, None)
         if run is not None:
             with suppress(PlacerecError):
                 run.end()
@@ -471,10 +562,10 @@ class Localizer:
             return Done(False, "The node is not active.")
         self._mapping = False
         self._forget()
-        self._end_run()
+        self._end_runs()
         self._paused_until = 0.0
-        run = self._running()
-        return Done(True, f"The session {run.id} began.")
+        run = self._running(self._first())
+        return Done(True, f"The session {run.id} began." if run.id else "The robot is looked for anew.")
 
     def _place(self, robot: Planar, covariance: Array, stamp: int) -> Done:
         if not self._active:
@@ -483,20 +574,24 @@ class Localizer:
         if odom is None:
             return Done(False, "There is no odometry, so the pose cannot be followed.")
         self._forget()
-        self._end_run()
+        self._end_runs()
         self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin)
         return Done(True, f"The robot is believed to be at x {robot.x:.2f}, y {robot.y:.2f}.")
 
     def _enrol_here(self) -> Done:
-        frame = self._present()
         if not self._active:
             return Done(False, "The node is not active.")
-        if frame is None:
+        present = self._present()
+        if not present:
             return Done(False, f"No image has come in the last {FRESH:g} s.")
+        done = [self._enrol_present(frame) for frame in present]
+        return Done(all(one.success for one in done), " ".join(one.message for one in done))
+
+    def _enrol_present(self, frame: Frame) -> Done:
         in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
         if in_odom is None:
             return Done(False, "There is no odometry for the moment of the image, so its pose is not known.")
-        run = self._running()
+        run = self._running(frame.camera)
         if self.odometer.frame == self._settings.map_frame:
             robot = in_odom
         elif self._mapping or run.places() == 0:
@@ -510,7 +605,8 @@ class Localizer:
     def _begin_drive(self) -> Done:
         if not self._active:
             return Done(False, "The node is not active.")
-        if not self._mapping and self.odometer.frame != self._settings.map_frame and self._running().places():
+        is_anew = not self._mapping and self.odometer.frame != self._settings.map_frame
+        if is_anew and self._running(self._first()).places():
             return Done(False, "The map has places. Drive into an empty one, or with odometry in the frame of the map.")
         if not self.odometer.frame:
             return Done(False, "There is no odometry, so no pose is known.")
@@ -536,30 +632,46 @@ class Localizer:
             self._health.begins("keyframes", "Odometry has begun anew, so images are no longer enrolled.")
             return
         self._health.over("keyframes")
-        if not drive.goes_on(odom, self._settings.keyframe_metres, self._settings.keyframe_degrees):
+        if not self._is_placed(frame.camera):
+            return
+        if not drive.goes_on(frame.camera, odom, self._settings.keyframe_metres, self._settings.keyframe_degrees):
             return
         self._enrol(frame, odom)
-        drive.last = odom
+        drive.last[frame.camera] = odom
         self._heard_from_service()
         self._health.counts["keyframes enrolled"] += 1
 
     def _enrol(self, frame: Frame, robot: Planar) -> Done:
         """Enrol a frame at which the robot was at a pose of the map."""
-        run = self._running()
-        camera = robot.then(self._mount())
+        self._camera = frame.camera
+        run = self._running(frame.camera)
+        camera = robot.then(self._mount(frame.camera))
         heading = math.degrees(camera.yaw)
         moment = moment_of(frame.stamp)
         assert moment is not None
         place = f"here-{moment:%Y%m%dT%H%M%S}-{moment.microsecond // 1000:03d}-{secrets.token_hex(2)}"
-        fields = {"x": camera.x, "y": camera.y, "heading": heading % 360, "sequence": self._sequence}
-        if camera.z:
-            fields["z"] = camera.z
+        fields: dict[str, Any] = {"sequence": self._sequence}
+        if (origin := self._settings.origin) is not None:
+            fields["latitude"], fields["longitude"], fields["heading"] = origin.geographic(camera)
+            if origin.altitude is not None:
+                fields["z"] = camera.z + origin.altitude
+        else:
+            fields |= {"x": camera.x, "y": camera.y, "heading": heading % 360} | ({"z": camera.z} if camera.z else {})
         run.enrol(place, picture_of(frame.message), frame.stamp, **fields)
         return Done(True, f"{place} was enrolled at x {camera.x:.2f}, y {camera.y:.2f}, heading {heading % 360:.0f}°.")
 
-    def _present(self) -> Frame | None:
-        frame = self._latest
-        return frame if frame is not None and time.monotonic() - frame.arrived <= FRESH else None
+    def _present(self) -> list[Frame]:
+        """The latest frame of each camera that can be used."""
+        now, several = time.monotonic(), bool(self._settings.camera_names)
+        fresh = [frame for _, frame in sorted(self._latest.items()) if now - frame.arrived <= FRESH]
+        return [frame for frame in fresh if not several or frame.camera in self.mounts]
+
+
+def _filtered(fix: Fix) -> dict[str, Any]:
+    """Where the robot is by all answers, for the JSON: metres, degrees, and the covariance of x, y and yaw, in rad."""
+    robot = fix.track.robot
+    covariance = fix.track.covariance.ravel().tolist()
+    return {"x": robot.x, "y": robot.y, "heading": math.degrees(robot.yaw) % 360, "covariance": covariance}
 
 
 def reason_of(error: PlacerecError) -> PlacerecError:

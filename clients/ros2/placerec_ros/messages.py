@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from array import array
 from collections.abc import Mapping, Sequence
 
@@ -10,15 +11,15 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, NavSatFix, NavSatStatus
 from std_msgs.msg import String
 
 from placerec_ros.frame_queue import Frame
 from placerec_ros.fusion import FLAT, Fix
 from placerec_ros.localizer import Answered
 from placerec_ros.odometry import NANOSECONDS
-from placerec_ros.planar import Planar, quaternion, yaw_of
-from placerec_ros.pose import UNKNOWN_ANGLE, UNKNOWN_HEIGHT
+from placerec_ros.planar import Datum, Planar, quaternion, yaw_of
+from placerec_ros.pose import UNKNOWN_ANGLE, UNKNOWN_HEIGHT, PoseEstimate
 from placerec_ros.track import Array
 
 
@@ -32,6 +33,19 @@ def pose_message(robot: Planar, covariance: Sequence[float], stamp: Time, frame_
     turned = pose.orientation
     turned.x, turned.y, turned.z, turned.w = quaternion(robot.yaw)
     message.pose.covariance = list(covariance)
+    return message
+
+
+def fix_message(found: PoseEstimate, datum: Datum, stamp: Time, frame_id: str) -> NavSatFix:
+    """Where the robot is on the Earth; the altitude is NaN where it is not known."""
+    message = NavSatFix()
+    message.header.stamp, message.header.frame_id = stamp, frame_id
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude, _ = datum.geographic(found.planar)
+    known = datum.altitude is not None and found.covariance[14] < UNKNOWN_HEIGHT
+    message.altitude = found.planar.z + (datum.altitude or 0.0) if known else math.nan
+    message.position_covariance = np.reshape(found.covariance, (6, 6))[:3, :3].ravel().tolist()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message
 
 

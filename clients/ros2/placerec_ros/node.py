@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -27,7 +28,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, NavSatFix
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -81,7 +82,7 @@ class PlacerecNode(LifecycleNode):
         self._outlet_lock = threading.Lock()
         self._publishing = False
         self._subscriptions_made: list[Any] = []
-        self._image_subscription: Any = None
+        self._image_subscriptions: dict[str, Any] = {}
         self._topics: list[Any] = []
         self._repetition = Repetition(1.0, 0.0)
         self._frames_of_robot: StaticFrames | None = None
@@ -89,6 +90,7 @@ class PlacerecNode(LifecycleNode):
         self._initial_pose_sent: PoseWithCovarianceStamped | None = None
         self._frames = 0
         self._heard = {"image": 0.0, "info": 0.0}
+        self._cameras: tuple[str, ...] = ("",)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._waiting = ReentrantCallbackGroup()  # while one of these waits, all other callbacks go on
         self._ask_for("create_map", lambda localizer, _: localizer.create_map())
@@ -139,9 +141,10 @@ class PlacerecNode(LifecycleNode):
         self._answer = self.create_lifecycle_publisher(String, "~/answer", 10)
         self._picture = self.create_lifecycle_publisher(CompressedImage, "~/annotated/compressed", 1)
         self._initial_pose = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "initialpose", 1)
+        self._satellite = self.create_lifecycle_publisher(NavSatFix, "~/fix", 10)
         self._topics = [
             *(self._pose, self._transform, self._filtered, self._answer, self._picture),
-            self._initial_pose,
+            *(self._initial_pose, self._satellite),
         ]
         self._frames_of_robot = StaticFrames() if chosen.use_tf_static and TFMessage is not None else None
         self._tf: Any = None
@@ -159,10 +162,12 @@ class PlacerecNode(LifecycleNode):
         result = super().on_activate(state)
         localizer, chosen = self._made()
         self._heard = {"image": time.monotonic(), "info": 0.0}
-        if chosen.use_camera_info:
-            self._subscribe(CameraInfo, "camera_info", self._on_camera_info, sensor_qos(1))
+        self._cameras = chosen.camera_names or ("",)
+        for camera in self._cameras if chosen.use_camera_info else ():
+            taken = partial(self._on_camera_info, camera)
+            self._subscribe(CameraInfo, _of_camera(camera, "camera_info"), taken, sensor_qos(1))
         self._subscribe(Odometry, "odom", self._on_odometry, sensor_qos(50))
-        self._look_for_images()
+        self._look_for_all_images()
         with self._outlet_lock:
             self._publishing = True
         if self._frames_of_robot is not None:
@@ -211,7 +216,8 @@ class PlacerecNode(LifecycleNode):
             self._publishing = False
         if self._localizer is not None:
             self._localizer.deactivate()
-        self._drop_images()
+        for camera in list(self._image_subscriptions):
+            self._drop_images(camera)
         while self._subscriptions_made:
             self.destroy_subscription(self._subscriptions_made.pop())
 
@@ -236,78 +242,85 @@ class PlacerecNode(LifecycleNode):
         self._subscriptions_made.append(made)
         return made
 
-    def _drop_images(self) -> None:
-        if self._image_subscription is not None:
-            self._subscriptions_made.remove(self._image_subscription)
-            self.destroy_subscription(self._image_subscription)
-            self._image_subscription = None
+    def _drop_images(self, camera: str) -> None:
+        made = self._image_subscriptions.pop(camera, None)
+        if made is not None:
+            self._subscriptions_made.remove(made)
+            self.destroy_subscription(made)
 
-    def _look_for_images(self) -> None:
-        """Subscribe to the images once their type is known; say so if it is none of an image."""
+    def _look_for_all_images(self) -> None:
+        for camera in self._cameras:
+            self._look_for_images(camera)
+
+    def _look_for_images(self, camera: str) -> None:
+        """Subscribe to the images of a camera once their type is known; say so if it is none of an image."""
         _, chosen = self._made()
-        topic = self._image_topic()
+        topic, kind_of = self._image_topic(camera), f"image type {camera}".strip()
         published = {one.topic_type for one in self.get_publishers_info_by_topic(topic)}
         wanted = {name: pair for name, pair in IMAGE_TYPES.items() if chosen.image_type in ("auto", name)}
         fitting = [kind for name, kind in wanted.values() if name in published]
         if published and not fitting:
             self._health.begins(
-                "image type",
+                kind_of,
                 f"The topic {topic} has the type {', '.join(sorted(published))}; the node takes "
                 f"{' or '.join(name for name, _ in wanted.values())}.",
                 ERROR,
             )
             if chosen.image_type == "auto":
-                self._drop_images()
+                self._drop_images(camera)
             return
         if published:
-            self._health.over("image type")
+            self._health.over(kind_of)
         elif chosen.image_type != "auto":
             fitting = [kind for _, kind in wanted.values()]
-        if fitting and (self._image_subscription is None or self._image_subscription.msg_type not in fitting):
-            self._drop_images()
+        made = self._image_subscriptions.get(camera)
+        if fitting and (made is None or made.msg_type not in fitting):
+            self._drop_images(camera)
+            taken = partial(self._on_image, camera)
             try:
-                self._image_subscription = self._subscribe(fitting[0], topic, self._on_image, sensor_qos(QUEUED))
+                self._image_subscriptions[camera] = self._subscribe(fitting[0], topic, taken, sensor_qos(QUEUED))
             except (
                 RCLError
             ) as error:  # the middleware has not forgotten the type from before; the next tick tries again
                 self.get_logger().debug(f"No subscription yet: {error}")
 
-    def _image_topic(self) -> str:
-        """The full name of the topic of images, by image_transport's convention if that is set."""
+    def _image_topic(self, camera: str) -> str:
+        """The full name of a camera's topic of images, by image_transport's convention if that is set."""
         _, chosen = self._made()
-        topic = str(self.resolve_topic_name("image"))
+        topic = str(self.resolve_topic_name(_of_camera(camera, "image")))
         compressed = chosen.image_transport == "compressed" and not topic.endswith("/compressed")
         return f"{topic}/compressed" if compressed else topic
 
-    def _on_image(self, message: Any) -> None:
+    def _on_image(self, camera: str, message: Any) -> None:
         self._frames += 1
         self._heard["image"] = time.monotonic()
         if self._localizer is not None:
-            self._find_camera(message.header.frame_id)
-            self._localizer.add(Frame(self._frames, stamp_of(message), message))
+            self._find_camera(camera, message.header.frame_id)
+            self._localizer.add(Frame(self._frames, stamp_of(message), message, camera=camera))
 
-    def _find_camera(self, frame: str) -> None:
+    def _find_camera(self, camera: str, frame: str) -> None:
         """Tell the localizer where the camera of an image is on the robot, once that is known."""
         localizer, chosen = self._made()
-        if self._frames_of_robot is None or localizer.mount is not None:
+        if self._frames_of_robot is None or camera in localizer.mounts:
             return
         frame, base = chosen.camera_frame or frame, chosen.base_frame or localizer.odometer.child
         found = self._frames_of_robot.between(base, frame) if base and frame else None
         if found is None:
             return
         try:
-            localizer.mount = mount = mount_of(found, frame)
+            localizer.mounts[camera] = mount = mount_of(found, frame)
         except UnfitMount as error:
-            self._health.begins("mount", f"The place of the camera is not used: {error}.")
+            self._health.begins(f"mount {camera}".strip(), f"The place of the camera is not used: {error}.")
         else:
-            self._health.over("mount")
+            self._health.over(f"mount {camera}".strip())
             yaw = math.degrees(mount.yaw)
-            self._health.fact("camera on the robot", f"x {mount.x:.2f} m, y {mount.y:.2f} m, {yaw:.0f}°, by /tf_static")
+            fact = f"camera {camera} on the robot".replace("  ", " ")
+            self._health.fact(fact, f"x {mount.x:.2f} m, y {mount.y:.2f} m, {yaw:.0f}°, by /tf_static")
 
     def _on_static_frames(self, message: Any) -> None:
         if self._localizer is not None and self._frames_of_robot is not None:
             self._frames_of_robot.add(message.transforms)
-            self._localizer.mount = None  # it is found again with the next image
+            self._localizer.mounts = {}  # they are found again with the next images
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         if self._localizer is None or message == self._initial_pose_sent:
@@ -334,7 +347,7 @@ class PlacerecNode(LifecycleNode):
         else:
             self._health.frame(f"An initial pose is not used. {done.message}")
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
+    def _on_camera_info(self, camera: str, message: CameraInfo) -> None:
         if self._localizer is None or self._settings is None:
             return
         localizer, chosen = self._localizer, self._settings
@@ -342,11 +355,11 @@ class PlacerecNode(LifecycleNode):
         try:
             intrinsics = intrinsics_of(message, chosen.rectified)
         except UnfitCamera as error:
-            localizer.camera(None)
-            self._health.begins("camera info", f"The intrinsics are not used: {error}.")
+            localizer.camera(None, camera)
+            self._health.begins(f"camera info {camera}".strip(), f"The intrinsics are not used: {error}.")
         else:
-            localizer.camera(intrinsics)
-            self._health.over("camera info")
+            localizer.camera(intrinsics, camera)
+            self._health.over(f"camera info {camera}".strip())
 
     def _on_odometry(self, message: Odometry) -> None:
         if self._localizer is None:
@@ -397,6 +410,9 @@ class PlacerecNode(LifecycleNode):
             stamp = answered.frame.message.header.stamp
             if (found := answered.estimate) is not None:
                 self._pose.publish(messages.pose_message(found.planar, found.covariance, stamp, chosen.map_frame))
+                if (origin := chosen.origin) is not None:
+                    base = chosen.base_frame or localizer.odometer.child or chosen.map_frame
+                    self._satellite.publish(messages.fix_message(found, origin, stamp, base))
             self._answer.publish(messages.answer_message(answered))
             if answered.fix is not None:
                 filtered = messages.filtered_message(answered.fix, stamp, chosen.map_frame)
@@ -455,7 +471,7 @@ class PlacerecNode(LifecycleNode):
 
     def _tick(self) -> None:
         if self._health.state == "active":
-            self._look_for_images()
+            self._look_for_all_images()
             self._look_for_silence()
         level, text, values = self._health.report()
         if self._localizer is not None:
@@ -470,15 +486,16 @@ class PlacerecNode(LifecycleNode):
         _, chosen = self._made()
         silent = time.monotonic() - self._heard["image"]
         if silent > SILENCE_SECONDS:
-            self._health.begins("images", f"No image has come on {self._image_topic()}.", WARN)
+            expected = ", ".join(map(self._image_topic, self._cameras))
+            self._health.begins("images", f"No image has come on {expected}.", WARN)
             return
         self._health.over("images")
         if not chosen.use_camera_info or self._heard["info"]:
             self._health.over("no camera info")
         elif self._frames:
-            topic = self.resolve_topic_name("camera_info")
+            topics = [self.resolve_topic_name(_of_camera(one, "camera_info")) for one in self._cameras]
             self._health.begins(
-                "no camera info", f"No CameraInfo has come on {topic}: the frames count without intrinsics."
+                "no camera info", f"No CameraInfo has come on {', '.join(topics)}: the frames count without intrinsics."
             )
 
     def _log(self, level: int, sentence: str) -> None:
@@ -502,6 +519,11 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         else:
             made.integer_range = [IntegerRange(from_value=int(parameter.least), to_value=int(parameter.most), step=1)]
     return made
+
+
+def _of_camera(camera: str, topic: str) -> str:
+    """A topic of a camera; that of the only one has no name before it."""
+    return f"{camera}/{topic}" if camera else topic
 
 
 def _is_local(url: str) -> bool:

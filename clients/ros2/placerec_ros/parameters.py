@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from placerec_ros.planar import Datum
+
 MAP_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
 _UNSEEN = (
@@ -59,6 +61,25 @@ PARAMETERS = (
         "Name of the camera in the map. Empty: one named by its intrinsics, so that robots with other cameras"
         " do not share it.",
     ),
+    Parameter(
+        "cameras",
+        "",
+        "Names of several cameras, such as front,left: each has the topics NAME/image and NAME/camera_info, and its "
+        "place by /tf_static.",
+    ),
+    Parameter(
+        "rig_query",
+        False,
+        "Of several cameras: ask their images of one moment together, in one query, instead of each in a session of "
+        "its own.",
+    ),
+    Parameter(
+        "rig_tolerance",
+        0.05,
+        "Seconds by which the stamps of images of one moment may differ.",
+        0.0,
+        1.0,
+    ),
     Parameter("use_camera_info", True, "Send the intrinsics of CameraInfo to the map."),
     Parameter(
         "rectified",
@@ -94,6 +115,12 @@ PARAMETERS = (
         choices=("raw", "compressed"),
     ),
     Parameter("map_frame", "map", "Frame of the map's poses, in all that is published."),
+    Parameter(
+        "datum",
+        "",
+        "Of a map in degrees: latitude,longitude of the origin of map_frame, whose x leads east: 48.8462,2.3464. A "
+        "third number is its altitude in metres above the ellipsoid of WGS 84; without it heights are left out.",
+    ),
     Parameter("odom_frame", "", "Frame of odometry, in the transform. Empty: that of its messages."),
     Parameter(
         "base_frame", "", "Frame of the robot, to find its camera. Empty: the child frame of odometry's messages."
@@ -212,6 +239,9 @@ class Settings:
     map: str
     encoder: str
     camera: str
+    cameras: str
+    rig_query: bool
+    rig_tolerance: float
     use_camera_info: bool
     rectified: bool
     camera_yaw: float
@@ -220,6 +250,7 @@ class Settings:
     image_type: str
     image_transport: str
     map_frame: str
+    datum: str
     odom_frame: str
     base_frame: str
     camera_frame: str
@@ -244,6 +275,16 @@ class Settings:
     keyframe_degrees: float
     sequence: str
     key: str | None
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The names of several cameras; none where there is one."""
+        return _names_of(self.cameras)
+
+    @property
+    def origin(self) -> Datum | None:
+        """The datum; None without one."""
+        return datum_of(self.datum) if self.datum else None
 
     def __repr__(self) -> str:
         return f"<settings of {self.map!r} at {self.url!r}>"  # never the key
@@ -285,6 +326,12 @@ def settings(values: Mapping[str, Any], environment: Mapping[str, str] = os.envi
     address = urlsplit(values["url"])
     if address.scheme not in ("http", "https") or not address.hostname or address.username or address.query:
         raise InvalidParameters("The parameter url has to be an address such as http://127.0.0.1:8000.")
+    if values["cameras"]:
+        _check_cameras(values)
+    elif values["rig_query"]:
+        raise InvalidParameters("The parameter rig_query needs cameras, which names those of the rig.")
+    if values["datum"]:
+        datum_of(values["datum"])
     if not values["map_frame"]:
         raise InvalidParameters("The parameter map_frame has to name a frame.")
     if values["sequence"] and (len(values["sequence"]) > 128 or not TRAVERSE.fullmatch(values["sequence"])):
@@ -294,6 +341,51 @@ def settings(values: Mapping[str, Any], environment: Mapping[str, str] = os.envi
             "and is not '.' or '..'."
         )
     return Settings(**{one.name: values[one.name] for one in PARAMETERS}, key=_key(values["key_file"], environment))
+
+
+CAMERA_TOPIC = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+MOST_CAMERAS = 16
+HIGHEST = 1e5
+"""Metres above or below the ellipsoid; no robot is farther from it."""
+
+
+def _names_of(cameras: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in cameras.split(",")) if cameras else ()
+
+
+def _check_cameras(values: Mapping[str, Any]) -> None:
+    names = _names_of(values["cameras"])
+    if not all(map(CAMERA_TOPIC.fullmatch, names)) or len(set(names)) < len(names) or len(names) > MOST_CAMERAS:
+        raise InvalidParameters(
+            f"The parameter cameras is {values['cameras'][:99]!r}; it is 1 to {MOST_CAMERAS} different names of "
+            "topics, such as front,left."
+        )
+    if not values["use_tf_static"]:
+        raise InvalidParameters("Several cameras need use_tf_static, which says where each of them is on the robot.")
+    for name in ("camera", "camera_frame"):
+        if values[name]:
+            raise InvalidParameters(f"With several cameras the parameter {name} has to be empty, for it names one.")
+
+
+def datum_of(text: str) -> Datum:
+    """The datum of a text ``latitude,longitude[,altitude]``, in degrees and metres.
+
+    Raises:
+        InvalidParameters: it is none.
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    reach = (90, 180, HIGHEST)
+    if len(numbers) not in (2, 3) or not all(abs(one) <= most for one, most in zip(numbers, reach, strict=False)):
+        numbers = []
+    if not numbers or abs(numbers[0]) == 90:
+        raise InvalidParameters(
+            f"The parameter datum is {text[:60]!r}; it is latitude,longitude in degrees, and may have an altitude in "
+            "metres."
+        )
+    return Datum(*numbers)
 
 
 def _check(parameter: Parameter, value: Any) -> None:

@@ -1,4 +1,4 @@
-"""The pose that an answer of a session gives: position, heading and covariance, or nothing."""
+"""The pose that the answer of a session or to a rig gives: position, heading and covariance, or nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from placerec_ros.planar import Planar, wrapped
+from placerec_ros.planar import Datum, Planar, wrapped
 
 UNKNOWN_HEIGHT = 1e6
 """Variance of z in m² where places have none, as the service gives it."""
@@ -63,6 +63,96 @@ def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimat
         if math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"]) <= reach:
             return PoseEstimate(_planar(measured), tuple(map(float, measured["covariance"])), "frame")
     return _of_belief(answer["candidates"], same_place_radius)
+
+
+def in_metres(answer: Mapping[str, Any], datum: Datum | None) -> Mapping[str, Any]:
+    """The answer of a session or of a rig with its poses in degrees as poses in metres about a datum.
+
+    Without a datum it is as it is.
+    """
+    if datum is None:
+        return answer
+
+    def flat(pose: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+        if pose is None or pose.get("latitude") is None:
+            return pose
+        heading = pose.get("heading")
+        made = datum.planar(pose["latitude"], pose["longitude"], heading)
+        turned = None if heading is None else math.degrees(made.yaw)
+        return {**pose, "x": made.x, "y": made.y, "z": datum.height(pose.get("z")), "heading": turned}
+
+    def posed(place: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+        return None if place is None else {**place, "pose": flat(place["pose"])}
+
+    def listed(name: str) -> list[Mapping[str, Any]]:
+        return [{**one, "place": posed(one["place"])} for one in answer[name]]
+
+    if "single" not in answer:
+        return {**answer, "place": posed(answer["place"]), "pose": flat(answer["pose"]), "matches": listed("matches")}
+    return {
+        **answer,
+        "place": posed(answer["place"]),
+        "single": {**answer["single"], "pose": flat(answer["single"].get("pose"))},
+        "candidates": listed("candidates"),
+    }
+
+
+def estimate_of_rig(
+    answer: Mapping[str, Any],
+    mounts: Mapping[str, Planar],
+    cameras: Mapping[str, str | None],
+    same_place_radius: float,
+    yaw: float | None,
+) -> PoseEstimate | None:
+    """The robot's pose by the answer to a rig; None unless it recognizes a place that has a pose in metres.
+
+    The position is that of the answer.  The heading is that of the best match there, less the direction in which its
+    camera looks on the robot.  Which camera that was, the place says, if a camera of the rig has its name.  Otherwise
+    it is the one that turns the robot least.
+
+    Args:
+        answer: ``SeveralAnswer`` as JSON.
+        mounts: where each camera of the rig is on the robot.
+        cameras: the names that the map has for the cameras of the rig.
+        same_place_radius: metres, of the map: places within it count as one.
+        yaw: of the robot so far, in radians; None if it is not known.
+    """
+    found = answer["pose"]
+    if answer["verdict"] != "recognized" or not metric(found) or not found.get("covariance"):
+        return None
+    covariance = np.reshape(np.array(found["covariance"], np.float64), (6, 6))
+    covariance[5, :] = covariance[:, 5] = 0.0
+    here = _planar(found)
+    seen = _seen_by(answer["matches"], here, mounts, cameras, same_place_radius, yaw)
+    covariance[5, 5] = UNKNOWN_ANGLE if seen is None else HEADING_VARIANCE
+    turned, mount = seen or (0.0, Planar(0.0, 0.0, 0.0))
+    camera = Planar(here.x, here.y, turned, here.z)
+    return PoseEstimate(camera, tuple(covariance.ravel().tolist()), "frame").of_robot(mount)
+
+
+def _seen_by(
+    matches: Sequence[Mapping[str, Any]],
+    here: Planar,
+    mounts: Mapping[str, Planar],
+    cameras: Mapping[str, str | None],
+    radius: float,
+    yaw: float | None,
+) -> tuple[float, Planar] | None:
+    """The heading of the best match near a position, in radians, and the mount of the camera that sees it."""
+    for match in matches:
+        pose = match["place"]["pose"]
+        if not metric(pose) or pose.get("heading") is None:
+            continue
+        if math.hypot(pose["x"] - here.x, pose["y"] - here.y) > radius:
+            continue
+        heading, taken = math.radians(pose["heading"]), match["place"].get("camera")
+        named = [mounts[name] for name, camera in cameras.items() if taken is not None and camera == taken]
+        if len(named) == 1:
+            return heading, named[0]
+        if yaw is not None:
+            known = yaw  # of several that it may have been, the one that turns the robot least
+            return heading, min(named or mounts.values(), key=lambda mount: abs(wrapped(heading - mount.yaw - known)))
+    return None
 
 
 def metric(pose: Mapping[str, Any] | None) -> bool:

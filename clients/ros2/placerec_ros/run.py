@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal, cast
 
-from placerec_client import Client, Odometry, Problem
+from placerec_client import Client, Odometry, Problem, Session
 from placerec_client.retry import Retry
 from placerec_ros.health import Health
 from placerec_ros.intrinsics import camera_name
@@ -15,6 +15,8 @@ from placerec_ros.parameters import Settings
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SESSION_GONE = frozenset({"unknown-session", "session-expired", "frame-out-of-order"})
 """Problems after which a new session is begun."""
+MATCHES = 10
+"""Matches of a rig's answer that are read for the robot's heading."""
 NOT_ALLOWED = frozenset({"role-too-low", "map-forbidden", "key-needed", "key-refused"})
 
 
@@ -33,46 +35,70 @@ class Run:
 
     Args:
         intrinsics: of the robot's camera, as the service takes them; None if they are not known.
+        label: the camera's name among those of a rig; empty for the only one.
     """
 
     def __init__(
-        self, client: Client, settings: Settings, health: Health, intrinsics: Mapping[str, Any] | None
+        self,
+        client: Client,
+        settings: Settings,
+        health: Health,
+        intrinsics: Mapping[str, Any] | None,
+        label: str = "",
     ) -> None:
         self._client, self._settings, self._health = client, settings, health
         self._map = client.maps[settings.map]
         self._read_map()
         self.intrinsics = intrinsics
-        self.camera = self._camera(intrinsics)
+        self.camera = self._camera(intrinsics, label)
+        self.id = ""
+        self._session: Session | None = None
+        if settings.rig_query:
+            self._check_encoder()
+        else:
+            self._begin_session()
+
+    def _begin_session(self) -> None:
+        settings = self._settings
         self._session = self._map.sessions.begin(
             advance=settings.advance or None,
             backwards=settings.backwards,
             speed_limit=settings.speed_limit or None,
             camera=self.camera,
-            verify=cast(Literal["auto", "always", "never"], settings.verify),
+            verify=verify_of(settings),
         )
         self.id = self._session.begin().id
-        health.fact("session", self.id)
+        self._health.fact("session", self.id)
+
+    def _check_encoder(self) -> None:
+        """Check that the map has the encoder of the parameters, which a query of a rig does not name."""
+        wanted = self._settings.encoder
+        if wanted and wanted not in (self.encoder, self.encoder.partition("@")[0]):
+            detail = f"The map {self._settings.map} belongs to the encoder {self.encoder}, not to {wanted}."
+            raise Problem({"type": "urn:placerec:problem:wrong-encoder", "detail": detail}, 409)
 
     def _read_map(self) -> None:
         view = self._map.read()
+        self.encoder = view.encoder
         self.radius = float(view.same_place_radius)
         self.revision = view.revision
         self._health.fact("map", f"{view.id}, revision {view.revision}, {view.places} places")
         self._health.fact("encoder", view.encoder)
 
-    def _camera(self, intrinsics: Mapping[str, Any] | None) -> str | None:
+    def _camera(self, intrinsics: Mapping[str, Any] | None, label: str) -> str | None:
         """The name of the camera in the map, which has the intrinsics afterwards if the key allows it."""
         name = self._settings.camera or None
         if intrinsics is None:
             return name
-        name = name or camera_name(dict(intrinsics))
         known = {camera.name: camera for camera in self._map.cameras}
+        if label and _has(known.get(label), intrinsics):
+            self._health.over("camera")
+            return label
+        name = name or camera_name(dict(intrinsics), label)
         there = known.get(name)
-        if there is not None and there.intrinsics is not None:
-            stated = there.intrinsics.model_dump(mode="json")
-            if all(_same(stated.get(key), value) for key, value in intrinsics.items()):
-                self._health.over("camera")
-                return name
+        if _has(there, intrinsics):
+            self._health.over("camera")
+            return name
         mask = None if there is None or there.mask is None else there.mask.model_dump(mode="json")
         definition: Any = {"mask": mask, "intrinsics": dict(intrinsics)}
         try:
@@ -88,6 +114,7 @@ class Run:
 
     def send(self, frame: Any, number: int, stamp: int, odometry: Odometry | None) -> dict[str, Any]:
         """Send a frame; the service's ``SessionAnswer`` as JSON."""
+        assert self._session is not None, "the images of a rig are asked together"
         answer = self._session.send(
             frame,
             odometry=odometry,
@@ -96,8 +123,7 @@ class Run:
             encoder=self._settings.encoder or None,
             deadline=self._settings.deadline,
         )
-        if answer.single.revision is not None and answer.single.revision != self.revision:
-            self._read_map()  # its settings were edited
+        self.of_revision(answer.single.revision)
         return answer.model_dump(mode="json")
 
     def picture(self, frame: Any) -> bytes | None:
@@ -123,8 +149,54 @@ class Run:
         return int(self._map.read().places)
 
     def end(self) -> None:
-        """Delete the session."""
-        self._session.delete()
+        """Delete the session, if there is one."""
+        if self._session is not None:
+            self._session.delete()
+
+    def of_revision(self, revision: int | None) -> None:
+        """Read the map again if an answer is of another revision of its settings."""
+        if revision is not None and revision != self.revision:
+            self._read_map()
+
+
+def ask_together(
+    client: Client, settings: Settings, frames: Mapping[str, Any], runs: Mapping[str, Run]
+) -> dict[str, Any]:
+    """Ask the frames of one moment in one query of a rig; the service's ``SeveralAnswer`` of the one map, as JSON.
+
+    Args:
+        frames: pictures by the names of the rig's cameras.
+        runs: of these cameras.
+
+    Raises:
+        Problem: the map could not answer; and all that ``placerec_client`` raises.
+    """
+    cameras = {name: runs[name].camera for name in frames if runs[name].camera is not None}
+    answer = client.query(
+        frames,
+        maps=[settings.map],
+        cameras=cameras or None,
+        k=MATCHES,
+        verify=verify_of(settings),
+        deadline=settings.deadline,
+    )
+    found = answer.model_dump(mode="json")
+    if (problem := found["maps"][0]["problem"]) is not None:
+        raise Problem(problem, int(found["maps"][0]["status"]))
+    return found
+
+
+def verify_of(settings: Settings) -> Literal["auto", "always", "never"]:
+    """The parameter verify, as the client takes it."""
+    return cast(Literal["auto", "always", "never"], settings.verify)
+
+
+def _has(camera: Any, intrinsics: Mapping[str, Any]) -> bool:
+    """Whether a camera of the map has these intrinsics."""
+    if camera is None or camera.intrinsics is None:
+        return False
+    stated = camera.intrinsics.model_dump(mode="json")
+    return all(_same(stated.get(key), value) for key, value in intrinsics.items())
 
 
 def _same(one: Any, other: Any) -> bool:

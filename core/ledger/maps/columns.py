@@ -101,7 +101,7 @@ def _positions(
     """Kind and position (``Pose.position``) of columns x, y, z, latitude, longitude; NaN is a missing value."""
     there = ~np.isnan(coordinates)
     metric, geographic = there[:, 0] & there[:, 1], there[:, 3] & there[:, 4]
-    whole = (metric & ~there[:, 3:].any(axis=1)) | (geographic & ~there[:, :3].any(axis=1))
+    whole = (metric & ~there[:, 3:].any(axis=1)) | (geographic & ~there[:, :2].any(axis=1))
     nothing = ~there.any(axis=1) & np.isnan(heading)
     for odd in np.flatnonzero(~(whole | nothing))[:1].tolist():
         names = (*("x", "y", "z", "latitude", "longitude"), "heading")

@@ -290,7 +290,12 @@ def room(connection: MapConnection) -> tuple[int, int, int]:
     return int(count), int(size), int(pictures)
 
 
+def delete_pictures(connection: MapConnection, rows: Sequence[int]) -> None:
+    """Delete pictures of frames."""
+    connection.execute(_DELETE_PICTURES, rows=list(rows))
+
+
 def delete_frames(connection: MapConnection, rows: Sequence[int]) -> None:
     """Delete pictures and keypoints of frames."""
-    connection.execute(_DELETE_PICTURES, rows=list(rows))
+    delete_pictures(connection, rows)
     connection.execute(_DELETE_KEYPOINTS, rows=list(rows))

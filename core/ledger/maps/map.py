@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from datetime import datetime
 from typing import Any, overload
 
 import numpy as np
@@ -15,6 +16,7 @@ from core.errors import (
     NoThumbnail,
     RevisionMismatch,
     StorageFailure,
+    TooManyLooks,
     TooManyToDelete,
     UnknownLook,
     UnknownPlace,
@@ -170,13 +172,13 @@ class LedgerMap(ABC):
         if place is None:
             raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
         if picture is None:
-            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+            raise NoThumbnail(f"The map keeps no picture of {_named(place_id)}.")
         if place.picture == "thumbnail":
             return picture
         try:
             return encode_thumbnail(decode(picture, ANY_SIZE))
         except InvalidImage as error:
-            raise NoThumbnail(f"The stored picture of place {place_id!r} cannot be shown: {error}") from error
+            raise NoThumbnail(f"The stored picture of {_named(place_id)} cannot be shown: {error}") from error
 
     def _pictured(self, place_id: str) -> tuple[Place | None, bytes | None]:
         """A place and its picture; None for what there is not."""
@@ -189,12 +191,12 @@ class LedgerMap(ABC):
                 try:
                     pictures = frames.pictures_at(connection, [stored.row])
                 except StorageFailure as damage:
-                    raise StorageFailure(f"The stored picture of place {place_id!r} is damaged.") from damage
+                    raise StorageFailure(f"The stored picture of {_named(place_id)} is damaged.") from damage
             found = read_pictures(self.objects, pictures)
             if stored.row in found or stored.row not in pictures:
                 return stored.place, found.get(stored.row)
             if stored.row == before:
-                raise StorageFailure(f"The picture of place {place_id!r} is missing in the object store, or damaged.")
+                raise StorageFailure(f"The picture of {_named(place_id)} is missing in the object store, or damaged.")
             before = stored.row  # or the place got another frame meanwhile
 
     # Writing
@@ -316,12 +318,26 @@ class LedgerMap(ABC):
                 raise UnknownLook(f"Place {place_id!r} has no look {look[:80]!r}.")
             write.forget(stored)
 
+    def forget_looks(self, addresses: Sequence[str]) -> int:
+        """Delete looks by address, those that there are, all in one commit; returns how many there were."""
+        with self._writing() as write:
+            found = places.of_ids(write.connection, addresses)
+            looks = [stored for stored in found.values() if stored.look_of is not None]
+            for stored in looks:
+                write.forget(stored)
+        return len(looks)
+
     def learnt_looks(self) -> dict[int, Look]:
         """The looks that were learnt from runs, by row."""
         with self._reading() as connection:
             return {
                 one.row: one.look() for one in places.looks_after(connection, -1, 1 << 62, None) if one.run is not None
             }
+
+    def count_learnt(self) -> int:
+        """How many places were learnt from runs, or have looks that were."""
+        with self._reading() as connection:
+            return places.count_learnt(connection)
 
     def count_served(self, counts: Mapping[int, tuple[int, int, int]]) -> None:
         """Add to how looks have served, by row: frames won rightly, won wrongly, and passed; in one commit.
@@ -340,15 +356,46 @@ class LedgerMap(ABC):
         if not rows:
             return 0
         with self._writing() as write:
-            going = [one for one in places.at_rows(write.connection, list(rows)).values() if one.run is not None]
-            for stored in going:
-                write.forget(stored)
-        return len(going)
+            return _withdrawn(write, rows)
 
-    def forget_learnt(self, run: str) -> int:
-        """Delete the looks that were learnt from a run, all in one commit; returns how many there were."""
+    def learn(self, look: Enrolment, instead: Sequence[int], most_places: int | None = None) -> tuple[Change, int]:
+        """Add a learnt look to a place, and delete learnt looks by row to make room for it, in one commit.
+
+        Returns:
+            What changed, and how many looks were deleted; none if the place has the look.
+
+        Raises:
+            UnknownPlace, RepeatedLook, LookNameTaken, NoRegions, ValueError: as of :meth:`enrol`.
+            TooManyLooks: the place, or the map, may not have it.
+        """
+        check_enrolment(look, self.record.dimension, self.record.local_shape)
         with self._writing() as write:
-            found = places.learnt_from(write.connection, run)
+            if (stored := write.find(look.id)) is not None and stored.digest == look.digest:
+                return "unchanged", 0
+            write.expect(1)
+            gone = _withdrawn(write, instead)
+            change = write.enrol(look)[1]
+            if most_places is not None and places.count_learnt(write.connection) > most_places:
+                raise TooManyLooks(f"The map learns {most_places} places and looks of places at most.")
+        return change, gone
+
+    def forget_learnt(self, run: str | None, since: datetime | None = None, until: datetime | None = None) -> int:
+        """Delete the looks that were learnt from a run or in a period, all in one commit; returns how many there were.
+
+        Args:
+            run: None: any.
+            since, until: when they were added, the end apart; None: there is no bound.
+        """
+        with self._writing() as write:
+            found = places.learnt_from(write.connection, run, since, until)
+            for stored in found:
+                write.forget(stored)
+        return len(found)
+
+    def forget_new_ground(self, run: str) -> int:
+        """Delete the places that were learnt from a run, all in one commit; returns how many there were."""
+        with self._writing() as write:
+            found = places.places_learnt_from(write.connection, run)
             for stored in found:
                 write.forget(stored)
         return len(found)
@@ -365,6 +412,20 @@ class LedgerMap(ABC):
                 write.forget(places.expect(write.connection, place_id))
         return found
 
+    def drop_pictures(self, before: datetime, most: int) -> int:
+        """Delete the pictures of up to ``most`` places that were enrolled before a moment; returns how many there were.
+
+        The places stay, and so do their keypoints.
+        """
+        with self._reading() as connection:
+            if not places.pictured_before(connection, before, 1):
+                return 0
+        with self._writing() as write:
+            found = places.pictured_before(write.connection, before, most)
+            for place_id in found:
+                write.drop_picture(places.expect(write.connection, place_id))
+        return len(found)
+
     def forget_sequence(self, name: str) -> int:
         count = 0
         with self._writing() as write:
@@ -378,6 +439,20 @@ class LedgerMap(ABC):
 
 
 _AT_ONCE = 1000
+
+
+def _withdrawn(write: Write, rows: Sequence[int]) -> int:
+    """Delete learnt looks by row; returns how many were there."""
+    going = [one for one in places.at_rows(write.connection, list(rows)).values() if one.run is not None]
+    for stored in going:
+        write.forget(stored)
+    return len(going)
+
+
+def _named(address: str) -> str:
+    """A place or a look, as messages name it."""
+    place_id, look = place_and_look(address)
+    return f"place {place_id!r}" if look is None else f"look {look!r} of place {place_id!r}"
 
 
 def _not_more(ids: list[str], most: int) -> list[str]:

@@ -63,6 +63,12 @@ _SOME_LOOKS = (
 )
 _LOOKS = Statement(_SOME_LOOKS)
 _LEARNT_FROM = Statement(_SOME_LOOKS.where(_P.run == bindparam("run")))
+_LEARNT_PLACES = Statement(
+    select(func.count(func.coalesce(_P.look_of, _P.number).distinct())).where(
+        _P.map == bindparam("map"), _P.run.is_not(None)
+    )
+)
+_PLACES_FROM = Statement(_STORED.where(_IS_PLACE, _P.run == bindparam("run")).order_by(_P.number))
 _BY_KEYS = Statement(_WHOLE.where(among(_P.key, "keys")))  # keys are those of one map
 _ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
 _NUMBERS_OF = Statement(select(_P.id, _P.number).where(_P.map == bindparam("map"), among(_P.id, "ids")))
@@ -71,6 +77,12 @@ _ROWS_OF_PLACE = Statement(
         _P.map == bindparam("map"),
         (_P.number == bindparam("place")) | (_P.look_of == bindparam("place")),
     )
+)
+_PICTURED_BEFORE = Statement(
+    select(_P.id)
+    .where(_P.map == bindparam("map"), _P.picture != "none", _P.created_at < bindparam("moment"))
+    .order_by(_P.number)
+    .limit(bindparam("most"))
 )
 _INSERT = Statement(
     lambda insert: insert(PLACES).values({name: bindparam(name) for name in ("map", *_COLUMNS, "seal")})
@@ -145,8 +157,8 @@ class StoredPlace:
     key: of its entity in Milvus.
     revision: of the map's write that changed it last.
     look_of: the number of the place whose look it is; None: it is a place.
-    seen: when a look's frame was taken, as text; run: the run from which it was learnt.
-    least: the score of two stages from which a match with a look is believed; None: from any.
+    seen: when a look's frame was taken, as text; run: the run from which a look or a place was learnt.
+    least: the score of two stages from which a match with its frame is believed; None: from any.
     right, wrong, passed: how a look has served.
     """
 
@@ -296,9 +308,22 @@ def looks_of(connection: MapConnection, stored: StoredPlace) -> list[StoredPlace
     return [_stored(values) for values in connection.execute(_LOOKS_OF, place=stored.number)]
 
 
-def learnt_from(connection: MapConnection, run: str) -> list[StoredPlace]:
-    """The looks that were learnt from a run."""
-    return looks_after(connection, -1, 1 << 62, run)
+def learnt_from(
+    connection: MapConnection, run: str | None, since: datetime | None, until: datetime | None
+) -> list[StoredPlace]:
+    """The looks that were learnt from a run, or any, and added in a period: from ``since`` on, and before ``until``."""
+    return [
+        stored
+        for stored in looks_after(connection, -1, 1 << 62, run)
+        if stored.run is not None
+        and (since is None or stored.place.created_at >= since)
+        and (until is None or stored.place.created_at < until)
+    ]
+
+
+def places_learnt_from(connection: MapConnection, run: str) -> list[StoredPlace]:
+    """The places that are new ground of a run."""
+    return [_stored(values) for values in connection.execute(_PLACES_FROM, run=run)]
 
 
 def looks_after(connection: MapConnection, after: int, limit: int, run: str | None) -> list[StoredPlace]:
@@ -308,6 +333,12 @@ def looks_after(connection: MapConnection, after: int, limit: int, run: str | No
     else:
         found = connection.execute(_LEARNT_FROM, after=after, most=limit, run=run)
     return [_stored(values) for values in found]
+
+
+def count_learnt(connection: MapConnection) -> int:
+    """How many places were learnt from runs, or have looks that were."""
+    ((count,),) = connection.execute(_LEARNT_PLACES)
+    return int(count)
 
 
 def numbers_of(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, int]:
@@ -341,6 +372,12 @@ def ids_of(connection: MapConnection, wanted: PlaceFilter, limit: int) -> list[s
     """The ids of up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
     statement, values = _listing(_conditions(wanted), True), _values(wanted)
     return [place_id for (place_id,) in connection.execute(statement, after=-1, most=limit, **values)]
+
+
+def pictured_before(connection: MapConnection, moment: datetime, limit: int) -> list[str]:
+    """The ids of up to ``limit`` places with a picture that were enrolled before a moment, the first enrolled first."""
+    found = connection.execute(_PICTURED_BEFORE, moment=moment_text(moment), most=limit)
+    return [str(place_id) for (place_id,) in found]
 
 
 Conditions = tuple[tuple[str, ...], int]

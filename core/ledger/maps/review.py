@@ -73,6 +73,7 @@ _ALL = Statement(_READ.order_by(_F.number))
 _FIND = Statement(_READ.where(_F.number == bindparam("number")))
 _SIZE = Statement(select(func.count(), func.coalesce(func.sum(_F.size), 0)).where(_OF_MAP))
 _BY_AGE = Statement(select(_F.number, _F.size).where(_OF_MAP).order_by(_F.label.is_not(None), _F.number))
+_BEFORE = Statement(select(_F.number).where(_OF_MAP, _F.at < bindparam("moment")))
 _PUT = Statement(
     lambda insert: (
         insert(FRAMES)
@@ -84,6 +85,11 @@ _PUT = Statement(
 _LABEL = Statement(
     update(FRAMES)
     .where(_OF_MAP, _F.number == bindparam("which"))
+    .values(label=bindparam("new_label"), seal=bindparam("new_seal"))
+)
+_LABEL_FIRST = Statement(
+    update(FRAMES)
+    .where(_OF_MAP, _F.number == bindparam("which"), _F.label.is_(None))
     .values(label=bindparam("new_label"), seal=bindparam("new_seal"))
 )
 _BY_DIGEST = Statement(_READ.where(_F.digest == bindparam("digest")))
@@ -181,6 +187,16 @@ class ReviewTable(ABC):
             by_age = ((int(number), int(length)) for number, length in connection.execute(_BY_AGE))
             drop(connection, frames_to_drop(by_age, count, size, setting, self._held))
 
+    def drop_before(self, moment: datetime) -> int:
+        with self._writing() as connection:
+            return self._drop_before(connection, moment)
+
+    def _drop_before(self, connection: MapConnection, moment: datetime) -> int:
+        old = [int(number) for (number,) in connection.execute(_BEFORE, moment=moment_text(moment))]
+        if going := [number for number in old if number not in self._held]:
+            drop(connection, going)
+        return len(going)
+
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
         with self._reading() as connection:
             found = connection.execute(_PAGES[labelled], before=2**62 if before is None else before, most=limit)
@@ -219,17 +235,31 @@ class ReviewTable(ABC):
 
     def label(self, number: int, label: Mapping[str, Any] | None) -> ReviewFrame:
         with self._writing() as connection:
-            *stored, _ = values = _expect(connection, number)
-            after = {**dict(zip(_COLUMNS, stored, strict=True)), "label": None if label is None else json.dumps(label)}
-            changed = sealed(_COLUMNS, after)
-            if not connection.change(_LABEL, which=number, new_label=changed["label"], new_seal=changed["seal"]):
+            values = _expect(connection, number)
+            if not _labelled(connection, _LABEL, values, label):
                 raise _unknown(number)
-        return replace(_frame(values), label=label)
+        before = _frame(values)
+        return replace(before, label=label, replaced=before.label)
+
+    def label_first(self, number: int, label: Mapping[str, Any]) -> bool:
+        with self._writing() as connection:
+            return _labelled(connection, _LABEL_FIRST, _expect(connection, number), label)
 
     def discard(self, number: int) -> None:
         with self._writing() as connection:
             _expect(connection, number)
             drop(connection, [number])
+
+
+def _labelled(
+    connection: MapConnection, statement: Statement, values: tuple[Any, ...], label: Mapping[str, Any] | None
+) -> bool:
+    """Give a stored frame a label, or none; whether the statement allows it."""
+    *stored, _ = values
+    after = {**dict(zip(_COLUMNS, stored, strict=True)), "label": None if label is None else json.dumps(label)}
+    changed = sealed(_COLUMNS, after)
+    number = after["number"]
+    return bool(connection.change(statement, which=number, new_label=changed["label"], new_seal=changed["seal"]))
 
 
 def _renewed(connection: MapConnection, known: tuple[Any, ...], answer: Mapping[str, Any]) -> bool:

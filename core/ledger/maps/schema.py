@@ -64,8 +64,8 @@ SEQUENCES = _table(
 # A look is a row of its own that has what its place has, so that whatever searches, reads and checks rows need not know
 # of looks.  look_of is the number of its place, its id is its address (:func:`core.places.look_address`), and frame,
 # camera and picture are its own.  looks is how many a place has; seen is when a look's frame was taken, and run the run
-# from which it was learnt; least is the score of two stages from which a match with it is believed, NULL: from any.
-# right, wrong and passed are how it has served since (:class:`core.learning.LookStatistics`).
+# from which it, or a place of new ground, was learnt; least is the score of two stages from which a match with it is
+# believed, NULL: from any.  right, wrong and passed are how it served since (:class:`core.learning.LookStatistics`).
 PLACES = _table(
     "places", ("number",),
     _column("number", integer()),  # grows in the order of enrolment

@@ -47,12 +47,12 @@ class Transfer:
             found = places.of_ids(connection, place_ids)
         return {place_id: (stored.of_frame(), stored.row) for place_id, stored in found.items()}
 
-    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
-        if items:
-            with self._writing() as write:
-                write.expect(len(items))
-                for item, history in items:
-                    write.adopt(item, history)
+    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> list[str]:
+        if not items:
+            return []
+        with self._writing() as write:
+            write.expect(len(items))
+            return [item.id for item, history in items if not write.adopt(item, history)]
 
     def forget(self, frames: Mapping[str, bytes]) -> int:
         if not frames:

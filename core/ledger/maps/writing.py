@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import RepeatedLook, TooManyLooks, UnknownPlace
+from core.errors import LookNameTaken, RepeatedLook, TooManyLooks, UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.ledger.maps import frames, places, record, sequences
 from core.ledger.maps.connection import MapConnection
@@ -134,7 +134,8 @@ class Write(ABC):
     def enrol(self, item: Enrolment, keep: Keep | None = None, ordinal: int | None = None) -> tuple[Place, Change]:
         """Create a place, replace its frame, or change its fields if the frame is the same; or add a look to a place.
 
-        A place whose frame is replaced loses the looks that were learnt, for it may be another place now.
+        A place whose frame is replaced loses the looks that were learnt, for it may be another place now, and a look
+        that shows the new frame.
 
         Args:
             keep: the picture of the frame to store; by default that of the map's settings.
@@ -147,11 +148,16 @@ class Write(ABC):
                 self._put_keypoints(stored, item.keypoints)
             return self.set_fields(stored, item.fields) if name is None else (stored.shown(), "unchanged")
         if name is not None:
+            if stored is not None:
+                raise LookNameTaken(f"Another frame of place {of!r} is its look {name}.")
             place = self._expect_room_for_look(of, item.digest)
         row, (kind, picture) = self.state.rows, picture_of(item, self.record.keep if keep is None else keep)
         checksum = self._add_descriptors(row, item)
         self.state = replace(self.state, rows=row + 1)
-        frame: dict[str, Any] = {"row": row, "checksum": checksum, "digest": item.digest}
+        least = None if item.least is None else item.least + 0.0
+        frame: dict[str, Any] = {
+            "row": row, "checksum": checksum, "digest": item.digest, "run": item.run, "least": least
+        }  # fmt: skip
         shape: dict[str, Any] = {**frame, "regions": item.regions, "picture": kind}
         look = ViewedFrame(item.descriptor, item.local, item.fields.pose)
         if place is not None:
@@ -163,7 +169,7 @@ class Write(ABC):
             shown = replace(shown, track=None, station=None, **frame)
             made = self._put(self._with_fields(shown, item.fields, look, stored), stored)
             self._leave(stored)
-            made = self._without_learnt_looks(made)
+            made = self._without_void_looks(made)
         if picture is not None:
             self.put_picture(row, picture)
         if item.keypoints is not None:
@@ -193,9 +199,7 @@ class Write(ABC):
         seen = item.fields.timestamp
         look = places.placed(
             item.id, fields, place.sequence, place.ordinal, number=self.state.numbers, revision=self._revision,
-            created_at=now, updated_at=now, seen=None if seen is None else moment_text(seen), run=item.run,
-            least=None if item.least is None else item.least + 0.0,
-            **values,
+            created_at=now, updated_at=now, seen=None if seen is None else moment_text(seen), **values,
         )  # fmt: skip
         return self.insert_look(place, places.as_look(look, place))
 
@@ -206,10 +210,10 @@ class Write(ABC):
         self._put(places.with_place(now, looks=now.place.looks + 1), now, searched=False)
         return made
 
-    def _without_learnt_looks(self, stored: StoredPlace) -> StoredPlace:
-        """A place after the looks that were learnt from runs are deleted."""
+    def _without_void_looks(self, stored: StoredPlace) -> StoredPlace:
+        """A place with a new frame, after the looks that were learnt from runs, or show this frame, are deleted."""
         for look in places.looks_of(self.connection, stored):
-            if look.run is not None:
+            if look.run is not None or look.digest == stored.digest:
                 self.forget(look)
         return self.find(stored.place.id) or stored
 
@@ -389,21 +393,28 @@ class Write(ABC):
         counted = replace(stored, right=stored.right + right, wrong=stored.wrong + wrong, passed=stored.passed + passed)
         self._put(counted, stored, searched=False)
 
-    def adopt(self, item: Enrolment, history: History) -> None:
-        """Store a place of another map, or a look of a place, with its history."""
-        with suppress(RepeatedLook, TooManyLooks):  # the place has other looks here
+    def adopt(self, item: Enrolment, history: History) -> bool:
+        """Store a place of another map, or a look of a place, with its history.
+
+        Returns:
+            Whether it is there: not if it is a look, and its place is gone, shows the same frame, has too many, or has
+            another of this name.
+        """
+        with suppress(UnknownPlace, RepeatedLook, LookNameTaken, TooManyLooks):
             self.enrol(item, history.picture, history.ordinal)
         self._latest.clear()
-        if (stored := self.find(item.id)) is None:
-            return
+        stored = self.find(item.id)
+        if stored is None or (stored.look_of is not None and stored.digest != item.digest):
+            return False
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
         if stored.look_of is not None:
             self._put(places.with_place(stored, **moments), stored, searched=False)
-            return
+            return True
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
         changed = replace(places.with_place(stored, **moments), ordinal=ordinal)
         self._put(changed, stored, searched=ordinal != stored.ordinal)
         sequences.keep_free(self.connection, stored.sequence, max(ordinal + 1, history.behind))
+        return True
 
     def set_counterpart(
         self, stored: StoredPlace, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
@@ -416,6 +427,11 @@ class Write(ABC):
             fields |= {"pose": pose, "updated_at": self._now}
         changed = replace(places.with_place(stored, **fields), track=track, station=station)
         self._put(changed, stored, searched=moved)
+
+    def drop_picture(self, stored: StoredPlace) -> None:
+        """Delete the picture of a place."""
+        frames.delete_pictures(self.connection, [stored.row])
+        self._put(places.with_place(stored, picture="none"), stored, searched=False)
 
     def forget(self, stored: StoredPlace) -> None:
         """Delete a place with its looks, or one look of a place."""

@@ -69,8 +69,9 @@ class PlaceLine(_Line):
     pose_of: the place whose pose it got from an alignment.
     digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
     keypoints: the number of those of its frame; their record is the next one in its group.  None: none are stored.
-    seen, run, least: when the frame of a look was taken, the run from which it was learnt, and the score of two stages
-        from which a match with it is believed.
+    seen: when the frame of a look was taken.
+    run, least: the run from which a look or a place was learnt, and the score of two stages from which a match with it
+        is believed.
     """
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}(/{LOOK})?$")]
@@ -97,8 +98,8 @@ class PlaceLine(_Line):
     def _whole(self) -> Self:
         if (self.track is None) != (self.station is None):
             raise ValueError("a track needs a station, and a station a track")
-        if "/" not in self.id and (self.seen, self.run, self.least) != (None, None, None):
-            raise ValueError("a place that is no look has neither seen nor run nor least")
+        if "/" not in self.id and self.seen is not None:
+            raise ValueError("only a look has seen")
         if self.pose_of is not None and self.pose is None:
             raise ValueError("a place without a pose has no pose of another")
         return self

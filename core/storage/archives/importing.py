@@ -123,6 +123,8 @@ class Importing(Unpacking):
             raise InvalidArchive(f"The look {line.id!r} is of a place that the file does not list before it.")
         if not line.digest.startswith(look):
             raise InvalidArchive(f"The look {line.id!r} is not named by the digest of its frame.")
+        if place.digest.hex() == line.digest:
+            raise InvalidArchive(f"The look {line.id!r} shows the frame with which its place was enrolled.")
         if place.place.looks >= MOST_LOOKS:
             raise InvalidArchive(f"The place {place_id!r} has more than {MOST_LOOKS} looks.")
         return place

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from core.disk import sqlite_file
 from core.disk.files import sync_file
-from core.disk.sqlite_file import DURABLE
+from core.disk.sqlite_file import DURABLE, rewrite
 from core.ledger.maps.connection import MapConnection
 from core.storage.database.schema import check_schema, connection_of, driver_of, prepare
 
@@ -45,7 +45,7 @@ class DatabaseClosed(Exception):
     """The database was closed before this use of it."""
 
 
-_SETTINGS = {**DURABLE, "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
+_SETTINGS = {**DURABLE, "secure_delete": "ON", "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
 
 
 def connect(path: Path, create: bool = False) -> sqlite3.Connection:
@@ -153,6 +153,20 @@ class Database:
         if busy:
             raise sqlite3.OperationalError("readers keep the log from being emptied")
         sync_file(self._path.with_name(f"{self._path.name}-wal"))  # or a power cut could restore its former content
+
+    def erase(self) -> int:
+        """Rewrite the file without what was deleted from it, and empty the log; the bytes by which it got smaller.
+
+        The caller ensures that nobody writes meanwhile.  This takes as much room on the disk again as the file has.
+
+        Raises:
+            OSError, sqlite3.Error: the disk refuses, or readers keep the log from being emptied.
+        """
+        before = self._path.stat().st_size
+        rewrite(self._writer, self._path.parent)
+        self._writer.execute("PRAGMA temp_store = MEMORY")
+        self.empty_log()
+        return max(0, before - self._path.stat().st_size)
 
     def close(self) -> None:
         """Wait for reads under way, refuse further ones, and close all connections.

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, missing
 from core.storage.files.row_formats import Local, inner_products
-from core.storage.files.segment_files import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
+from core.storage.files.segment_files import (
+    ERASED,
+    ERASING,
+    HEADER_BYTES,
+    NO_LOCAL,
+    Layout,
+    check_header,
+    segment_name,
+)
 
 Rows = NDArray[np.int64]
 Checksums = NDArray[np.uint32]
@@ -104,10 +112,15 @@ class RowReader:
     def _checked(
         self, part: tuple[int, np.dtype[np.void]], rows: Rows, checksums: Checksums, name: str
     ) -> NDArray[np.void]:
-        """Read a part of the records of rows and check that each is of its row, sound, and the one that SQLite has."""
+        """Read a part of the records of rows and check that each is of its row, sound, and the one that SQLite has.
+
+        Rows without a place may be erased.
+        """
         found = self._read(rows, *part)
         whole = self._sound(found, rows, name)
         stated = found["checksum"].tolist()
+        erased = np.isin(found["reserved"], (ERASING, ERASED)) & (checksums == 0)
+        whole = [sound or gone for sound, gone in zip(whole, erased.tolist(), strict=True)]
         for row, expected, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
             if not sound or (expected and expected != checksum):
                 where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"

@@ -6,7 +6,8 @@ A file is little-endian: a header of 4 096 bytes followed by records (see `Layou
              encoder identity, the cells and the values per cell of the local descriptors, the encoder identity,
              zeros, CRC-32 of all before it
     record   stored descriptor, row (uint64), checksum of the record (uint32), CRC-32 of descriptor and row (uint32),
-             CRC-32 of local descriptors and row (uint32), zeros (uint32), stored local descriptors
+             CRC-32 of local descriptors and row (uint32), zeros (uint32; in an erased record its mark), stored local
+             descriptors
 
 The checksum of a record is the CRC-32 of its two other checksums, so that the descriptor and the local descriptors can
 each be read and checked without the other; both are stored in the map's precision (:data:`Precision`).  The version is
@@ -14,6 +15,9 @@ each be read and checked without the other; both are stored in the map's precisi
 
 Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  SQLite says how many records
 count; any that follow were never acknowledged and are overwritten.
+
+The record of a row without a place may be *erased*: its descriptors are zeros, its row and its checksums stay, so that
+the checksum of the segment does, and a mark stands in the place of the last zeros.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,6 +63,9 @@ _VERSION = 3
 _CODES: dict[Precision, bytes] = {"half": b"<f2", "compressed": b"6 bits"}
 _IDENTITY_BYTES = 1024
 _CHUNK_BYTES = 8 << 20
+
+ERASING, ERASED = 0x53415245, 0x454E4F47
+"""The marks of a record whose descriptors are being overwritten, and are overwritten, with zeros."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +143,12 @@ class Layout:
             return False
         return (int(record["of_descriptor"]), int(record["of_local"])) == self.part_checksums(record, row)
 
+    def is_erased(self, record: np.void, row: int) -> bool:
+        """Whether a record of ``row`` is marked as erased, or about to be, and its checksums stayed as they were."""
+        sums = struct.pack("<II", record["of_descriptor"], record["of_local"])
+        marked = record["reserved"] in (ERASING, ERASED)
+        return bool(marked and record["row"] == row and record["checksum"] == zlib.crc32(sums))
+
     def descriptors_of(self, records: NDArray[np.void]) -> NDArray[np.float32]:
         """The descriptors of records, which are searched: float32 [n, D]."""
         return unpack_descriptors(records["descriptor"], self.precision, self.dimension)
@@ -195,8 +208,15 @@ def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterat
 
 
 def damaged_rows(layout: Layout, records: NDArray[np.void], first_row: int) -> list[int]:
-    """The rows of consecutive records from ``first_row`` on that do not match their checksum."""
-    return [row for row, record in enumerate(records, start=first_row) if not layout.is_sound(record, row)]
+    """The rows of consecutive records from ``first_row`` on that do not match their checksum, and are not erased."""
+    numbered = enumerate(records, start=first_row)
+    return [row for row, record in numbered if not (layout.is_sound(record, row) or layout.is_erased(record, row))]
+
+
+def erased_rows(records: NDArray[np.void], first_row: int) -> list[int]:
+    """The rows of consecutive records from ``first_row`` on that are erased, or about to be."""
+    marked = np.isin(records["reserved"], (ERASING, ERASED))
+    return [first_row + int(offset) for offset in np.flatnonzero(marked)]
 
 
 def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum: int) -> Iterator[NDArray[np.void]]:
@@ -260,3 +280,46 @@ def rewind(folder: Path, layout: Layout, rows: int) -> None:
             if os.fstat(file.fileno()).st_size > end:
                 file.truncate(end)
                 os.fsync(file.fileno())
+
+
+def erase(folder: Path, layout: Layout, number: int, offsets: Sequence[int]) -> int:
+    """Overwrite the descriptors of records of a segment, which no place has and nobody reads, with zeros; and sync.
+
+    The mark comes first and is synced, so that after a crash a record that is half overwritten is not taken for a
+    damaged one.
+
+    Returns:
+        How many records were not erased before.
+
+    Raises:
+        Damage: the file is missing.
+        OSError: the disk refuses; erase them again.
+    """
+    path, record = folder / segment_name(number), layout.record
+    assert record.fields is not None
+    start, mark_at = record.itemsize, record.fields["reserved"][1]
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError as error:
+        raise missing(path, error) from error
+    try:
+        done = struct.pack("<I", ERASED)
+        at = [HEADER_BYTES + offset * start for offset in offsets]
+        at = [one for one in at if os.pread(file, 4, one + mark_at) != done]
+        for one in at:
+            write_at(file, struct.pack("<I", ERASING), one + mark_at)
+        if at:
+            os.fsync(file)
+        for one in at:
+            for name in ("descriptor", "local"):
+                kind, field_at, *_ = record.fields[name]
+                write_at(file, bytes(kind.itemsize), one + field_at)
+        if at:
+            os.fsync(file)
+        for one in at:
+            write_at(file, done, one + mark_at)
+        if at:
+            os.fsync(file)
+        return len(at)
+    finally:
+        os.close(file)

@@ -71,6 +71,14 @@ class IndexFiles:
         path = self._folder / codes_name(entries[0].number // self.group_size)
         return write_arrays(path, "codes", self._group_of(entries), {"codes": codes})
 
+    def remove_codes(self, group: int) -> None:
+        """Delete the file of the codes of a group, if there is one.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        (self._folder / codes_name(group)).unlink(missing_ok=True)
+
     def read_recall(self) -> Recall:
         """Read the last recall that was measured."""
         arrays = read_arrays(self._folder / "recall.index", "recall", self._made_by)

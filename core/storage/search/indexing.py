@@ -19,7 +19,7 @@ import numpy as np
 
 from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
-from core.index import CodeTable
+from core.index import Codes, CodeTable
 from core.index.flat import flat_index, vectors
 from core.maps.records import TierSetting
 from core.maps.status import IndexStatus, Recall, Tier
@@ -323,7 +323,7 @@ class Indexer:
         if tuple(of_group) in self._written or snapshot.table is None:
             return
         rows = sum(segment.rows for segment in of_group)
-        codes = snapshot.table.codes(first, first + rows)
+        codes = self._living_codes(snapshot, first, first + rows)
         if len(codes) < rows:  # a write has committed rows that no snapshot has yet
             return
         if self._files.write_codes(of_group, codes):
@@ -344,7 +344,37 @@ class Indexer:
         if of_group and snapshot.table is not None and snapshot.coded == snapshot.rows:
             first = of_group[0].number * snapshot.rows_per_segment
             if tuple(of_group) not in self._written:
-                self._files.write_codes(of_group, snapshot.table.codes(first, snapshot.rows))
+                self._files.write_codes(of_group, self._living_codes(snapshot, first, snapshot.rows))
+
+    def _living_codes(self, snapshot: Snapshot, start: int, stop: int) -> Codes:
+        """The codes of rows for a file, those of rows without a place blank; fewer if fewer rows have one."""
+        assert snapshot.table is not None
+        codes = snapshot.table.codes(start, stop)
+        dead = ~snapshot.alive[start : start + len(codes)]
+        codes[dead] = self._files.coder.blank(int(dead.sum()))
+        return codes
+
+    def forget_codes(self, numbers: Sequence[int], look: Callable[[], None]) -> None:
+        """Delete the files of the codes of some segments, and write them again without those of deleted places.
+
+        Args:
+            look: is called while codes are being built; its exceptions end the waiting.
+
+        Raises:
+            Stopped: the map was closed.
+            OSError: the disk refuses.
+        """
+        while not self._building.acquire(timeout=_PATIENCE_SECONDS):
+            look()
+            if self._stopping.is_set():
+                raise Stopped
+        try:
+            for group in {number // self._files.group_size for number in numbers}:
+                self._files.remove_codes(group)
+                self._written = {of for of in self._written if of[0].number // self._files.group_size != group}
+        finally:
+            self._building.release()
+        self.wake()
 
     def _join(self) -> None:
         """Join blocks of codes until few rows are left in blocks of which every code is read."""

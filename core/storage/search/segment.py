@@ -94,7 +94,7 @@ class HeldRows:
 
 
 class Reading:
-    """A token: as long as it lives, the file of a segment may be read."""
+    """A token: as long as it lives, a segment, or some of its rows, may be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +107,8 @@ class Segment:
     alive: bool [n], False for rows of places that were deleted or got another frame.
     checksums: uint32 [n], of each row as SQLite has it; 0 if it has none.
     reading: is shared by all states of the segment in which its file may be read.
+    unerased: is shared by all states of the segment from one erasure of dead rows to the next
+        (:mod:`core.storage.erasing`).
     removed: no row is alive, and the descriptors are deleted in memory and on disk.
     """
 
@@ -116,6 +118,7 @@ class Segment:
     alive: NDArray[np.bool_]
     checksums: NDArray[np.uint32]
     reading: Reading = field(default_factory=Reading)
+    unerased: Reading = field(default_factory=Reading)
     removed: bool = False
 
     def __len__(self) -> int:

@@ -64,7 +64,7 @@ class AttentiveAttention(VectorSystem):
     """
 
     def __init__(self, about: About, network: ResNet50, attention: Attention, shown: InputDefinition) -> None:
-        from core.networks.identity import tensors_digest
+        from core.networks.torch_network import tensors_digest
 
         super().__init__(about, weights=tensors_digest(network.tensors | attention.tensors()))
         self.network, self.attention, self.shown = network, attention, shown

@@ -26,7 +26,7 @@ from torch.nn.functional import conv2d, softplus
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition, Pixels
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.baselines.attention.attentive_attention import read_pair
 from lab.baselines.netvlad import unit_rows
 from lab.baselines.system import About, Array, Resources, VectorSystem
@@ -83,9 +83,9 @@ class ContextFlexibleAttention(VectorSystem):
     """
 
     def __init__(
-        self, about: About, network: ShallowNetwork, context: FlexibleContext, tensors: dict[str, Tensor]
+        self, about: About, network: TorchNetwork, context: FlexibleContext, tensors: dict[str, Tensor]
     ) -> None:
-        from core.networks.identity import tensors_digest
+        from core.networks.torch_network import tensors_digest
 
         super().__init__(about, weights=tensors_digest(tensors))
         self.network, self.context = network, context
@@ -100,7 +100,7 @@ def build(about: About, resources: Resources) -> ContextFlexibleAttention:
     return ContextFlexibleAttention(about, *load_context_flexible(resources.file()))
 
 
-def load_context_flexible(path: Path) -> tuple[ShallowNetwork, FlexibleContext, dict[str, Tensor]]:
+def load_context_flexible(path: Path) -> tuple[TorchNetwork, FlexibleContext, dict[str, Tensor]]:
     """Network, context and all tensors in use of a file in the layout that this module describes.
 
     Raises:

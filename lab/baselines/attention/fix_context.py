@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, conv2d, conv_transpose2d
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition, Pixels
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.baselines.netvlad import HEIGHT, WIDTH, NetVladLayer
 from lab.baselines.system import About, Array, Resources, VectorSystem
 from lab.baselines.trunks.vgg import CONVOLUTIONS, IMAGENET_BGR, LAST, forward, load_vgg16
@@ -67,10 +67,10 @@ class FixedContext:
 class FixContext(VectorSystem):
     """NetVLAD whose soft assignment is multiplied by the mask (Kim et al., equation 3); scores are cosines."""
 
-    def __init__(self, about: About, network: ShallowNetwork, context: FixedContext, layer: NetVladLayer) -> None:
-        from core.networks.identity import tensors_digest
+    def __init__(self, about: About, network: TorchNetwork, context: FixedContext, layer: NetVladLayer) -> None:
+        from core.networks.torch_network import tensors_digest
 
-        tensors = network.weights() | context.tensors() | layer.tensors()
+        tensors = network.tensors() | context.tensors() | layer.tensors()
         super().__init__(about, weights=tensors_digest(tensors))
         self.network, self.context, self.layer = network, context, layer
 
@@ -84,7 +84,7 @@ def build(about: About, resources: Resources) -> FixContext:
     return FixContext(about, *load_fix_context(resources.file()))
 
 
-def load_fix_context(path: Path) -> tuple[ShallowNetwork, FixedContext, NetVladLayer]:
+def load_fix_context(path: Path) -> tuple[TorchNetwork, FixedContext, NetVladLayer]:
     """VGG-16, the reweighting network and the NetVLAD layer of the authors' file.
 
     Raises:

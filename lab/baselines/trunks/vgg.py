@@ -14,7 +14,8 @@ from torch import Tensor
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition, Pixels, prepare
-from core.networks.network import Convolution, Layer, NetworkDefinition, Pooling, Relu, ShallowNetwork
+from core.networks.network import Convolution, Layer, NetworkDefinition, Pooling, Relu
+from core.networks.torch_network import TorchNetwork
 
 BLOCKS = (2, 2, 3, 3, 3)
 CONVOLUTIONS = tuple(f"conv{block}_{place}" for block, count in enumerate(BLOCKS, 1) for place in range(1, count + 1))
@@ -43,7 +44,7 @@ def load_vgg16(
     outputs: tuple[str, ...] = (LAST,),
     rectified: bool,
     ceil: bool = False,
-) -> ShallowNetwork:
+) -> TorchNetwork:
     """Build the network up to conv5_3.
 
     Args:
@@ -65,12 +66,12 @@ def load_vgg16(
         layers.append(Convolution(name=name, channels=weight.shape[0], kernel=3, pad=1))
         if rectified or name != LAST:
             layers.append(Relu(name=name.replace("conv", "relu")))
-    network = ShallowNetwork(NetworkDefinition(name="vgg16", input=shown, layers=tuple(layers)), outputs)
+    network = TorchNetwork(NetworkDefinition(name="vgg16", input=shown, layers=tuple(layers)), outputs)
     network.load_weights(weights)
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def forward(network: ShallowNetwork, pixels: Pixels) -> tuple[Tensor, ...]:
+def forward(network: TorchNetwork, pixels: Pixels) -> tuple[Tensor, ...]:
     """The maps of the network's outputs for one frame, float32 [K, X, Y] each."""
     image = torch.from_numpy(np.ascontiguousarray(prepare(pixels, network.input))).permute(2, 0, 1)[None]
     return tuple(maps[0] for maps in network(image))

@@ -21,7 +21,9 @@ from service.commands.options.recordings import (
     EveryDegrees,
     EveryMetres,
     EverySeconds,
+    FixedFrame,
     LargestGap,
+    MovingFrame,
     PoseTopic,
     RecordingOptions,
     Topic,
@@ -45,6 +47,10 @@ class RecordingsOptions:
     query_topic: Annotated[str | None, _of_query()] = None
     pose_topic: PoseTopic = None
     query_pose_topic: Annotated[str | None, _of_query()] = None
+    fixed_frame: FixedFrame = None
+    query_fixed_frame: Annotated[str | None, _of_query(metavar="FRAME")] = None
+    moving_frame: MovingFrame = None
+    query_moving_frame: Annotated[str | None, _of_query(metavar="FRAME")] = None
     trajectory: TrajectoryFile = None
     query_trajectory: Annotated[Path | None, _of_query(metavar="FILE")] = None
     trajectory_times: TrajectoryTimes = None
@@ -58,18 +64,32 @@ class RecordingsOptions:
     @property
     def of_reference(self) -> RecordingOptions:
         """Those of the known traverse."""
-        return self._of(self.topic, self.pose_topic, self.trajectory, self.trajectory_times)
+        return RecordingOptions(
+            self.topic,
+            self.pose_topic,
+            self.trajectory,
+            self.trajectory_times,
+            *self._of_both,
+            self.fixed_frame,
+            self.moving_frame,
+        )
 
     @property
     def of_query(self) -> RecordingOptions:
         """Those of the traverse to recognize."""
-        return self._of(self.query_topic, self.query_pose_topic, self.query_trajectory, self.query_trajectory_times)
+        return RecordingOptions(
+            self.query_topic,
+            self.query_pose_topic,
+            self.query_trajectory,
+            self.query_trajectory_times,
+            *self._of_both,
+            self.query_fixed_frame,
+            self.query_moving_frame,
+        )
 
-    def _of(
-        self, topic: str | None, pose_topic: str | None, trajectory: Path | None, times: Path | None
-    ) -> RecordingOptions:
-        keyframes = (self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
-        return RecordingOptions(topic, pose_topic, trajectory, times, self.largest_gap, *keyframes)
+    @property
+    def _of_both(self) -> tuple[float | None, float | None, float | None, float | None, float | None]:
+        return self.largest_gap, self.every_metres, self.every_degrees, self.every_seconds, self.every_change
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from core.judgement.calibration import FEWEST_OUTCOMES, blocks_of
-from core.judgement.curves import auc_roc
+from core.judgement.curves import auc_pr, auc_roc
 from core.judgement.probability import fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.verdict import TOP_PLACES
@@ -31,9 +31,22 @@ TOO_FEW = f"it takes {FEWEST_OUTCOMES} right and {FEWEST_OUTCOMES} wrong best ma
 NO_ORDER = "right matches do not have higher scores than wrong ones in every part of the traverse."
 
 
+class Doubt(BaseModel):
+    """How well measures of doubt tell right best matches from wrong ones: areas under their precision and recall."""
+
+    decision: float = Field(description="The decision value, from which the probability is.")
+    score: float = Field(description="The score of the best match.")
+    ratio: float = Field(description="That score over the one of the best other place.")
+    spread: float = Field(
+        description="The spread of where the best five references are, weighted by their scores (Zaffar et al., CVPR "
+        "2024), by their numbers in the traverse."
+    )
+
+
 class Trust(BaseModel):
     """Figures of the probabilities of the best matches, cross-validated over blocks of queries."""
 
+    doubt: Doubt
     auc_roc_right: float = Field(description="The chance that a right best match has a higher decision value.")
     reliability: Reliability
     believed_precision: Share = Field(description=f"Right ones, of the answers with a probability over {BELIEVED}.")
@@ -61,6 +74,32 @@ def decisions(scores: NDArray[np.floating[Any]], retained: NDArray[np.int64]) ->
     return np.asarray(np.sqrt(top * np.maximum(0, top - mean)), np.float64)
 
 
+def doubt(
+    scores: NDArray[np.floating[Any]],
+    retained: NDArray[np.int64],
+    right: NDArray[np.bool_],
+    values: NDArray[np.float64],
+) -> Doubt:
+    """The areas of plain measures of doubt, beside that of the decision value.
+
+    Args:
+        scores: [Q, R']; retained: int64 [R'].
+        right: bool [Q], whether the best match is.
+        values: float64 [Q], the decision values.
+    """
+    best, top = scores.argmax(axis=1), scores.max(axis=1).astype(np.float64)
+    apart = np.abs(retained[None, :] - retained[best][:, None]) > SAME_PLACE
+    second = np.where(apart, scores, -np.inf).max(axis=1)
+    ratio = np.where(np.isfinite(second), top / np.maximum(second, 1e-6), 1.0)
+    first = np.argsort(-scores, axis=1, kind="stable")[:, :TOP_PLACES]
+    weights = np.maximum(np.take_along_axis(scores, first, 1), 1e-6).astype(np.float64)
+    where = retained[first].astype(np.float64)
+    middle = np.average(where, axis=1, weights=weights)[:, None]
+    spread = np.sqrt(np.average((where - middle) ** 2, axis=1, weights=weights))
+    areas = (auc_pr(measure, right) for measure in (values, top, ratio, -spread))
+    return Doubt(**dict(zip(Doubt.model_fields, areas, strict=True)))
+
+
 def trust(
     scores: NDArray[np.floating[Any]], retained: NDArray[np.int64], outcomes: Sequence[Outcome]
 ) -> tuple[Trust | None, str | None]:
@@ -83,6 +122,7 @@ def trust(
     believed = probabilities >= BELIEVED
     hits, known = int((believed & right).sum()), sum(outcome.rank is not None for outcome in outcomes)
     return Trust(
+        doubt=doubt(scores, retained, right, values),
         auc_roc_right=auc_roc(values, right) or 0.0,
         reliability=reliability(probabilities, right),
         believed_precision=wilson(hits, int(believed.sum())),

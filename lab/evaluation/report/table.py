@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from lab.evaluation.protocol.comparison import SystemRun
 
 
+DOUBTS = {"ours": "decision", "score": "score", "ratio": "ratio", "spread": "spread"}
+"""Headings of the measures of doubt, and their fields in :class:`lab.evaluation.protocol.trust.Doubt`."""
+
+
 @dataclass(frozen=True)
 class Column:
     """One figure: its heading, its meaning, how to find and write it, and which end of it is good."""
@@ -52,6 +56,7 @@ def columns(runs: Sequence[SystemRun]) -> list[Column]:
             lambda run: run.evaluation.recall_at_full_precision,
         ),
         Column("Accuracy", "EP", "extended precision", lambda run: run.evaluation.extended_precision),
+        *(_doubt_column(heading, name) for heading, name in DOUBTS.items()),
         Column("Milliseconds per query", "total", "all stages", time_per_query, milliseconds, higher_is_better=False),
         *(_stage_column(stage) for stage in stages(runs)),
         Column("Memory", "a place", "bytes per place", lambda run: run.bytes_per_place, _size, higher_is_better=False),
@@ -74,6 +79,13 @@ def _recall_column(depth: int) -> Column:
         f"recall@{depth}: queries with a true reference among the best {depth}",
         lambda run: run.evaluation.recall_at.get(str(depth)),
     )
+
+
+def _doubt_column(heading: str, name: str) -> Column:
+    def area(run: SystemRun) -> float | None:
+        return None if run.evaluation.trust is None else float(getattr(run.evaluation.trust.doubt, name))
+
+    return Column("Doubt", heading, f"is the best match right? area under precision and recall by the {name}", area)
 
 
 def _stage_column(stage: str) -> Column:

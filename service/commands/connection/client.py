@@ -22,9 +22,10 @@ from placerec_client.frames import media_type
 from placerec_client.requests import Part, form
 from service.commands.connection.credentials import VARIABLE, given_key, is_unencrypted
 from service.commands.console import Failure, remark
+from service.commands.options.settings import read_settings
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    pass
 
 Result = TypeVar("Result")
 
@@ -212,21 +213,6 @@ async def open_service(target: CommandTarget) -> AsyncIterator[Service]:
         yield Service(await stack.enter_async_context(client))
 
 
-def read_settings(data_dir: Path | None = None) -> Settings:
-    """The service's settings, with another data directory if one is given.
-
-    Raises:
-        Failure: the environment sets one of them to an invalid value.
-    """
-    from service import settings
-
-    try:
-        found = settings.read_settings()
-    except settings.SettingsError as error:
-        raise Failure(str(error)) from error
-    return found if data_dir is None else found.model_copy(update={"data_dir": data_dir})
-
-
 def ask(target: CommandTarget, method: str, path: str, **options: Any) -> httpx.Response:
     """Send one request and return its answer; it raises what ``Service.request`` raises."""
 
@@ -267,6 +253,5 @@ __all__ = [
     "open_service",
     "path_of",
     "read_bytes",
-    "read_settings",
     "run",
 ]

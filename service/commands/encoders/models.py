@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from core.errors import InvalidImage
-from service.commands.connection.client import read_bytes, read_settings
+from service.commands.connection.client import read_bytes
 from service.commands.console import Failure
+from service.commands.options.settings import read_settings
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels

@@ -7,7 +7,6 @@ DIR/.<map>.part             what there is of a file that is being written; no ot
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -15,10 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.errors import InvalidIdentifier
 from core.places import MAP_IDS
+from service.backups.index import INDEX, BackupEntry, BackupIndex, InvalidIndex, file_name
+from service.backups.shelf import NAME
 from service.commands.connection.client import (
     AsJson,
     CommandTarget,
@@ -33,6 +33,7 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, complain, remark, show, table
 from service.commands.jobs import Wait, check_outlives, followed, show_outcome
+from service.commands.maps.formats import Format, export_as
 from service.commands.maps.transfers import check_file, download, upload
 
 backup = typer.Typer(cls=Commands, help="Save all maps in a folder, verify them, restore them.", no_args_is_help=True)
@@ -40,22 +41,34 @@ backup = typer.Typer(cls=Commands, help="Save all maps in a folder, verify them,
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the backup.", show_default=False)]
 Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this map; may be repeated.")]
 
-INDEX = "index.json"
-FORMAT = "placerec backup"
-
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A tar file.", show_default=False)]
+Target = Annotated[Path, typer.Argument(metavar="FILE", help="A file or, for colmap, a folder.", show_default=False)]
 
 
 def export(
     map_id: MapId,
-    file: File,
+    file: Target,
+    form: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            help="tar: all of the map, to import it again; mcap: its frames as ROS 2 messages; colmap: a folder with "
+            "its frames and a sparse model of COLMAP.",
+        ),
+    ] = "tar",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Save a map as a file. An interrupted download continues when the command is run again."""
+    """Save a map as a file. An interrupted download of a tar file continues when the command is run again.
+
+    The formats of other tools are made here of a tar file that is downloaded first, and need a map that keeps images.
+    """
     if file.exists() and not overwrite:
         raise Failure(f"{file} already exists. Give --overwrite to replace it.")
+    if form != "tar":
+        export_as(CommandTarget(url, data_dir), map_id, file, form, overwrite)
+        return
 
     async def work() -> str | None:
         async with open_service(CommandTarget(url, data_dir)) as service:
@@ -85,50 +98,23 @@ def import_(
     show_outcome(run(work()), as_json)
 
 
-class BackupEntry(BaseModel):
-    """A map of a backup; ``listed`` is whether the service had it when the backup was last made."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    id: Annotated[str, MAP_IDS]
-    file: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,100}$")
-    manifest_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-    bytes: int
-    places: int
-    saved_at: datetime
-    listed: bool = True
-
-
-class BackupIndex(BaseModel):
-    """The maps of a backup."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    format: str = FORMAT
-    version: int = 1
-    maps: list[BackupEntry] = []
-
-    def find(self, map_id: str) -> BackupEntry | None:
-        """The entry of a map."""
-        return next((entry for entry in self.maps if entry.id == map_id), None)
-
-
 def read_index(folder: Path) -> BackupIndex:
     """The index of a backup.
 
     Raises:
-        Failure: there is no index, or it cannot be read.
+        Failure: there is no index, or it cannot be read; of a folder in which a service keeps its backups, the text
+            names the latest of them.
     """
-    path = folder / INDEX
     try:
-        index = BackupIndex.model_validate_json(path.read_bytes())
+        return BackupIndex.read(folder)
+    except FileNotFoundError as error:
+        if kept := sorted(path.parent for path in folder.glob(f"*/{INDEX}") if NAME.fullmatch(path.parent.name)):
+            raise Failure(f"{folder} holds {len(kept)} backups: name one of them; the latest is {kept[-1]}.") from error
+        raise Failure(f"{folder / INDEX} cannot be read: {error.strerror}.") from error
     except OSError as error:
-        raise Failure(f"{path} cannot be read: {error.strerror}.") from error
-    except ValidationError as error:
-        raise Failure(f"{path} is not the index of a backup, or is damaged.") from error
-    if (index.format, index.version) != (FORMAT, 1):
-        raise Failure(f"{path} was written by a later version of placerec.")
-    return index
+        raise Failure(f"{folder / INDEX} cannot be read: {error.strerror}.") from error
+    except InvalidIndex as error:
+        raise Failure(str(error)) from error
 
 
 @backup.command("create")
@@ -196,7 +182,7 @@ async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str)
     if tag is None:
         remark(f"{map_id}: unchanged.")
         return
-    file = folder / f"{map_id}.{tag[:16]}.tar"
+    file = folder / file_name(map_id, tag)
     _rename(downloaded, file)
     archive = _manifest_of(file)
     entry = BackupEntry(
@@ -207,7 +193,7 @@ async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str)
         places=archive.places,
         saved_at=datetime.now(UTC),
     )
-    index.maps = sorted([*(one for one in index.maps if one.id != map_id), entry], key=lambda one: one.id)
+    index.put(entry)
     _write_index(folder, index)
     remark(f"{map_id}: {entry.places} places in {file.name}.")
 
@@ -231,11 +217,8 @@ def _manifest_of(file: Path) -> Any:
 
 
 def _write_index(folder: Path, index: BackupIndex) -> None:
-    from core.disk.files import write_file
-
-    text = json.dumps(index.model_dump(mode="json"), indent=2) + "\n"
     try:
-        write_file(folder / INDEX, text.encode())
+        index.write(folder)
     except OSError as error:
         raise Failure(f"{folder / INDEX} cannot be written: {error.strerror}.") from error
 

@@ -19,20 +19,25 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, number, remark, say, show, show_json, table
 from service.commands.maps.backup import export, import_
+from service.commands.maps.coverage import coverage
 from service.commands.maps.places import places, sequences
-from service.commands.maps.upkeep import align, health, keypoints, merge, prune, rebuild, reencode
+from service.commands.maps.stretches import stretches
+from service.commands.maps.upkeep import align, erase, health, keypoints, merge, prune, rebuild, reencode
 
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
 maps.add_typer(places, name="places")
 maps.add_typer(sequences, name="sequences")
 for name, command in (
     ("health", health),
+    ("coverage", coverage),
     ("re-encode", reencode),
     ("align", align),
     ("prune", prune),
     ("rebuild", rebuild),
     ("keypoints", keypoints),
+    ("erase", erase),
     ("merge", merge),
+    ("stretches", stretches),
     ("export", export),
     ("import", import_),
 ):

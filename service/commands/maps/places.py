@@ -22,9 +22,13 @@ from service.commands.connection.client import (
     run,
 )
 from service.commands.console import Commands, Failure, remark, show, show_json, table
+from service.commands.jobs import followed, submit
 
 places = typer.Typer(cls=Commands, help="List, show, edit and delete the places of a map.", no_args_is_help=True)
 
+Erase = Annotated[
+    bool, typer.Option("--erase", help="Also overwrite what they leave in files, and discard frames for review.")
+]
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
 
@@ -103,6 +107,7 @@ def delete_places(
     map_id: MapId,
     place_ids: Annotated[list[str], typer.Argument(metavar="PLACE…", help="Ids.", show_default=False)],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    erase: Erase = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -110,6 +115,7 @@ def delete_places(
     for place_id in place_ids:
         path_of(place_id)  # refuses an invalid name before the request
     path = path_of("maps", map_id, "places") + ":delete"
+    erasing = path_of("maps", map_id, "erase")
 
     async def work() -> None:
         async with open_service(CommandTarget(url, data_dir)) as service:
@@ -121,6 +127,10 @@ def delete_places(
                 raise Failure(f"The map {map_id} has no place {', '.join(missing)}; nothing was deleted.")
             if not yes:
                 typer.confirm(f"Delete from the map {map_id}: {', '.join(place_ids)}?", abort=True)
+            if erase:
+                submitted = await service.request("POST", erasing, json={"ids": place_ids})
+                show_erased(await followed(service, submitted.json()))
+                return
             deleted = await order(dry_run=False)
             if deleted["ids"]:
                 remark(f"Deleted: {', '.join(deleted['ids'])}.")
@@ -145,6 +155,34 @@ def save_thumbnail(
             opened.write(picture)
     except OSError as error:
         raise Failure(f"{file} cannot be written: {error.strerror}.") from error
+
+
+def show_erased(job: dict[str, Any], ordered: bool = True) -> None:
+    """Say what a job has erased.
+
+    Args:
+        ordered: whether something was named, and not only what deleted places have left.
+
+    Raises:
+        Failure: it did not succeed.
+    """
+    if job["state"] != "succeeded":
+        reason = (job["problem"] or {}).get("detail", "")
+        raise Failure(f"Erasing {job['state']}: {reason} What is deleted stays so; erase it again.")
+    found = job["result"]
+    remark(
+        f"Erased: {found['places']} places, {found['looks']} looks, {found['review']} frames for review, "
+        f"{found['answers']} answers; {found['rows']} descriptors are overwritten or removed."
+        + (f" Bags removed: {found['bags']}." if found["bags"] else "")
+    )
+    if ordered and not any(found[kind] for kind in ("places", "looks", "review", "answers", "bags")):
+        remark("The map has nothing of what was named: is a name mistyped?")
+    if waiting := found["waiting_bags"]:
+        named = ", ".join(waiting[:10]) + (", …" if len(waiting) > 10 else "")
+        remark(
+            f"Bags that wait to be enrolled, which may have such frames: {named}. placerec maps erase --bags removes "
+            "them, but for those in use."
+        )
 
 
 def _object(text: str) -> dict[str, Any]:
@@ -203,6 +241,7 @@ def delete_sequence(
     map_id: MapId,
     sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="Name of the traverse.", show_default=False)],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    erase: Erase = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -210,5 +249,10 @@ def delete_sequence(
     path = path_of("maps", map_id, "sequences", sequence)
     if not yes:
         typer.confirm(f"Delete all places of the sequence {sequence} of the map {map_id}?", abort=True)
-    deleted = ask(CommandTarget(url, data_dir), "DELETE", path).json()
+    target = CommandTarget(url, data_dir)
+    if erase:
+        order = {"filter": {"sequence": sequence}}
+        show_erased(submit(target, path_of("maps", map_id, "erase"), order, wait=True))
+        return
+    deleted = ask(target, "DELETE", path).json()
     remark(f"The sequence {sequence} is deleted: {deleted['places']} places.")

@@ -1,5 +1,5 @@
-"""The upkeep of maps: ``placerec maps health``, ``re-encode``, ``rebuild``, ``keypoints``, ``align``, ``prune`` and
-``merge``.
+"""The upkeep of maps: ``placerec maps health``, ``re-encode``, ``rebuild``, ``keypoints``, ``align``, ``prune``,
+``erase`` and ``merge``.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from core.places import place_and_look
 from service.commands.connection.client import (
     AsJson,
     CommandTarget,
@@ -23,6 +24,7 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Failure, number, remark, say, show, show_json, table
 from service.commands.jobs import Wait, followed, show_outcome, submit
+from service.commands.maps.places import show_erased
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do it; otherwise the command only reports what it would do.")]
 
@@ -149,6 +151,62 @@ def _show_rebuilt(found: dict[str, dict[str, Any]], as_json: bool) -> None:
         show(shown)
     if failed := [map_id for map_id, job in found.items() if job["state"] != "succeeded"]:
         raise Failure(f"Not rebuilt: {', '.join(failed)}.")
+
+
+def erase(
+    map_id: MapId,
+    place: Annotated[list[str] | None, typer.Option(help="A place with its looks; can be repeated.")] = None,
+    look: Annotated[
+        list[str] | None, typer.Option(metavar="PLACE/LOOK", help="One look of a place; can be repeated.")
+    ] = None,
+    sequence: Annotated[str | None, typer.Option(help="The places of this traverse.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Only what this camera took.")] = None,
+    after: Annotated[str | None, typer.Option(help="Only frames of this time or later, ISO 8601.")] = None,
+    before: Annotated[str | None, typer.Option(help="Only frames of this time or earlier, ISO 8601.")] = None,
+    session: Annotated[
+        str | None, typer.Option(help="What this session has sent, and the looks that its run has taught.")
+    ] = None,
+    bags: Annotated[
+        bool, typer.Option("--bags", help="Also remove all bags of the map that wait to be enrolled.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Erase frames for good: of places, a traverse, a time or a session; by default, what was deleted has left."""
+    given = {"sequence": sequence, "camera": camera, "after": after, "before": before}
+    conditions = {name: value for name, value in given.items() if value is not None}
+    ids = [*(place or []), *(look or [])]
+    if ids and conditions:
+        raise typer.BadParameter("--place and --look cannot be combined with conditions")
+    for place_id in place or []:
+        path_of(place_id)  # refuses an invalid name before the request
+    for address in look or []:
+        if not all(place_and_look(address)):
+            raise typer.BadParameter(f"{address} is no look: write PLACE/LOOK")
+        path_of(*address.split("/"))
+    body: dict[str, Any] = {"ids": ids} if ids else {"filter": conditions} if conditions else {}
+    body |= {} if session is None else {"session": session}
+    body |= {"bags": True} if bags else {}
+    path = path_of("maps", map_id, "erase")
+    if body and not yes:
+        typer.confirm(f"Erase from the map {map_id} for good: {described(body)}?", abort=True)
+    job = submit(CommandTarget(url, data_dir), path, body, wait)
+    if as_json or not wait:
+        show_outcome(job, as_json)
+    else:
+        show_erased(job, bool(body))
+
+
+def described(order: dict[str, Any]) -> str:
+    """An order to erase frames in words."""
+    parts = [", ".join(order["ids"])] if "ids" in order else []
+    parts += [f"{name} {value}" for name, value in order.get("filter", {}).items()]
+    parts += [f"session {order['session']}"] if "session" in order else []
+    parts += ["all bags that wait"] if order.get("bags") else []
+    return "; ".join(parts)
 
 
 def keypoints(

@@ -26,7 +26,21 @@ Topic = Annotated[
 PoseTopic = Annotated[
     str | None,
     typer.Option(
-        help="Of a bag: the topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped, NavSatFix).",
+        help="Of a bag: the topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped, NavSatFix), or /tf.",
+        rich_help_panel=PANEL,
+    ),
+]
+FixedFrame = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FRAME", help="With --pose-topic /tf: where poses are; default: map or odom.", rich_help_panel=PANEL
+    ),
+]
+MovingFrame = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FRAME",
+        help="With --pose-topic /tf: whose poses they are; default: the camera's, by the pictures.",
         rich_help_panel=PANEL,
     ),
 ]
@@ -87,6 +101,8 @@ class RecordingOptions:
     every_degrees: EveryDegrees = None
     every_seconds: EverySeconds = None
     every_change: EveryChange = None
+    fixed_frame: FixedFrame = None
+    moving_frame: MovingFrame = None
 
     @contextmanager
     def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
@@ -105,7 +121,7 @@ class RecordingOptions:
         from core.recordings.recording import LARGEST_GAP
 
         gap = LARGEST_GAP if self.largest_gap is None else self.largest_gap
-        poses = Poses(self.pose_topic, self.trajectory, self.trajectory_times, gap)
+        poses = Poses(self.pose_topic, self.trajectory, self.trajectory_times, gap, self.fixed_frame, self.moving_frame)
         with messages.status(f"Reading {path} …"):
             recording = open_recording(path, self.topic, poses, prefix)
         with recording:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
 
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, prepare
 from core.method.encoder import Encoder, Encoding
+from core.networks.forward import forward_pass
+from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork, as_tensor, follow_threads
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.storage import Atlas
-from core.threads import each
+from core.threads import allowed_threads, each
 from service.commands.timing.samples import fill_map, sample_frame
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
@@ -45,19 +46,21 @@ def medians(runs: Mapping[str, Callable[[], object]], rounds: int, warm_up: int 
 def forward_passes(encoder: Encoder, pixels: Pixels) -> dict[str, Callable[[], object]]:
     """The bare forward pass: the encoder's module, eager float32, batch of one, in two memory layouts.
 
-    The module and its input are copied into the layout beforehand: only the pass is measured.  A network that is no
-    torch module has one pass, its own.
+    The module and its input are copied into the layout beforehand: only the pass is measured.  A network of
+    another kind has one pass, its own.
     """
     backbone = encoder.extractor.backbone
-    image = torch.from_numpy(prepare(pixels, backbone.input)[None]).permute(0, 3, 1, 2)
-    if not isinstance(backbone, nn.Module):
-        return {OWN: lambda: backbone(image)}
+    image = prepare(pixels, backbone.input)[None]
+    if not isinstance(backbone, ShallowNetwork):
+        own = forward_pass(backbone)
+        return {OWN: lambda: own(image)}
 
     def make(layout: torch.memory_format) -> Callable[[], object]:
-        module = copy.deepcopy(backbone).float().to(memory_format=layout)  # type: ignore[call-overload]
-        shown = image.contiguous(memory_format=layout)
+        module = TorchNetwork.of(backbone).to(memory_format=layout)  # type: ignore[call-overload]
+        shown = as_tensor(image).contiguous(memory_format=layout)
 
         def run() -> object:
+            follow_threads()
             with torch.inference_mode():
                 return module(shown)
 
@@ -85,7 +88,7 @@ def encoding_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], objec
 
 def encode_batch(encoder: Encoder, frames: Sequence[bytes]) -> list[Encoding]:
     """Decode and encode frames as fast as this process can: each core decodes some, then encodes some."""
-    return encoder.encode_batch(each(decode, frames, torch.get_num_threads()))
+    return encoder.encode_batch(each(decode, frames, allowed_threads()))
 
 
 @contextmanager

@@ -1,9 +1,12 @@
 // The answer to one frame: the verdict, the matches beside the frame, why the best one matches, and what took how long.
 import { Facts, Name, Verdict } from "./elements.js";
-import { decimal, encoderName, integer, metres, milliseconds, percent, poseText } from "./formats.js";
+import { changeText, decimal, encoderName, integer, metres, milliseconds, percent, poseText } from "./formats.js";
 import { Picture, Thumbnail, thumbnailPath } from "./pictures.js";
+import { readPlan } from "./plan_data.js";
+import { useResource } from "./resource.js";
 import { href } from "./router.js";
-import { html, useState } from "./view.js";
+import { SmallPlan } from "./small_plan.js";
+import { html, useMemo, useState } from "./view.js";
 
 const REASONS = {
   "no-regions": "The frame shows nothing to compare, as a blank wall does.",
@@ -19,9 +22,10 @@ export function Answer({ map, answer, frame }) {
     <div class="answer">
       <section class="panel" aria-label="Answer">
         <${Summary} map=${map} answer=${answer} />
-        ${match && html`<${Pair} map=${map} frame=${frame} match=${match} why=${match.rank === 1 ? answer.explanation : null} />`}
+        ${match && html`<${Pair} map=${map} frame=${frame} match=${match} why=${match.rank === 1 ? answer.explanation : null} few=${answer.verdict === "unknown"} />`}
         ${!match && html`<div class="pair alone"><img src=${frame.url} alt="The frame" /></div>`}
       </section>
+      ${answer.matches.length > 0 && html`<${Where} map=${map} answer=${answer} />`}
       ${answer.matches.length > 0 && html`
         <section class="panel" aria-label="Matches">
           <h2>Matches</h2>
@@ -39,12 +43,13 @@ export function Answer({ map, answer, frame }) {
 }
 
 function Summary({ map, answer }) {
-  const { verdict, probability, place, reason, rivals = [], pose } = answer;
+  const { verdict, probability, place, reason, rivals = [], pose, change } = answer;
   return html`
     <div class="spread">
       <p class="large"><${Verdict} verdict=${verdict} />${place && html` as <a href=${href("maps", map, "places", place.id)}>${place.id}</a>`}</p>
       <p class="large">${probability !== null && probability !== undefined && html`${percent(probability, 1)} <span class="faint small">probable</span>`}</p>
     </div>
+    ${answer.matches.length > 0 && html`<p class="sentence">${sentenceOf(answer)}</p>`}
     ${reason && html`<p>${REASONS[reason] || reason}</p>`}
     ${rivals.length > 0 && html`
       <p>
@@ -52,21 +57,72 @@ function Summary({ map, answer }) {
         <span class="faint"> ${rival.same_place ? "the same place" : "another place"}, ${decimal(rival.score)}</span>`)}
       </p>
     `}
+    ${change && html`<p class="faint">The view is ${changeText(change)}</p>`}
     ${pose && html`<p class="faint">Pose ${poseText(pose)} ± ${metres(pose.spread)}</p>`}
   `;
 }
 
+/** Why the verdict is what it is, in one sentence. */
+export function sentenceOf({ verdict, decision, threshold, margin, probability, matches }) {
+  const inliers = matches[0]?.parts?.inliers ?? null;
+  const parts = [];
+  const above = decision !== null && decision >= threshold;
+  if (decision !== null) {
+    const digits = [3, 4, 5, 6].find((one) => decision.toFixed(one) !== threshold.toFixed(one)) || 6;
+    parts.push(`${decimal(decision, digits)} is ${decision === threshold ? "at" : above ? "above" : "below"} ${decimal(threshold, digits)}`);
+  }
+  if (margin === null) parts.push("no other place comes into question");
+  else parts.push(margin < 0 ? `another place is ${decimal(-margin)} ahead` : `the next place is ${decimal(margin)} behind`);
+  if (inliers !== null) {
+    parts.push(`geometry agrees on ${inliers === 1 ? "one point" : `${integer(inliers)} points`}`);
+    // A match that was verified stands out by its probability, whatever its decision value is.
+    if ((verdict === "recognized") !== above && verdict !== "ambiguous") parts.push(`which makes it ${percent(probability)} probable`);
+  }
+  const text = parts.join("; ").replace("; which", ", which");
+  return `${text[0].toUpperCase()}${text.slice(1)}.`;
+}
+
+/** The place on the plan, with the other matches ringed. */
+function Where({ map, answer }) {
+  const plan = useResource((signal) => readPlan(map, signal), [map]);
+  const marks = useMemo(() => (plan.data ? whereMarks(plan.data, answer) : {}), [plan.data, answer]);
+  if (!plan.data || plan.data.count === 0) return null;
+  if (!plan.data.index.has(answer.matches[0].place.id)) return null;
+  const text = answer.verdict === "recognized" ? "The place" : "The best match";
+  return html`
+    <section class="panel" aria-label="On the plan">
+      <div class="spread"><h2>On the plan</h2><a href=${href("maps", map, "plan", { place: answer.matches[0].place.id })}>Open the plan</a></div>
+      <${SmallPlan} plan=${plan.data} marks=${marks} label=${`${text}, ${answer.matches[0].place.id}, on the plan of ${map}.`} />
+      <p class="faint small">${text} is ringed in blue, other matches in amber${marks.robots?.length ? "; the arrow is the pose that was estimated" : ""}.</p>
+    </section>
+  `;
+}
+
+function whereMarks(plan, { matches, pose, verdict }) {
+  const numbers = matches.map((one) => plan.index.get(one.place.id)).filter((one) => one !== undefined);
+  const point = pose ? plan.projection?.(pose) : null;
+  const robots = point ? [{ x: point.x, y: point.y, angle: point.heading, trail: [], label: "", verdict }] : [];
+  return { chosen: numbers[0] ?? null, misleading: numbers.slice(1), robots };
+}
+
+const FEW = 15;
 const LAYERS = [
   ["inliers", "Inliers", (why) => why.inliers.length],
   ["cells", "Cells", (why) => why.cells.length],
   ["regions", "Regions", (why) => why.regions.length],
 ];
 
-/** The frame beside a match; with an explanation, what connects them is drawn over both. */
-function Pair({ map, frame, match, why }) {
+/** The frame beside a match; with an explanation, what connects them is drawn over both.
+ *
+ * few: only the strongest lines are drawn at first: of what was not recognized, most connect nothing.
+ */
+function Pair({ map, frame, match, why, few }) {
   const kinds = why ? LAYERS.filter(([, , count]) => count(why) > 0) : [];
   const [kind, setKind] = useState(null);
-  const shown = kinds.some(([id]) => id === kind) || kind === "" ? kind : kinds[0]?.[0];
+  const [strongest, setStrongest] = useState(few);
+  const usual = (few && kinds.find(([id]) => id === "cells")) || kinds[0];
+  const shown = kinds.some(([id]) => id === kind) || kind === "" ? kind : usual?.[0];
+  const many = why && shown === "cells" && why.cells.length > FEW;
   return html`
     ${kinds.length > 0 && html`
       <div class="row">
@@ -74,13 +130,14 @@ function Pair({ map, frame, match, why }) {
           ${kinds.map(([id, name, count]) => html`<button type="button" aria-pressed=${shown === id} onClick=${() => setKind(id)}>${name} <span class="faint">${integer(count(why))}</span></button>`)}
           <button type="button" aria-pressed=${shown === ""} onClick=${() => setKind("")}>Nothing</button>
         </div>
+        ${many && html`<label class="row"><input type="checkbox" checked=${strongest} onChange=${() => setStrongest(!strongest)} /> the ${FEW} strongest only</label>`}
       </div>
     `}
     <figure class="stack">
       <div class="pair" style=${{ "--ratio": frame.ratio || 4 / 3 }}>
         <img src=${frame.url} alt="The frame" />
         <${Picture} path=${thumbnailPath(map, match.place.id)} version=${match.place.updated_at} alt=${`Place ${match.place.id}`} />
-        ${why && shown && html`<${Overlay} why=${why} kind=${shown} />`}
+        ${why && shown && html`<${Overlay} why=${why} kind=${shown} most=${strongest ? FEW : Infinity} />`}
       </div>
       <figcaption class="spread small faint"><span>the frame</span><span>${match.place.id}, rank ${match.rank}</span></figcaption>
     </figure>
@@ -88,22 +145,27 @@ function Pair({ map, frame, match, why }) {
 }
 
 /** Lines and boxes over both frames; each frame is one unit wide. */
-function Overlay({ why, kind }) {
+function Overlay({ why, kind, most }) {
   return html`
     <svg viewBox="0 0 2 1" preserveAspectRatio="none" aria-hidden="true" class=${`overlay ${kind}`}>
-      ${kind === "regions" ? why.regions.map((pair) => html`<${RegionPair} why=${why} pair=${pair} />`) : linesOf(why, kind).map(([x1, y1, x2, y2, strength]) => html`
-        <line x1=${x1} y1=${y1} x2=${1 + x2} y2=${y2} opacity=${strength} vector-effect="non-scaling-stroke" />
+      ${kind === "regions" ? why.regions.map((pair) => html`<${RegionPair} why=${why} pair=${pair} />`) : linesOf(why, kind, most).map(([x1, y1, x2, y2, strength, width]) => html`
+        <line x1=${x1} y1=${y1} x2=${1 + x2} y2=${y2} opacity=${strength} style=${width ? { strokeWidth: `${width}px` } : undefined} vector-effect="non-scaling-stroke" />
       `)}
     </svg>
   `;
 }
 
-function linesOf(why, kind) {
+/** Lines as from and to, how opaque and how wide they are; of the cells the strongest `most`, by their gain. */
+function linesOf(why, kind, most) {
   if (kind === "inliers") return why.inliers.map(({ query, match }) => [...query, ...match, Math.min(0.8, 0.2 + 40 / why.inliers.length)]);
   const [rows, columns] = why.grid;
-  const most = Math.max(...why.cells.map((cell) => cell.gain), 1e-9);
+  const cells = [...why.cells].sort((one, other) => other.gain - one.gain).slice(0, most);
+  const greatest = Math.max(...cells.map((cell) => cell.gain), 1e-9);
   const centre = ([row, column]) => [(column + 0.5) / columns, (row + 0.5) / rows];
-  return why.cells.map(({ query, match, gain }) => [...centre(query), ...centre(match), 0.15 + 0.8 * Math.max(0, gain / most)]);
+  return cells.map(({ query, match, gain }) => {
+    const weight = Math.max(0, gain / greatest);
+    return [...centre(query), ...centre(match), 0.15 + 0.8 * weight, most < Infinity ? 1 + 3 * weight : null];
+  });
 }
 
 function RegionPair({ why, pair }) {

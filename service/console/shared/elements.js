@@ -153,6 +153,30 @@ export function Field({ label, hint, children, inline = false }) {
   `;
 }
 
+/** An input that is read when it is left: what is typed stays when the view is drawn again, until there is another value. */
+export function Typed({ value, change, ...more }) {
+  const [text, setText] = useState(null); // null: nothing is being typed
+  useEffect(() => setText(null), [value]);
+  const left = ({ target }) => {
+    setText(null);
+    change(target);
+  };
+  return html`<input ...${more} value=${text ?? value} onInput=${(event) => setText(event.target.value)} onChange=${left} spellcheck=${false} />`;
+}
+
+/** An input of a number: change gets it with every letter, and NaN as long as what is written is none, such as "0.". */
+export function NumberInput({ value, change, ...more }) {
+  const [text, setText] = useState(null); // what is written, as long as it is what the value comes from
+  const told = useRef(null);
+  const typed = ({ target }) => {
+    told.current = target.valueAsNumber;
+    setText(target.value);
+    change(target.valueAsNumber);
+  };
+  const shown = text !== null && Object.is(told.current, value) ? text : value;
+  return html`<input ...${more} type="number" value=${Number.isNaN(shown) ? "" : shown} onInput=${typed} onBlur=${() => setText(null)} />`;
+}
+
 /** A dialog; it closes with Esc, unless it stays until a button in it is pressed, and gives the focus back. */
 export function Dialog({ title, close, wide = false, stays = false, children }) {
   const element = useRef(null);

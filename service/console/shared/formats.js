@@ -81,6 +81,11 @@ export function encoderName(identity) {
   return identity.split("@")[0];
 }
 
+/** Whether a frame shows the map as it is: known, changed or new, with the probabilities of all three. */
+export function changeText({ verdict, known, changed, new: fresh }) {
+  return `${verdict}: known ${percent(known)}, changed ${percent(changed)}, new ${percent(fresh)}`;
+}
+
 /** Where a pose is, in one line. */
 export function poseText(pose) {
   if (!pose) return NOTHING;

@@ -1,5 +1,6 @@
 // The settings of a map that its owner may choose when it is made and later.
-import { Field } from "./elements.js";
+import { Field, NumberInput } from "./elements.js";
+import { ALARMS } from "./fleet.js";
 import { html } from "./view.js";
 
 /** fields: the settings as the API has them; change: a function that takes some of them. */
@@ -24,15 +25,26 @@ export function MapSettings({ fields, change }) {
         </select>
       <//>
       <${Field} label="Same place, metres">
-        <input type="number" min="0" step="any" required value=${fields.same_place_radius} onInput=${(event) => change({ same_place_radius: event.target.valueAsNumber })} />
+        <${NumberInput} min="0" step="any" required value=${fields.same_place_radius} change=${(metres) => change({ same_place_radius: metres })} />
       <//>
       <${Field} label="Same place, frames">
-        <input type="number" min="0" step="1" required value=${fields.same_place_frames} onInput=${(event) => change({ same_place_frames: event.target.valueAsNumber })} />
+        <${NumberInput} min="0" step="1" required value=${fields.same_place_frames} change=${(frames) => change({ same_place_frames: frames })} />
       <//>
     </div>
+    ${fields.alarms && html`<${AlarmLimits} limits=${fields.alarms} change=${(changes) => change({ alarms: { ...fields.alarms, ...changes } })} />`}
     <label class="field check">
       <input type="checkbox" checked=${fields.verification} onChange=${(event) => change({ verification: event.target.checked })} />
       <span>Keep keypoints, by which answers are verified</span>
     </label>
+  `;
+}
+
+/** From which numbers on trends raise alarms; an empty field: never. */
+function AlarmLimits({ limits, change }) {
+  return html`
+    <fieldset class="fields">
+      <legend class="label">Alarm, from so many; never, if left out</legend>
+      ${Object.entries(ALARMS).map(([name, label]) => html`<${Field} label=${label}><${NumberInput} min="1" step="1" value=${limits[name] ?? NaN} change=${(limit) => change({ [name]: Number.isNaN(limit) ? null : limit })} /><//>`)}
+    </fieldset>
   `;
 }

@@ -1,6 +1,6 @@
 // A matrix of scores as a picture: rows are frames of one traverse, columns those of another.
 import { colour, isDark, onTheme } from "./colours.js";
-import { integer } from "./formats.js";
+import { decimal, integer } from "./formats.js";
 import { html, useEffect, useRef, useState } from "./view.js";
 
 const MOST_HIGH = 0.72;
@@ -8,7 +8,7 @@ const MOST_HIGH = 0.72;
 /** data: a comparison with its bytes; layers: which lines are drawn; chosen: [row, column]; choose: a function. */
 export function Matrix({ data, layers, chosen, choose }) {
   const { rows, columns } = data;
-  const [cells, lines, box] = [useRef(null), useRef(null), useRef(null)];
+  const [cells, lines, box, ramp] = [useRef(null), useRef(null), useRef(null), useRef(null)];
   const [size, setSize] = useState([0, 0]);
   const [theme, setTheme] = useState(isDark());
   useEffect(() => onTheme(() => setTheme(isDark())), []);
@@ -24,12 +24,15 @@ export function Matrix({ data, layers, chosen, choose }) {
     fit();
     return () => observer.disconnect();
   }, [rows, columns]);
-  useEffect(() => drawCells(cells.current, data), [data.bytes, theme]);
+  useEffect(() => {
+    drawCells(cells.current, data);
+    drawCells(ramp.current, { bytes: Uint8Array.from({ length: 128 }, (_, one) => 2 * one), rows: 1, columns: 128 });
+  }, [data.bytes, theme]);
   useEffect(() => drawLines(lines.current, data, layers, chosen), [data.stretches, data.counterparts, layers.join(), chosen.join(), size.join(), theme]);
   const cellAt = (event) => {
     const row = Math.floor((event.offsetY / lines.current.clientHeight) * rows);
     const column = Math.floor((event.offsetX / lines.current.clientWidth) * columns);
-    choose([Math.min(Math.max(row, 0), rows - 1), Math.min(Math.max(column, 0), columns - 1)]);
+    return [Math.min(Math.max(row, 0), rows - 1), Math.min(Math.max(column, 0), columns - 1)];
   };
   const typed = (event) => {
     const steps = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
@@ -40,10 +43,23 @@ export function Matrix({ data, layers, chosen, choose }) {
     choose([Math.min(Math.max(row, 0), rows - 1), Math.min(Math.max(column, 0), columns - 1)]);
   };
   const text = `Similarity of ${integer(rows)} frames of ${data.query.sequence}, downwards, and ${integer(columns)} of ${data.reference.sequence}, to the right. Arrow keys choose a pair.`;
+  const [pointed, setPointed] = useState(null);
+  const [row, column] = pointed || chosen;
+  const value = data.scale.low + (data.bytes[row * columns + column] / 255) * (data.scale.high - data.scale.low);
   return html`
-    <div class="matrix" ref=${box} style=${{ width: `${size[0]}px`, height: `${size[1]}px` }}>
-      <canvas ref=${cells} width=${columns} height=${rows} aria-hidden="true"></canvas>
-      <canvas ref=${lines} width=${size[0] * devicePixelRatio} height=${size[1] * devicePixelRatio} tabindex="0" role="img" aria-label=${text} onClick=${cellAt} onKeyDown=${typed}></canvas>
+    <div class="matrix-frame">
+      <span class="axis across"><span>1</span><span>frames of ${data.reference.sequence}</span><span>${integer(columns)}</span></span>
+      <span class="axis down"><span>1</span><span>frames of ${data.query.sequence}</span><span>${integer(rows)}</span></span>
+      <div class="matrix-box">
+        <div class="matrix" ref=${box} style=${{ width: `${size[0]}px`, height: `${size[1]}px` }}>
+          <canvas ref=${cells} width=${columns} height=${rows} aria-hidden="true"></canvas>
+          <canvas ref=${lines} width=${size[0] * devicePixelRatio} height=${size[1] * devicePixelRatio} tabindex="0" role="img" aria-label=${text} onClick=${(event) => choose(cellAt(event))} onKeyDown=${typed} onPointerMove=${(event) => setPointed(cellAt(event))} onPointerLeave=${() => setPointed(null)}></canvas>
+        </div>
+      </div>
+      <div class="matrix-scale spread small">
+        <span class="faint">frame ${integer(row + 1)} of ${data.query.sequence} against ${integer(column + 1)} of ${data.reference.sequence}: <strong>${decimal(value)}</strong></span>
+        <span class="row"><span class="faint">${decimal(data.scale.low)}</span><canvas ref=${ramp} width="128" height="1" aria-hidden="true"></canvas><span class="faint">${decimal(data.scale.high)}</span></span>
+      </div>
     </div>
   `;
 }

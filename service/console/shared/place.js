@@ -2,6 +2,7 @@
 import { get, may, patch, remove } from "./api.js";
 import { ByName, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, say, Verdict } from "./elements.js";
 import { decimal, integer, metres, milliseconds, percent, poseText } from "./formats.js";
+import { PlaceLooks } from "./looks.js";
 import { mapPath } from "./map_path.js";
 import { Thumbnail } from "./pictures.js";
 import { readPlan, nearestTo, stepsAlong } from "./plan_data.js";
@@ -29,6 +30,7 @@ export function Place({ map, id }) {
           <section class="panel" aria-label="Picture"><${Thumbnail} map=${map} place=${id} version=${data.updated_at} /></section>
           <section class="panel" aria-label="Facts"><${About} map=${map} place=${data} /></section>
         </div>
+        <${PlaceLooks} map=${map} place=${id} />
         <${Neighbours} map=${map} place=${data} />
         <${Lately} map=${map} id=${id} />
       `}
@@ -155,7 +157,7 @@ function Answers({ items }) {
 }
 
 const METRIC = ["x", "y", "z", "heading"];
-const GEOGRAPHIC = ["latitude", "longitude", "heading"];
+const GEOGRAPHIC = ["latitude", "longitude", "z", "heading"];
 
 function Edit({ map, place, close, changed }) {
   const pose = place.pose || {};

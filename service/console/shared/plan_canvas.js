@@ -1,12 +1,17 @@
-// A plan on two canvases: places below, what moves and what is chosen above.  Up to a few thousand places are drawn as
-// discs with their headings; more of them as squares written straight into the picture, which takes milliseconds.
+// A plan on canvases: places below, what moves and what is chosen above, a floor plan and a grid on the ground.  From afar
+// a traverse is one thin line; near, its places are discs with their headings.  More than a few thousand places are
+// squares written straight into the picture, which takes milliseconds.
 import { plain } from "./view.js";
 
 const DENSE = 5000;
 const NEAR = 14;
+const FEW = 150;
+const APART = 7;
+const GRID = 90;
 const MARGIN = 0.06;
 
-/** Options: onChoose(number or null), onHover(number or null), onView(view). */
+/** Options: onChoose(number or null), onHover(number or null), onView(view), onPoint({x, y} in metres or null), onLasso(numbers);
+ * ground: a canvas below the others. */
 export class PlanCanvas {
   constructor(places, above, options) {
     Object.assign(this, { places, above, options });
@@ -33,7 +38,8 @@ export class PlanCanvas {
     this.draw();
   }
 
-  /** marks: {chosen, hovered, misleading (numbers), robots: [{x, y, angle, ellipse, trail, colour, label}], dots}. */
+  /** marks: {chosen, hovered, misleading (numbers), robots: [{x, y, angle, ellipse, trail, colour, label}], dots,
+   * ways: lists of [{x, y, spread}] in metres, which all are to be seen, too}. */
   mark(marks) {
     this.marks = { ...this.marks, ...marks };
     this.drawAbove();
@@ -45,7 +51,7 @@ export class PlanCanvas {
     if (!width || !height) return;
     const first = !this.width;
     Object.assign(this, { ratio, width, height });
-    for (const canvas of [this.places, this.above]) {
+    for (const canvas of [this.places, this.above, this.options.ground].filter(Boolean)) {
       canvas.width = Math.round(width * ratio);
       canvas.height = Math.round(height * ratio);
     }
@@ -64,6 +70,10 @@ export class PlanCanvas {
       if (x[one] > right) right = x[one];
       if (y[one] < bottom) bottom = y[one];
       if (y[one] > top) top = y[one];
+    }
+    for (const point of (this.marks?.ways || []).flat()) {
+      [left, right] = [Math.min(left, point.x), Math.max(right, point.x)];
+      [bottom, top] = [Math.min(bottom, point.y), Math.max(top, point.y)];
     }
     if (left > right || !this.width) return;
     const [wide, high] = [Math.max(right - left, 1e-3), Math.max(top - bottom, 1e-3)];
@@ -103,12 +113,68 @@ export class PlanCanvas {
     requestAnimationFrame(() => {
       this.queued = false;
       if (!this.content || !this.width) return;
+      this.drawGround();
       this.select();
       if (this.shownCount > DENSE) this.drawDense();
       else this.drawSparse();
       this.drawAbove();
       this.frames = (this.frames || 0) + 1;
     });
+  }
+
+  /** ground: {grid, image, placed: the matrix from the image's pixels to metres}. */
+  lay(ground) {
+    this.ground = ground;
+    this.draw();
+  }
+
+  drawGround() {
+    if (!this.options.ground) return;
+    const context = this.options.ground.getContext("2d");
+    const { grid = false, image = null, placed = null } = this.ground || {};
+    context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    context.clearRect(0, 0, this.width, this.height);
+    if (image && placed) this.drawImage(context, image, placed);
+    if (grid && this.marks?.tints) this.drawGrid(context);
+  }
+
+  drawImage(context, image, { a, b, x, y }) {
+    // A pixel (u, v), v downwards, lies at (a u + b v + x, b u - a v + y) metres.
+    const { scale } = this.view;
+    const [left, top] = this.at(x, y);
+    context.save();
+    context.globalAlpha = 0.6;
+    context.transform(a * scale, -b * scale, b * scale, a * scale, left, top);
+    context.drawImage(image, 0, 0);
+    context.restore();
+  }
+
+  drawGrid(context) {
+    const { scale, x: cx, y: cy } = this.view;
+    const wanted = GRID / scale;
+    const power = 10 ** Math.floor(Math.log10(wanted));
+    const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= wanted);
+    const { line, faint } = this.marks.tints;
+    context.strokeStyle = line;
+    context.fillStyle = faint;
+    context.font = "11px system-ui, sans-serif";
+    context.lineWidth = 1;
+    const digits = Math.max(0, -Math.floor(Math.log10(step)));
+    const [halfX, halfY] = [this.width / 2 / scale, this.height / 2 / scale];
+    context.beginPath();
+    for (let x = Math.ceil((cx - halfX) / step) * step; x <= cx + halfX; x += step) {
+      const [px] = this.at(x, 0);
+      context.moveTo(px, 0);
+      context.lineTo(px, this.height);
+      context.fillText(x.toFixed(digits), px + 3, this.height - 6);
+    }
+    for (let y = Math.ceil((cy - halfY) / step) * step; y <= cy + halfY; y += step) {
+      const [, py] = this.at(0, y);
+      context.moveTo(0, py);
+      context.lineTo(this.width, py);
+      context.fillText(y.toFixed(digits), this.width - 44, py - 4);
+    }
+    context.stroke();
   }
 
   /** Which places lie in the picture. */
@@ -152,15 +218,34 @@ export class PlanCanvas {
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     context.clearRect(0, 0, this.width, this.height);
     const radius = Math.min(7, Math.max(2.5, this.view.scale * 0.25, 9 - Math.log2(1 + this.shownCount / 12)));
-    this.drawLines(context);
+    const near = this.isNear();
+    this.drawLines(context, near);
     const byGroup = new Map();
     for (let one = 0; one < this.shownCount; one += 1) {
       const number = this.shown[one];
       const group = this.content.group[number];
+      if (!near && this.content.lines[group].length > 1) continue; // its line shows it
       if (!byGroup.has(group)) byGroup.set(group, []);
       byGroup.get(group).push(number);
     }
     for (const [group, numbers] of byGroup) this.drawDiscs(context, numbers, this.content.colours[group], radius);
+  }
+
+  /** Whether there is room for a disc for each place in the picture. */
+  isNear() {
+    if (this.shownCount <= FEW) return true;
+    let [sum, count] = [0, 0];
+    const pace = Math.max(1, Math.floor(this.shownCount / 400));
+    for (let one = pace; one < this.shownCount; one += pace) {
+      const [before, here] = [this.shown[one] - 1, this.shown[one]];
+      if (this.content.group[before] !== this.content.group[here]) continue;
+      const [ax, ay] = this.pixel(before);
+      const [bx, by] = this.pixel(here);
+      if (Number.isNaN(ax + bx)) continue;
+      sum += Math.hypot(ax - bx, ay - by);
+      count += 1;
+    }
+    return count > 0 && sum / count >= APART;
   }
 
   drawDiscs(context, numbers, colour, radius) {
@@ -185,10 +270,10 @@ export class PlanCanvas {
     context.stroke();
   }
 
-  drawLines(context) {
+  drawLines(context, near) {
     const { lines, colours, visible } = this.content;
-    context.lineWidth = 1;
-    context.globalAlpha = 0.35;
+    context.lineWidth = near ? 1 : 1.5;
+    context.globalAlpha = near ? 0.35 : 1;
     lines.forEach((places, group) => {
       if (!visible[group] || places.length > 4 * DENSE) return;
       context.strokeStyle = colours[group];
@@ -215,19 +300,67 @@ export class PlanCanvas {
     return [(x - cx) * scale + this.width / 2, this.height / 2 - (y - cy) * scale];
   }
 
+  /** The point in metres at a pixel. */
+  spot(atX, atY) {
+    const { scale, x, y } = this.view;
+    return { x: x + (atX - this.width / 2) / scale, y: y + (this.height / 2 - atY) / scale };
+  }
+
   drawAbove() {
     if (!this.content || !this.width) return;
     const context = this.above.getContext("2d");
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     context.clearRect(0, 0, this.width, this.height);
     this.drawGaps(context);
-    const { chosen = null, hovered = null, misleading = [], dots = [], robots = [], tints } = this.marks || {};
+    const { chosen = null, hovered = null, misleading = [], selected = [], dots = [], robots = [], ways = [], tints } = this.marks || {};
     if (!tints) return;
     for (const number of misleading) this.ring(context, number, 8, tints.ambiguous, 2);
+    for (const way of ways) this.drawWay(context, way, tints);
     for (const dot of dots) this.drawDot(context, dot, tints);
     for (const robot of robots) this.drawRobot(context, robot, tints);
+    for (const number of selected) this.ring(context, number, 7, tints.text, 1.5);
+    if (this.lasso) this.drawLasso(context, tints);
     if (hovered !== null) this.ring(context, hovered, 9, tints.text, 1.5);
     if (chosen !== null) this.ring(context, chosen, 10, tints.accent, 3);
+  }
+
+  /** A way as a line, within a band as wide as its standard deviation. */
+  drawWay(context, way, tints) {
+    context.fillStyle = context.strokeStyle = tints.ambiguous;
+    context.globalAlpha = 0.2;
+    context.beginPath();
+    for (const { x, y, spread } of way) {
+      const [px, py] = this.at(x, y);
+      const radius = Math.max(3, spread * this.view.scale);
+      context.moveTo(px + radius, py);
+      context.arc(px, py, radius, 0, 2 * Math.PI);
+    }
+    context.fill();
+    context.globalAlpha = 1;
+    context.lineWidth = 2.5;
+    context.beginPath();
+    for (const { x, y } of way) context.lineTo(...this.at(x, y));
+    context.stroke();
+  }
+
+  drawLasso(context, tints) {
+    context.strokeStyle = tints.accent;
+    context.lineWidth = 1.5;
+    context.setLineDash([4, 3]);
+    context.beginPath();
+    for (const point of this.lasso) context.lineTo(...point);
+    context.closePath();
+    context.stroke();
+    context.setLineDash([]);
+  }
+
+  /** The places within the lasso, of those in the picture. */
+  caught() {
+    const found = [];
+    for (let one = 0; one < this.shownCount; one += 1) {
+      if (isWithin(this.pixel(this.shown[one]), this.lasso)) found.push(this.shown[one]);
+    }
+    return found;
   }
 
   drawGaps(context) {
@@ -325,11 +458,18 @@ export class PlanCanvas {
       this.above.setPointerCapture(event.pointerId);
       touches.set(event.pointerId, [event.offsetX, event.offsetY]);
       moved = 0;
+      this.lasso = this.options.onLasso && (event.shiftKey || this.catching) && touches.size === 1 ? [[event.offsetX, event.offsetY]] : null;
     });
     on("pointermove", (event) => {
       const before = touches.get(event.pointerId);
       const here = [event.offsetX, event.offsetY];
+      if (this.lasso) {
+        this.lasso.push(here);
+        this.drawAbove();
+        return;
+      }
       if (!before) {
+        this.options.onPoint?.(this.spot(...here));
         this.options.onHover?.(this.content ? this.nearest(...here) : null);
         return;
       }
@@ -345,10 +485,23 @@ export class PlanCanvas {
     });
     on("pointerup", (event) => {
       touches.delete(event.pointerId);
+      if (this.lasso) {
+        const found = this.lasso.length > 2 ? this.caught() : [];
+        this.lasso = null;
+        this.options.onLasso(found);
+        this.drawAbove();
+        return;
+      }
       if (moved < 4 && this.content) this.options.onChoose?.(this.nearest(event.offsetX, event.offsetY));
     });
-    on("pointercancel", (event) => touches.delete(event.pointerId));
-    on("pointerleave", () => this.options.onHover?.(null));
+    on("pointercancel", (event) => {
+      touches.delete(event.pointerId);
+      this.lasso = null;
+    });
+    on("pointerleave", () => {
+      this.options.onHover?.(null);
+      this.options.onPoint?.(null);
+    });
     on("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), [event.offsetX, event.offsetY]);
@@ -374,4 +527,14 @@ export class PlanCanvas {
     event.preventDefault();
     keys[event.key]();
   }
+}
+
+/** Whether a point lies within a polygon. */
+function isWithin([x, y], corners) {
+  let inside = false;
+  corners.forEach(([ax, ay], one) => {
+    const [bx, by] = corners[(one + 1) % corners.length];
+    if (ay > y !== by > y && x < ax + ((y - ay) * (bx - ax)) / (by - ay)) inside = !inside;
+  });
+  return inside;
 }

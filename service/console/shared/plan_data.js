@@ -52,7 +52,7 @@ function placed(columns, count, projection) {
   return { px, py, angle };
 }
 
-/** A function from a pose to a point in metres; null where no place has a pose.
+/** A function from a pose to a point in metres, with the one `back`; null where no place has a pose.
  *
  * A map has either metric or geographic poses as a rule; where it has both, those of the other kind are left out.
  */
@@ -61,17 +61,20 @@ function projectionOf(columns) {
   const [metric, geographic] = [counted(columns.x), counted(columns.latitude)];
   if (metric === 0 && geographic === 0) return null;
   if (metric >= geographic) {
-    return (pose) => (isNumber(pose.x) ? { x: pose.x, y: pose.y, heading: radians(pose.heading) } : null);
+    const projected = (pose) => (isNumber(pose.x) ? { x: pose.x, y: pose.y, heading: radians(pose.heading) } : null);
+    return Object.assign(projected, { geographic: false, back: ({ x, y }) => ({ x, y }) });
   }
   const first = columns.latitude.findIndex((value) => value !== null);
   const [latitude, longitude] = [columns.latitude[first], columns.longitude[first]];
   const [north, east] = [EARTH * (Math.PI / 180), EARTH * (Math.PI / 180) * Math.cos((latitude * Math.PI) / 180)];
-  return (pose) => {
+  const projected = (pose) => {
     if (!isNumber(pose.latitude)) return null;
     const around = ((pose.longitude - longitude + 540) % 360) - 180;
     const heading = isNumber(pose.heading) ? radians(90 - pose.heading) : null;
     return { x: around * east, y: (pose.latitude - latitude) * north, heading };
   };
+  const back = ({ x, y }) => ({ latitude: latitude + y / north, longitude: longitude + x / east });
+  return Object.assign(projected, { geographic: true, back });
 }
 
 function isNumber(value) {

@@ -19,7 +19,10 @@ export class Robots {
   async begin(map, signal) {
     const sessions = await all(mapPath(map, "sessions"), {}, { signal });
     for (const { id } of sessions.slice(0, 50)) {
-      const told = await get(mapPath(map, "sessions", id), {}, { signal });
+      const told = await get(mapPath(map, "sessions", id), {}, { signal }).catch((error) => {
+        if (error.status !== 404) throw error; // one that has ended since it was listed hides no other
+        return {};
+      });
       const { belief, key, camera, last_frame_at: at } = told;
       if (at && belief?.place?.pose) this.move({ session: id, key, camera, pose: belief.place.pose, verdict: belief.verdict, at });
     }

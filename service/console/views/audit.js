@@ -1,6 +1,8 @@
 // Who changed what: the audit trail, the newest first.
 import { get } from "../shared/api.js";
-import { Dialog, Field, Head, Moment, Nothing, Pager } from "../shared/elements.js";
+import { saveCsv } from "../shared/csv.js";
+import { complain, Dialog, Field, Head, Moment, Nothing, Pager, say, Typed } from "../shared/elements.js";
+import { integer } from "../shared/formats.js";
 import { Result } from "../shared/result.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
@@ -9,6 +11,7 @@ import { html, useEffect, useState } from "../shared/view.js";
 const FILTERS = { map: "Map", key: "Key", operation: "Operation", after: "From (UTC)", before: "To (UTC)" };
 const ENOUGH = 50;
 const MOST_PAGES = 20;
+const MOST_SAVED_PAGES = 50;
 
 export default function Audit({ query }) {
   const filter = Object.fromEntries(Object.keys(FILTERS).filter((name) => query[name]).map((name) => [name, query[name]]));
@@ -18,14 +21,27 @@ export default function Audit({ query }) {
   useEffect(() => setCursors([""]), [present]);
   const cursor = cursors.at(-1);
   const lines = useResource((signal) => read(filter, cursor, signal), [filter, cursor]);
+  const [saving, setSaving] = useState(false);
+  const keep = async () => {
+    setSaving(true);
+    try {
+      const { items, more } = await readMany(filter);
+      saveCsv("audit.csv", columnsOf(items), items);
+      if (more) say(`The latest ${integer(items.length)} lines were saved; choose a shorter time for older ones.`);
+    } catch (error) {
+      complain(error);
+    }
+    setSaving(false);
+  };
   const kind = (name) => (["after", "before"].includes(name) ? "datetime-local" : "text");
   return html`
     <${Head} title="Audit" note=${lines.data?.source === "memory" ? "The last lines of this process; with PLACEREC_AUDIT_FILE all of them are stored." : "Changes and refusals, with their callers."}>
+      <button type="button" disabled=${saving} onClick=${keep}>${saving ? "Reading …" : "Save as CSV"}</button>
       <button type="button" onClick=${lines.reload}>Refresh</button>
     <//>
     <div class="filters" role="search" aria-label="Filters">
       ${Object.entries(FILTERS).map(([name, label]) => html`
-        <${Field} label=${label}><input type=${kind(name)} step="1" value=${filter[name] || ""} onChange=${(event) => restate({ [name]: event.target.value.trim() })} spellcheck=${false} /><//>
+        <${Field} label=${label}><${Typed} type=${kind(name)} step="1" value=${filter[name] || ""} change=${({ value }) => restate({ [name]: value.trim() })} /><//>
       `)}
     </div>
     <${Shown} resource=${lines}>
@@ -51,6 +67,25 @@ async function read(filter, cursor, signal) {
     if (!next) break;
   }
   return { items, next, source };
+}
+
+/** The latest lines that fit, and whether there are more. */
+async function readMany(filter) {
+  const items = [];
+  let next = "";
+  for (let page = 0; page < MOST_SAVED_PAGES; page += 1) {
+    const told = await get("/audit", { ...filter, limit: 1000, cursor: next });
+    items.push(...told.items);
+    next = told.next_cursor;
+    if (!next) break;
+  }
+  return { items, more: Boolean(next) };
+}
+
+/** A column for each field that a line has: lines of different operations have different ones. */
+function columnsOf(items) {
+  const names = new Set(items.flatMap((line) => Object.keys(line)));
+  return [...names].map((name) => [name, (line) => line[name]]);
 }
 
 function tone(line) {

@@ -1,7 +1,7 @@
 // When answers are believed: how probable they really are, what a threshold costs, and another one to try and apply.
 import { getTagged, get, may, patch, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
-import { ByName, complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
+import { ByName, complain, Facts, Field, FormDialog, Head, Moment, Nothing, NumberInput, Pill, say, Trouble } from "../shared/elements.js";
 import { decimal, integer, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -328,7 +328,7 @@ function Order({ map, own, tag, started, close }) {
             <option value="mean_of_negatives">mean of unknown places</option>
           </select>
         <//>
-        ${fields.rule !== "mean_of_negatives" && html`<${Field} label="Share"><input type="number" min="0.001" max="0.999" step="any" value=${fields.value} onInput=${(event) => change({ value: event.target.valueAsNumber })} /><//>`}
+        ${fields.rule !== "mean_of_negatives" && html`<${Field} label="Share"><${NumberInput} min="0.001" max="0.999" step="any" value=${fields.value} change=${(value) => change({ value })} /><//>`}
       </div>`}
       <label class="field check"><input type="checkbox" checked=${fields.dry} onChange=${() => change({ dry: !fields.dry })} /><span>Dry run: only measure, store nothing</span></label>
       ${replaces && html`

@@ -3,6 +3,7 @@
 import { all, get, may, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
 import { ByName, Facts, Field, Head, Loading, Moment, Name, Pill, Trouble, VerdictMix } from "../shared/elements.js";
+import { ALARMS } from "../shared/fleet.js";
 import { counted, decimal, integer, metres, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -29,6 +30,7 @@ function Report({ map, data }) {
   return html`
     ${!complete && html`<p class="notice">The map is large: a sample of ${integer(aliasing.examined)} of its ${integer(aliasing.of)} places was examined in the time there was.</p>`}
     ${data.shared_routes.map((one) => html`<${OneRoute} map=${map} route=${one} />`)}
+    <${Trends} map=${map} trends=${data.trends} />
     <div class="columns">
       <section class="panel">
         <h2>Answers</h2>
@@ -57,6 +59,28 @@ function Report({ map, data }) {
       <section class="panel"><h2>Gaps <span class="faint">${integer(gapCount)}</span></h2><${Gaps} map=${map} items=${gaps} count=${gapCount} byMeasure=${byMeasure} /></section>
     </div>
   `;
+}
+
+const TRENDS = [
+  ["worse_places", "worse", "worse_count", (one) => one.place],
+  ["changed_places", "changed", "changed_count", (one) => one.place],
+  ["quiet_stretches", "quiet", "quiet_count", (one) => one.first],
+];
+
+/** What has changed of places over time, with what to do about it; where it raised an alarm, since when. */
+function Trends({ map, trends }) {
+  const some = TRENDS.filter(([alarm, list]) => trends[list].length > 0 || trends.alarms.some((one) => one.alarm === alarm));
+  return some.map(([alarm, list, count, placeOf]) => {
+    const raised = trends.alarms.find((one) => one.alarm === alarm);
+    return html`
+      <section class=${raised ? "panel alarms" : "panel"} aria-label=${ALARMS[alarm]}>
+        <div class="spread"><h2>${ALARMS[alarm]} <span class="faint">${integer(trends[count])}</span></h2>${raised && html`<span><${Pill} tone="bad">alarm<//> <${Moment} at=${raised.since} /></span>`}</div>
+        ${trends.advice[alarm] && html`<p>${trends.advice[alarm]}</p>`}
+        <ul class="stack">${trends[list].slice(0, 8).map((one) => html`<li class="small" key=${placeOf(one)}><a href=${href("maps", map, "places", placeOf(one))}><${Name} text=${placeOf(one)} /></a> <span class="faint">${one.sentence}</span></li>`)}</ul>
+        <${More} shown=${Math.min(8, trends[list].length)} count=${trends[count]} />
+      </section>
+    `;
+  });
 }
 
 function Drift({ answers }) {

@@ -1,6 +1,6 @@
 // Long work: what runs, what waits, what ended and with which result; running work can be cancelled.
 import { caller, get, may } from "../shared/api.js";
-import { Dialog, Field, Head, Moment, Nothing, Pager, Progress, Trouble } from "../shared/elements.js";
+import { Dialog, Field, Head, Moment, Nothing, Pager, Progress, Trouble, Typed } from "../shared/elements.js";
 import { duration, integer } from "../shared/formats.js";
 import { CancelJob, hasEnded, JobState, useJob } from "../shared/jobs.js";
 import { Result } from "../shared/result.js";
@@ -20,7 +20,7 @@ export default function Jobs({ query }) {
   return html`
     <${Head} title="Jobs" note="Long work in the background, the newest first." />
     <div class="filters" role="search" aria-label="Filters">
-      <${Field} label="Map"><input value=${map} onChange=${(event) => restate({ map: event.target.value.trim() })} spellcheck=${false} /><//>
+      <${Field} label="Map"><${Typed} value=${map} change=${({ value }) => restate({ map: value.trim() })} /><//>
       <${Field} label="State">
         <select value=${state} onChange=${(event) => restate({ state: event.target.value })}>
           <option value="">all</option>${STATES.map((one) => html`<option>${one}</option>`)}

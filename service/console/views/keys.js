@@ -4,7 +4,7 @@ import { ByName, complain, Field, FormDialog, Head, Moment, Nothing, Pill, say }
 import { MapsField } from "../shared/maps_field.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { newKey } from "../shared/secret.js";
-import { html, useState } from "../shared/view.js";
+import { html, useRef, useState } from "../shared/view.js";
 
 const ROLES = ["query", "enrol", "admin"];
 const TONES = { "in force": "good", revoked: "bad", expired: "warn" };
@@ -42,7 +42,7 @@ function Table({ items, open, close, changed }) {
           ${items.map((key) => html`
             <tr key=${key.id}>
               <td><strong>${key.name}</strong>${key.own && html` <${Pill} tone="on">yours<//>`} <code class="faint small">${key.id}</code></td>
-              <td>${key.role}</td>
+              <td>${key.role}${key.role === "enrol" && key.learn && html` <${Pill} tone="on" title="Maps that learn may learn from its runs">teaches<//>`}</td>
               <td class="long">${key.maps === null ? "all" : key.maps.join(", ")}</td>
               <td><${Pill} tone=${TONES[key.state]}>${key.state}<//></td>
               <td class="nowrap"><${Moment} at=${key.created_at} /></td>
@@ -50,6 +50,7 @@ function Table({ items, open, close, changed }) {
               <td class="nowrap">${key.expires_at ? html`<${Moment} at=${key.expires_at} />` : html`<span class="faint">never</span>`}</td>
               <td class="actions-cell">
                 ${key.state === "in force" && html`
+                  <button type="button" class="small" aria-label=${`Rotate ${key.name}`} onClick=${() => open(html`<${Rotate} key_=${key} close=${close} changed=${changed} />`)}>Rotate</button>
                   <button type="button" class="small" aria-label=${`Narrow ${key.name}`} onClick=${() => open(html`<${Narrow} key_=${key} close=${close} changed=${changed} />`)}>Narrow</button>
                   <button type="button" class="small danger" aria-label=${`Delete ${key.name}`} onClick=${() => open(html`<${Delete} key_=${key} close=${close} changed=${changed} />`)}>Delete</button>
                 `}
@@ -84,12 +85,12 @@ function useLocking() {
 }
 
 function Create({ first, close, changed }) {
-  const [fields, setFields] = useState({ name: "", role: first ? "admin" : "query", maps: null, expires: "" });
+  const [fields, setFields] = useState({ name: "", role: first ? "admin" : "query", learn: false, maps: null, expires: "" });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const { guarded, box } = useLocking();
   const create = guarded(async (query) => {
     const { name, role, maps, expires } = fields;
-    const body = { name, role, maps, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
+    const body = { name, role, maps, learn: role === "enrol" && fields.learn, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
     newKey.value = await (await send("POST", "/keys", { query, json: body })).json();
     if (first) useKey(newKey.value.key, { known: true }).catch(complain); // without it the next request would be refused
     changed();
@@ -99,6 +100,7 @@ function Create({ first, close, changed }) {
       ${first && html`<p class="notice">With the first key everybody needs one, you too. Make it an admin key for all maps; it is used here at once.</p>`}
       <${Field} label="Name"><input required maxlength="64" value=${fields.name} onInput=${(event) => change({ name: event.target.value })} autofocus autocomplete="off" spellcheck=${false} /><//>
       <${RoleField} roles=${ROLES} value=${fields.role} change=${(role) => change({ role })} />
+      ${fields.role === "enrol" && html`<${LearnField} value=${fields.learn} change=${(learn) => change({ learn })} />`}
       <${MapsField} value=${fields.maps} change=${(maps) => change({ maps })} />
       <${Field} label="Expires (UTC)" hint="Never, if left out."><input type="datetime-local" value=${fields.expires} onInput=${(event) => change({ expires: event.target.value })} /><//>
       ${box}
@@ -116,14 +118,21 @@ function RoleField({ roles, value, change }) {
   `;
 }
 
+/** An option of the role enrol; admin includes it, and query cannot have it. */
+function LearnField({ value, change }) {
+  return html`<label class="field check"><input type="checkbox" checked=${value} onChange=${() => change(!value)} /><span>Maps that learn may learn from its runs</span></label>`;
+}
+
 function Narrow({ key_: key, close, changed }) {
   const [role, setRole] = useState(key.role);
+  const [learn, setLearn] = useState(key.learn);
   const [maps, setMaps] = useState(key.maps);
   const [expires, setExpires] = useState(key.expires_at ? key.expires_at.slice(0, 16) : "");
   const { guarded, box } = useLocking();
   const save = guarded(async (query) => {
     const changes = {};
     if (role !== key.role) changes.role = role;
+    if (role === "enrol" && learn !== key.learn) changes.learn = learn;
     if (JSON.stringify(maps) !== JSON.stringify(key.maps)) changes.maps = maps;
     if (expires && expires !== key.expires_at?.slice(0, 16)) changes.expires_at = new Date(`${expires}Z`).toISOString();
     await send("PATCH", pathOf("keys", key.id), { query, json: changes });
@@ -133,10 +142,53 @@ function Narrow({ key_: key, close, changed }) {
   });
   return html`
     <${FormDialog} title=${`Narrow ${key.name}`} action="Narrow" ready=${maps?.length !== 0} close=${close} send=${save}>
-      <p class="faint">A key can only be narrowed: to a lower role, fewer maps, an earlier end.</p>
+      <p class="faint">A key can only be narrowed: to a lower role, fewer maps, an earlier end, no more learning from its runs.</p>
       <${RoleField} roles=${ROLES.slice(0, ROLES.indexOf(key.role) + 1)} value=${role} change=${setRole} />
+      ${role === "enrol" && key.learn && html`<${LearnField} value=${learn} change=${setLearn} />`}
       <${MapsField} value=${maps} among=${key.maps} change=${setMaps} />
       <${Field} label="Expires (UTC)"><input type="datetime-local" value=${expires} max=${key.expires_at?.slice(0, 16)} onInput=${(event) => setExpires(event.target.value)} /><//>
+      ${box}
+    <//>
+  `;
+}
+
+/** A name for the key after one: robot-7 goes on as robot-7.2, for two keys in force have no name in common. */
+function nextName(name) {
+  const [, stem, number] = /^(.*?)(?:\.(\d+))?$/.exec(name);
+  return `${stem}.${Number(number || 1) + 1}`;
+}
+
+const ENDS = { 0: "at once", 1: "in an hour", 24: "in a day", 168: "in a week" };
+
+/** Another key that may do the same takes the place of one, which goes on for a while. */
+function Rotate({ key_: key, close, changed }) {
+  const [hours, setHours] = useState("24");
+  const [name, setName] = useState(nextName(key.name));
+  const { guarded, box } = useLocking();
+  const made = useRef(null);
+  const rotate = guarded(async (query) => {
+    const { role, learn, maps, expires_at: expires } = key;
+    // If the old one could not be ended, this is tried again with the new one that there is by then.
+    made.current ??= await (await send("POST", "/keys", { query, json: { name, role, maps, learn: role === "enrol" && learn, expires_at: expires } })).json();
+    if (key.own) await useKey(made.current.key, { known: true });
+    const end = new Date(Date.now() + Number(hours) * 3_600_000);
+    if (hours === "0") await send("DELETE", pathOf("keys", key.id), { query });
+    else if (!expires || end < new Date(expires)) await send("PATCH", pathOf("keys", key.id), { query, json: { expires_at: end.toISOString() } });
+    newKey.value = made.current;
+    changed();
+  });
+  const cancel = () => {
+    if (made.current) newKey.value = made.current;
+    close();
+  };
+  return html`
+    <${FormDialog} title=${`Rotate ${key.name}`} action="Make the new key" ready=${name.trim() !== ""} close=${cancel} send=${rotate}>
+      <p>A new key of the same role, maps and end is made, and shown once. Give it to whoever uses the old one before that ends.</p>
+      <${Field} label="Name of the new key"><input required maxlength="64" value=${name} onInput=${(event) => setName(event.target.value)} autocomplete="off" spellcheck=${false} /><//>
+      <${Field} label="The old one ends">
+        <select value=${hours} onChange=${(event) => setHours(event.target.value)}>${Object.entries(ENDS).map(([value, text]) => html`<option value=${value}>${text}</option>`)}</select>
+      <//>
+      ${key.own && html`<p class="notice">It is the key that you use now; the console goes on with the new one.</p>`}
       ${box}
     <//>
   `;

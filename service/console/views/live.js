@@ -1,7 +1,7 @@
 // The queries of a map as they are answered: verdict, probability, who asked, and why.
 import { epoch, follow, get, key, may } from "../shared/api.js";
 import { Bar, Dialog, ExactMoment, Facts, Field, Head, Name, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
-import { clock, decimal, exact, integer, metres, percent, poseText } from "../shared/formats.js";
+import { changeText, clock, decimal, exact, integer, metres, percent, poseText } from "../shared/formats.js";
 import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
@@ -154,6 +154,7 @@ function Details({ map, event, close }) {
           ["Score", decimal(score)],
           ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],
           reason && ["Reason", reason],
+          event.change && ["View", changeText(event.change)],
           ["Pose", pose ? `${poseText(pose)} ± ${metres(pose.spread)}` : "–"],
           ["Asked by", event.key || "–"],
           event.camera && ["Camera", event.camera],

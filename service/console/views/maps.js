@@ -1,8 +1,9 @@
 // All maps: how large, how searched, how they answer; made, edited, deleted, saved as files and read from them.
-import { all, caller, download, everyMap, get, getTagged, may, patch, post, remove, upload } from "../shared/api.js";
-import { ByName, complain, Dialog, Field, FormDialog, Head, Menu, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
+import { all, caller, everyMap, get, getTagged, may, patch, post, remove, upload } from "../shared/api.js";
+import { ByName, Dialog, Field, FormDialog, Head, Menu, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
 import { mapNames } from "../shared/chosen_map.js";
 import { bytes, counted, encoderName, integer } from "../shared/formats.js";
+import { ExportAll, ExportMap } from "../shared/export_map.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
 import { MapSettings } from "../shared/map_settings.js";
@@ -18,6 +19,7 @@ export default function Maps() {
   return html`
     <${Head} title="Maps" note=${maps.data && summary(maps.data.items)}>
       ${may("admin") && html`
+        ${maps.data?.items.length > 1 && html`<button type="button" onClick=${() => setDialog(html`<${ExportAll} maps=${maps.data.items.map((one) => one.id)} close=${close} />`)}>Export all</button>`}
         <button type="button" onClick=${() => setDialog(html`<${Import} close=${close} changed=${changed} />`)}>Import</button>
         <button type="button" class="primary" onClick=${() => setDialog(html`<${Create} close=${close} changed=${changed} />`)}>Create a map</button>
       `}
@@ -94,7 +96,7 @@ function Row({ map, open, close, changed }) {
         ${may("admin") && html`
           <${Menu} of=${map.id} items=${[
             ["Edit", fresh],
-            ["Export", () => open(html`<${Export} map=${map} close=${close} />`)],
+            ["Export", () => open(html`<${ExportMap} map=${map.id} close=${close} />`)],
             ["Delete", () => open(html`<${Delete} map=${map.id} places=${map.places} close=${close} changed=${changed} />`), "danger"],
           ]} />
         `}
@@ -187,7 +189,7 @@ function getTaggedMap(map) {
   return getTagged(mapPath(map));
 }
 
-const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification"];
+const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification", "alarms"];
 
 function EditForm({ map, read, close, changed }) {
   const [fields, setFields] = useState({
@@ -229,40 +231,6 @@ function Verify({ map, close }) {
           ${told.problems.length > 0 && html`<ul class="stack">${told.problems.map((one) => html`<li class="mono small">${one}</li>`)}</ul>`}
         `}
       <//>
-    <//>
-  `;
-}
-
-function Export({ map, close }) {
-  const [state, setState] = useState(null);
-  const start = async () => {
-    const controller = new AbortController();
-    setState({ done: 0, total: null, controller });
-    try {
-      const progress = (done, total) => setState((old) => ({ ...old, done, total }));
-      await download(mapPath(map.id, "export"), `${map.id}.tar`, { progress, signal: controller.signal });
-      say(`${map.id}.tar was saved.`);
-      close();
-    } catch (error) {
-      setState(null);
-      complain(error);
-    }
-  };
-  const stop = () => {
-    state?.controller.abort();
-    close();
-  };
-  return html`
-    <${Dialog} title=${`Export ${map.id}`} close=${stop}>
-      <p>One file with the map's settings, places, descriptors, pictures and cameras, as they are now. It can be imported here or elsewhere.</p>
-      ${state && html`
-        <${Progress} done=${state.done} total=${state.total} label="Export" />
-        <p class="faint small">${bytes(state.done)} of ${bytes(state.total)}</p>
-      `}
-      <footer class="row">
-        <button type="button" class="primary" disabled=${state !== null} onClick=${start}>Export</button>
-        <button type="button" onClick=${stop}>${state ? "Stop" : "Cancel"}</button>
-      </footer>
     <//>
   `;
 }

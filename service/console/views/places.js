@@ -1,6 +1,8 @@
 // The places of a map as thumbnails, page by page and filtered; one place, where the address names it.
-import { get, may, post } from "../shared/api.js";
-import { ByName, complain, Field, Head, Moment, Name, Nothing, Pager, Pill } from "../shared/elements.js";
+import { all, get, may } from "../shared/api.js";
+import { saveCsv } from "../shared/csv.js";
+import { DeletePlaces } from "../shared/delete_places.js";
+import { complain, Field, Head, Moment, Name, Nothing, Pager, Typed } from "../shared/elements.js";
 import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -10,6 +12,12 @@ import { href, restate } from "../shared/router.js";
 import { html, useEffect, useState } from "../shared/view.js";
 
 const PAGE = 60;
+const COLUMNS = [
+  ...["id", "sequence", "timestamp", "camera"].map((name) => [name, (place) => place[name]]),
+  ...["x", "y", "z", "latitude", "longitude", "heading"].map((name) => [name, (place) => place.pose?.[name]]),
+  ...["pose_of", "regions", "picture", "created_at", "updated_at"].map((name) => [name, (place) => place[name]]),
+  ["metadata", (place) => JSON.stringify(place.metadata)],
+];
 const FILTERS = ["sequence", "camera", "after", "before", "where"];
 
 export default function Places({ map, rest, query }) {
@@ -39,10 +47,21 @@ function List({ map, query }) {
       page.reload();
       about.reload();
     };
-    setDialog(html`<${Delete} map=${map} order=${order} close=${close} done=${done} />`);
+    setDialog(html`<${DeletePlaces} map=${map} order=${order} close=${close} done=${done} />`);
+  };
+  const [saving, setSaving] = useState(false);
+  const keep = async () => {
+    setSaving(true);
+    try {
+      saveCsv(`${map}-places.csv`, COLUMNS, await all(mapPath(map, "places"), filter));
+    } catch (error) {
+      complain(error);
+    }
+    setSaving(false);
   };
   return html`
     <${Head} title="Places" note=${about.data && `${counted(about.data.places, "place")} in ${map}`}>
+      ${chosen.size === 0 && html`<button type="button" disabled=${saving} onClick=${keep}>${saving ? "Reading …" : "Save as CSV"}</button>`}
       ${may("enrol") && chosen.size > 0 && html`
         <button type="button" onClick=${() => setChosen(new Set())}>Choose none</button>
         <button type="button" class="danger" onClick=${() => remove({ ids: [...chosen] })}>Delete ${integer(chosen.size)} chosen</button>
@@ -84,6 +103,7 @@ function Filters({ map, filter }) {
   const [wrong, setWrong] = useState("");
   useEffect(() => setWhere(shownWhere(filter.where)), [filter.where]);
   const given = (name) => ({ value: filter[name] || "", onChange: (event) => restate({ [name]: event.target.value }) });
+  const moment = (name) => ({ type: "datetime-local", step: "1", value: filter[name] || "", change: ({ value }) => restate({ [name]: value }) });
   const applyWhere = () => {
     const read = readWhere(where);
     setWrong(read === null ? "Write name = value, several separated by commas." : "");
@@ -105,8 +125,8 @@ function Filters({ map, filter }) {
           </select>
         <//>
       `}
-      <${Field} label="Taken from (UTC)"><input type="datetime-local" step="1" ...${given("after")} /><//>
-      <${Field} label="to (UTC)"><input type="datetime-local" step="1" ...${given("before")} /><//>
+      <${Field} label="Taken from (UTC)"><${Typed} ...${moment("after")} /><//>
+      <${Field} label="to (UTC)"><${Typed} ...${moment("before")} /><//>
       <${Field} label="Metadata" hint=${wrong}>
         <input placeholder="floor = 2, light = day" value=${where} onInput=${(event) => setWhere(event.target.value)} onChange=${applyWhere} spellcheck=${false} />
       <//>
@@ -173,25 +193,5 @@ function Tile({ map, place, chosen, toggle }) {
         <span class="under faint small"><span>${place.sequence ? html`<${Name} text=${place.sequence} />` : "no traverse"}</span>${place.timestamp && html`<${Moment} at=${place.timestamp} />`}</span>
       </a>
     </li>
-  `;
-}
-
-/** Delete places: what would go is counted first, and what was counted is what goes. */
-function Delete({ map, order, close, done }) {
-  const report = useResource((signal) => post(`${mapPath(map, "places")}:delete`, { ...order, dry_run: true }, { signal }), [order]);
-  const send = async () => {
-    await post(`${mapPath(map, "places")}:delete`, { ids: report.data.ids, dry_run: false }).catch((error) => {
-      if (error.status === 404) complain(error);
-      throw error;
-    });
-    done();
-  };
-  if (report.data === undefined) return html`<${Shown} resource=${report} />`;
-  const { places, ids } = report.data;
-  return html`
-    <${ByName} title=${places === 1 ? "Delete a place" : `Delete ${integer(places)} places`} name=${map} action="Delete" close=${close} send=${send}>
-      <p>No later query finds ${places === 1 ? "it" : "them"}. This cannot be undone.</p>
-      <p class="row">${ids.slice(0, 12).map((id) => html`<${Pill}>${id}<//>`)}${ids.length > 12 && html`<span class="faint">and ${integer(ids.length - 12)} more</span>`}</p>
-    <//>
   `;
 }

@@ -2,12 +2,15 @@
 // lie below one another as strips.
 import { epoch, follow, get, may } from "../shared/api.js";
 import { complain, Facts, Head, Loading, Name, Nothing, Verdict } from "../shared/elements.js";
-import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
+import { isDark, onTheme, traverseColour } from "../shared/colours.js";
 import { counted, exact, integer, metres, poseText, relative } from "../shared/formats.js";
+import { Caught } from "../shared/lasso.js";
+import { FloorPlan, useFloor } from "../shared/floor_plan.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { PlanCanvas } from "../shared/plan_canvas.js";
-import { readPlan, stripsOf } from "../shared/plan_data.js";
+import { contentOf, presentTints } from "../shared/plan_content.js";
+import { readPlan } from "../shared/plan_data.js";
 import { Robots } from "../shared/robots.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
@@ -20,7 +23,10 @@ export default function Plan({ map, query }) {
     <${Shown} resource=${plan}>
       ${(data) => data.count === 0
         ? html`<${Nothing} title="The map is empty">Enrol a traverse, and it is drawn here.<//>`
-        : html`<${Drawing} map=${map} plan=${data} query=${query} />`}
+        : html`
+          <${Drawing} map=${map} plan=${data} query=${query} changed=${plan.reload} />
+          ${data.posed === 0 && html`<${Strips} map=${map} plan=${data} />`}
+        `}
     <//>
   `;
 }
@@ -34,17 +40,22 @@ function planNote({ places, posed, count, gap_count: gapCount }) {
   return parts.join(" · ");
 }
 
-function Drawing({ map, plan, query }) {
+function Drawing({ map, plan, query, changed }) {
   const [strips, setStrips] = useState(plan.posed === 0);
   const [off, setOff] = useState(new Set());
   const [showGaps, setShowGaps] = useState(true);
   const [misleading, setMisleading] = useState(null);
   const [live, setLive] = useState(plan.posed > 0);
   const [theme, setTheme] = useState(isDark());
+  const [grid, setGrid] = useState(false);
+  const [point, setPoint] = useState(null);
+  const [catching, setCatching] = useState(false);
+  const [selected, setSelected] = useState([]);
+  const floor = useFloor(map);
   const [hovered, setHovered] = useState(null);
   const [view, setView] = useState(null);
   const drawing = useRef(null);
-  const [places, above] = [useRef(null), useRef(null)];
+  const [ground, places, above] = [useRef(null), useRef(null), useRef(null)];
   const chosen = query.place !== undefined ? plan.index.get(query.place) ?? null : null;
   const choose = (number) => restate({ place: number === null ? "" : plan.ids[number] });
   const latest = useRef({});
@@ -56,22 +67,32 @@ function Drawing({ map, plan, query }) {
       onChoose: (number) => latest.current.choose(number),
       onHover: setHovered,
       onView: setView,
+      onPoint: setPoint,
+      onLasso: (numbers) => {
+        setSelected(numbers);
+        setCatching(false);
+      },
+      ground: ground.current,
       onStep: (step) => stepOn(latest.current, step, drawing.current),
     });
     return () => drawing.current.close();
   }, []);
   const groups = plan.traverses;
-  const content = useMemo(() => contentOf(plan, strips, off, showGaps), [plan, strips, off, showGaps, theme]);
+  const content = useMemo(() => contentOf(plan, { strips, off, showGaps }), [plan, strips, off, showGaps, theme]);
   const shape = `${strips} ${map}`;
   const fitted = useRef(null);
   useEffect(() => {
-    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown", "faint"].map((name) => [name, colour(name)]));
-    drawing.current.mark({ tints });
+    drawing.current.mark({ tints: presentTints() });
     drawing.current.show(content, fitted.current !== shape);
     if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);
     fitted.current = shape;
   }, [content]);
-  useEffect(() => drawing.current.mark({ chosen, hovered, misleading: misleading || [] }), [chosen, hovered, misleading]);
+  useEffect(() => drawing.current.mark({ chosen, hovered, misleading: misleading || [], selected }), [chosen, hovered, misleading, selected]);
+  useEffect(() => setSelected([]), [plan, strips]);
+  useEffect(() => {
+    drawing.current.catching = catching;
+  }, [catching]);
+  useEffect(() => drawing.current.lay(strips ? {} : { grid, image: floor.image, placed: floor.placed }), [grid, floor.image, floor.placed, strips, theme]);
   const robots = useRobots(map, plan, live && !strips, drawing);
 
   const told = hovered ?? null;
@@ -79,8 +100,9 @@ function Drawing({ map, plan, query }) {
     <div class="plan">
       <div class="stack">
         <div class="plan-canvas">
-          <canvas ref=${places} aria-hidden="true"></canvas>
-          <canvas ref=${above} tabindex="0" role="img" aria-label=${`Plan of ${map}: ${integer(plan.count)} places. Arrow keys move, plus and minus zoom, 0 shows all, n and p go along the traverse.`}></canvas>
+          <canvas ref=${ground} class="ground" aria-hidden="true"></canvas>
+          <canvas ref=${places} class="places" aria-hidden="true"></canvas>
+          <canvas ref=${above} class=${catching ? "catching" : ""} tabindex="0" role="img" aria-label=${`Plan of ${map}: ${integer(plan.count)} places. Arrow keys move, plus and minus zoom, 0 shows all, n and p go along the traverse; a drag with Shift draws a lasso.`}></canvas>
           <div class="plan-tools">
             <button type="button" aria-label="Zoom in" onClick=${() => drawing.current.zoom(1.4)}>+</button>
             <button type="button" aria-label="Zoom out" onClick=${() => drawing.current.zoom(1 / 1.4)}>−</button>
@@ -88,8 +110,10 @@ function Drawing({ map, plan, query }) {
           </div>
           <div class="plan-read">
             ${view && html`<${ScaleBar} scale=${view.scale} strips=${strips} />`}
-            ${told !== null && html`<span>${plan.ids[told]}</span>`}
+            ${told !== null ? html`<span>${plan.ids[told]}</span>` : point && !strips && html`<span>${poseText(plan.projection.back(point))}</span>`}
           </div>
+          ${!strips && html`<${Compass} geographic=${plan.projection.geographic} />`}
+          ${told !== null && told !== chosen && html`<${Hovered} key=${told} map=${map} plan=${plan} number=${told} at=${drawing.current.pixel(told)} size=${[drawing.current.width, drawing.current.height]} />`}
         </div>
         <div class="filters">
           ${plan.posed > 0 && html`
@@ -98,10 +122,12 @@ function Drawing({ map, plan, query }) {
               <button type="button" aria-pressed=${strips} onClick=${() => setStrips(true)}>Strips</button>
             </div>
           `}
+          ${may("enrol") && html`<button type="button" aria-pressed=${catching} onClick=${() => setCatching(!catching)}>Lasso</button>`}
           <${Find} plan=${plan} choose=${(number) => { choose(number); drawing.current.centre(number); }} />
         </div>
       </div>
       <div class="stack">
+        ${selected.length > 0 && html`<${Caught} map=${map} plan=${plan} numbers=${selected} drop=${() => setSelected([])} changed=${changed} />`}
         ${chosen !== null && html`<${Chosen} map=${map} plan=${plan} number=${chosen} close=${() => choose(null)} />`}
         <section class="panel">
           <h2>Traverses</h2>
@@ -109,6 +135,8 @@ function Drawing({ map, plan, query }) {
         </section>
         <section class="panel">
           <h2>Also shown</h2>
+          ${plan.posed > 0 && html`<label class="row"><input type="checkbox" checked=${grid} onChange=${() => setGrid(!grid)} /> Grid, in metres</label>`}
+          ${plan.posed > 1 && html`<${FloorPlan} floor=${floor} plan=${plan} chosen=${chosen} />`}
           ${plan.gap_count > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gap_count)})</label>`}
           ${plan.posed > 0 && html`<label class="row"><input type="checkbox" checked=${live} onChange=${() => setLive(!live)} /> Robots and answers, live</label>`}
           ${may("enrol") && html`<${Misleading} map=${map} plan=${plan} found=${misleading} setFound=${setMisleading} />`}
@@ -119,25 +147,41 @@ function Drawing({ map, plan, query }) {
   `;
 }
 
-/** What the canvas draws: positions, colours by traverse, and which traverses are seen. */
-function contentOf(plan, strips, off, showGaps) {
-  const { x, y } = strips ? stripsOf(plan) : { x: plan.px, y: plan.py };
-  const last = plan.sequences.length;
-  const group = Int32Array.from(plan.sequence, (one) => (one < 0 ? last : one));
-  const names = [...plan.sequences, null];
-  const colours = names.map((_, one) => traverseColour(one < last ? one : -1));
-  const lines = names.map((name) => (name === null ? [] : plan.traverses.find((one) => one.name === name)?.places || []));
-  const gaps = showGaps && !strips ? plan.gaps : [];
-  const visible = names.map((name) => !off.has(name));
-  return { x, y, group, colours, numbers: colours.map(pixelOf), visible, lines, gaps, angle: strips ? null : plan.angle };
+/** Where north is; a metric map says only where its axes point. */
+function Compass({ geographic }) {
+  const text = geographic ? "North is up" : "x to the right, y up";
+  return html`<div class="compass" role="img" aria-label=${text} title=${text}><span aria-hidden="true">↑</span><span aria-hidden="true">${geographic ? "N" : "y"}</span></div>`;
 }
 
-/** A colour as a pixel of a little-endian Uint32Array. */
-function pixelOf(text) {
-  const context = new OffscreenCanvas(1, 1).getContext("2d");
-  context.fillStyle = text;
-  context.fillRect(0, 0, 1, 1);
-  return new Uint32Array(context.getImageData(0, 0, 1, 1).data.buffer)[0];
+const CARD = [150, 150];
+
+/** A place under the pointer: its picture beside it, within the plan. */
+function Hovered({ map, plan, number, at: [px, py], size: [width, height] }) {
+  const left = Math.max(4, px + 16 + CARD[0] > width ? px - 16 - CARD[0] : px + 16);
+  const top = Math.max(4, Math.min(py - CARD[1] / 2, height - CARD[1] - 4));
+  return html`<div class="hovered" style=${{ left: `${left}px`, top: `${top}px` }}><${Thumbnail} map=${map} place=${plan.ids[number]} /><span class="small"><${Name} text=${plan.ids[number]} /></span></div>`;
+}
+
+const MOST_OF_STRIP = 60;
+
+/** Without poses: the traverses as rows of their pictures, evenly chosen. */
+function Strips({ map, plan }) {
+  return html`
+    <section class="stack" aria-label="Traverses as pictures">
+      ${plan.traverses.slice(0, 20).map(({ name, places }) => {
+        const pace = Math.max(1, Math.ceil(places.length / MOST_OF_STRIP));
+        const shown = places.filter((_, one) => one % pace === 0);
+        return html`
+          <div class="panel" key=${name}>
+            <div class="spread"><h2>${name ?? "no traverse"}</h2><span class="faint">${counted(places.length, "place")}${pace > 1 && html`, every ${integer(pace)}th`}</span></div>
+            <ul class="strip" tabindex="0" role="group" aria-label=${`Pictures of ${name ?? "places of no traverse"}`}>
+              ${shown.map((one) => html`<li key=${one}><a href=${href("maps", map, "places", plan.ids[one])} title=${plan.ids[one]}><${Thumbnail} map=${map} place=${plan.ids[one]} /></a></li>`)}
+            </ul>
+          </div>
+        `;
+      })}
+    </section>
+  `;
 }
 
 function stepOn({ chosen, plan, choose }, step, drawing) {

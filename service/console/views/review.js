@@ -1,24 +1,27 @@
 // Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
 import { get, getTagged, may, patch, post, remove, save } from "../shared/api.js";
-import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
+import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, Nothing, NumberInput, Pager, Pill, say, Verdict } from "../shared/elements.js";
 import { bytes, counted, decimal, integer, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource } from "../shared/resource.js";
-import { href } from "../shared/router.js";
+import { href, restate } from "../shared/router.js";
+import { Stretches, useStretches } from "../shared/stretches.js";
 import { html, useEffect, useRef, useState } from "../shared/view.js";
 
 const PAGE = 30;
 const REGRET = 8000;
 const LOOKS_EVERY = 5000;
 
-export default function Review({ map }) {
+export default function Review({ map, query }) {
   const about = useResource((signal) => getTagged(mapPath(map), {}, signal), [map]);
-  const [labelled, setLabelled] = useState(false);
+  const stretches = useStretches(map);
+  const shown = ["labelled", "stretches"].includes(query.show) ? query.show : "waiting";
   const [dialog, setDialog] = useState(null);
   const close = () => setDialog(null);
   const settings = about.data?.data.review;
-  const learns = about.data && about.data.data.learning.mode !== "off";
+  const learning = about.data?.data.learning;
+  const learns = learning && (learning.mode !== "off" || learning.new_ground);
   const keep = () => setDialog(html`<${Keeping} map=${map} read=${about.data} close=${close} changed=${about.reload} />`);
   const write = async () => {
     const told = await get(mapPath(map, "review", "labels")).catch(complain);
@@ -33,10 +36,13 @@ export default function Review({ map }) {
       ${() => html`
         ${settings === null && !learns && html`<p class="notice">This map stores no frames for review now. ${may("admin") ? "Choose under Stored frames the answers whose frames it stores." : "Somebody with an admin key can turn that on."}</p>`}
         <div class="segments" role="group" aria-label="Which frames">
-          <button type="button" aria-pressed=${!labelled} onClick=${() => setLabelled(false)}>To be looked at</button>
-          <button type="button" aria-pressed=${labelled} onClick=${() => setLabelled(true)}>Labelled</button>
+          <button type="button" aria-pressed=${shown === "waiting"} onClick=${() => restate({ show: "" })}>To be looked at</button>
+          <button type="button" aria-pressed=${shown === "labelled"} onClick=${() => restate({ show: "labelled" })}>Labelled</button>
+          <button type="button" aria-pressed=${shown === "stretches"} onClick=${() => restate({ show: "stretches" })}>New ground${stretches.data?.length > 0 && ` (${integer(stretches.data.length)})`}</button>
         </div>
-        <${Frames} key=${labelled} map=${map} labelled=${labelled} keeps=${settings !== null || learns} />
+        ${shown === "stretches"
+          ? html`<${Stretches} map=${map} stretches=${stretches} about=${about} />`
+          : html`<${Frames} key=${shown} map=${map} labelled=${shown === "labelled"} keeps=${settings !== null || learns} />`}
       `}
     <//>
     ${dialog}
@@ -59,11 +65,13 @@ function usePinned(page, place) {
   return { items, fresh: (told || []).filter((one) => !(one.id <= (items[0]?.id ?? 0))).length, adopt };
 }
 
-/** Frames as they are now, with older ones that moved up behind them. */
+/** Frames as they are now, with older ones that moved up behind them; one that is not listed any more has no label. */
 function joined(items, told) {
   const now = new Map(told.map((one) => [one.id, one]));
   const last = items.at(-1)?.id ?? 0;
-  return [...items.map((one) => now.get(one.id) || one), ...told.filter((one) => one.id < last)];
+  const oldest = told.length < PAGE ? 0 : told.at(-1).id;
+  const left = (one) => (one.id < oldest ? one : { ...one, label: null, labelled_at: null });
+  return [...items.map((one) => now.get(one.id) || left(one)), ...told.filter((one) => one.id < last)];
 }
 
 function Frames({ map, labelled, keeps }) {
@@ -219,6 +227,7 @@ function Labelling({ map, frame, label, discard }) {
           ${!frame.label && html`<div class="row"><button type="button" class="primary narrow" disabled=${busy} onClick=${clicked({ place: proposal.place, look: true })}>Add it to the looks of <${Name} text=${proposal.place} /></button></div>`}
         </div>
       `}
+      ${answer.stretch && html`<p class="notice">It is of new ground, <a href=${href("maps", map, "review", { show: "stretches" })}>which is accepted or rejected as a whole</a>.</p>`}
       <div class="spread"><h2>Which place is it?</h2><span class="faint small">The number keys choose a candidate.</span></div>
       <ol class="matches">
         ${answer.matches.map((one, number) => html`
@@ -305,10 +314,12 @@ function Keeping({ map, read, close, changed }) {
   const [frames, setFrames] = useState(present?.most_frames ?? 500);
   const [size, setSize] = useState(present ? Math.round(present.most_bytes / MIB) : 256);
   const [mode, setMode] = useState(read.data.learning.mode);
+  const [ground, setGround] = useState(read.data.learning.new_ground);
+  const [calibration, setCalibration] = useState(read.data.learning.calibration);
   const toggle = (name) => setVerdicts((old) => (old.includes(name) ? old.filter((one) => one !== name) : [...old, name]));
   const keep = async () => {
     const review = verdicts.length ? { verdicts, most_frames: frames, most_bytes: size * MIB } : null;
-    await patch(mapPath(map), { review, learning: { mode } }, read.tag);
+    await patch(mapPath(map), { review, learning: { mode, new_ground: ground, calibration } }, read.tag);
     say(review ? "Such frames are stored from now on." : "No further frames are stored for their answers.");
     changed();
   };
@@ -327,8 +338,16 @@ function Keeping({ map, read, close, changed }) {
             <option value="auto">looks, taken where evidence agrees</option>
           </select>
         <//>
-        <${Field} label="At most, frames"><input type="number" min="1" step="1" value=${frames} onInput=${(event) => setFrames(event.target.valueAsNumber)} /><//>
-        <${Field} label="At most, MiB"><input type="number" min="1" step="1" value=${size} onInput=${(event) => setSize(event.target.valueAsNumber)} /><//>
+        <${Field} label="What runs and alignments say of the calibration">
+          <select value=${calibration} onChange=${(event) => setCalibration(event.target.value)}>
+            <option value="off">nothing</option>
+            <option value="propose">it is proposed under Calibration</option>
+            <option value="auto">it is stored, after runs where two agree</option>
+          </select>
+        <//>
+        <label class="field check"><input type="checkbox" checked=${ground} onChange=${() => setGround(!ground)} /><span>Where runs leave the map and come back, propose their way as new ground</span></label>
+        <${Field} label="At most, frames"><${NumberInput} min="1" step="1" value=${frames} change=${setFrames} /><//>
+        <${Field} label="At most, MiB"><${NumberInput} min="1" step="1" value=${size} change=${setSize} /><//>
       </div>
     <//>
   `;

@@ -1,10 +1,12 @@
 // The service itself: is it ready, what waits, how long answers take, and how near it is to its limits.
-import { get } from "../shared/api.js";
+import { everyMap, get, may } from "../shared/api.js";
+import { Chart } from "../shared/chart.js";
+import { saveCsv } from "../shared/csv.js";
 import { Bar, Facts, Head, Moment, Pill } from "../shared/elements.js";
 import { bytes, duration, integer, milliseconds } from "../shared/formats.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { Result } from "../shared/result.js";
-import { html, useState } from "../shared/view.js";
+import { html, useMemo, useState } from "../shared/view.js";
 
 export default function Service() {
   const state = useResource((signal) => get("/service", {}, { signal }), [], { every: 3000 });
@@ -51,8 +53,83 @@ function State({ data }) {
         ]} />
       </section>
     </div>
-    <section class="stack"><h2>Answers of the last five minutes</h2><${Latencies} operations=${requests.operations} /></section>
+    ${may("admin") && everyMap.value && html`<${History} />`}
+    <section class="stack"><div><h2>Requests of the last five minutes</h2><p class="faint">without those of this console</p></div><${Latencies} operations=${requests.operations} /></section>
     <${More} data=${data} />
+  `;
+}
+
+const RANGES = { 1: "1 hour", 6: "6 hours", 24: "1 day", 168: "7 days" };
+const MIB = 2 ** 20;
+const GIB = 2 ** 30;
+const COUNTS = ["recognized", "ambiguous", "unknown"];
+
+/** The load over time, as far as it is stored. */
+function History() {
+  const [hours, setHours] = useState("6");
+  const history = useResource((signal) => get("/service/history", { hours }, { signal }), [hours], { every: 30_000 });
+  return html`
+    <section class="panel" aria-label="Over time">
+      <div class="spread">
+        <h2>Over time</h2>
+        <div class="row">
+          <div class="segments" role="group" aria-label="How far back">
+            ${Object.entries(RANGES).map(([value, text]) => html`<button type="button" aria-pressed=${hours === value} onClick=${() => setHours(value)}>${text}</button>`)}
+          </div>
+          <button type="button" class="small" disabled=${!history.data} onClick=${() => saveHistory(history.data)}>Save as CSV</button>
+        </div>
+      </div>
+      <${Shown} resource=${history}>${(data) => html`<${Plots} data=${data} hours=${Number(hours)} />`}<//>
+    </section>
+  `;
+}
+
+function saveHistory(data) {
+  const names = Object.keys(data).filter((name) => name !== "step_seconds");
+  saveCsv("service-history.csv", names.map((name) => [name, (row) => data[name][row]]), data.at.map((_, row) => row));
+}
+
+/** Columns on an even grid of time: what is missing, while the service did not run, is a gap. */
+function gridOf(data, hours) {
+  const step = data.step_seconds;
+  const last = Math.floor(Date.now() / 1000 / step) * step;
+  const first = last - Math.ceil((hours * 3600) / step) * step + step;
+  const xs = Array.from({ length: (last - first) / step + 1 }, (_, one) => first + one * step);
+  const rows = new Map(data.at.map((at, row) => [Math.round(new Date(at).getTime() / 1000), row]));
+  const column = (name, by = 1) => xs.map((x) => {
+    const value = rows.has(x) ? data[name][rows.get(x)] : null;
+    return value === null ? null : value / by;
+  });
+  return { xs, column };
+}
+
+function momentOf(seconds, hours) {
+  const moment = new Date(1000 * seconds);
+  return hours > 24 ? moment.toLocaleDateString("en-GB", { day: "numeric", month: "short" }) : moment.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" });
+}
+
+function Plots({ data, hours }) {
+  const minutes = data.step_seconds / 60;
+  const plots = useMemo(() => {
+    const { xs, column } = gridOf(data, hours);
+    return {
+      answers: [xs, ...COUNTS.map((name) => column(name, minutes))],
+      latencies: [xs, column("p50"), column("p99")],
+      memory: [xs, column("resident", MIB)],
+      disk: [xs, column("disk_free", GIB)],
+    };
+  }, [data, hours]);
+  const time = { label: "", time: true, values: (_, splits) => splits.map((one) => momentOf(one, hours)), of: hours };
+  const total = COUNTS.map((name) => `${integer(data[name].reduce((sum, one) => sum + one, 0))} ${name}`).join(", ");
+  const p99 = Math.max(0, ...data.p99.filter((one) => one !== null));
+  return html`
+    <p>${total}; ${integer(data.errors.reduce((sum, one) => sum + one, 0))} requests failed.</p>
+    <div class="plots">
+      <figure><${Chart} data=${plots.answers} height=${200} series=${COUNTS.map((name) => ({ label: name, tint: name }))} axes=${[time, { label: "answers a minute" }]} label=${`Answers a minute by verdict: ${total}`} /></figure>
+      <figure><${Chart} data=${plots.latencies} height=${200} series=${[{ label: "half of them" }, { label: "99 of 100", tint: "ambiguous" }]} axes=${[time, { label: "milliseconds" }]} label=${`Latency of answers in milliseconds; 99 of 100 took at most ${milliseconds(p99)}`} /></figure>
+      <figure><${Chart} data=${plots.memory} height=${200} series=${[{ label: "memory" }]} axes=${[time, { label: "memory, MiB" }]} label=${`Memory; now ${bytes(data.resident.at(-1))}`} /></figure>
+      <figure><${Chart} data=${plots.disk} height=${200} series=${[{ label: "free" }]} axes=${[time, { label: "free on the disk, GiB" }]} label=${`Free on the disk; now ${bytes(data.disk_free.at(-1))}`} /></figure>
+    </div>
   `;
 }
 

@@ -6,6 +6,7 @@ import { decimal, integer, milliseconds } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
 import { Matrix } from "../shared/matrix.js";
+import { CalibrationOutcome } from "../shared/outcome.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
@@ -158,6 +159,7 @@ function Alignment({ job, changed, undo }) {
       !back && ["Poses handed over", integer(result.poses_handed_over)],
       result.poses_taken_back > 0 && ["Poses taken back", integer(result.poses_taken_back)],
       ["Stored", result.stored ? "yes" : "no, a dry run"],
+      result.calibration && ["Calibration", html`<${CalibrationOutcome} map=${job.map} told=${result.calibration} />`],
     ]} />`}
   `;
 }

@@ -22,8 +22,9 @@ SCHEMAS = DOCUMENT["components"]["schemas"]
 METHODS = ("get", "post", "put", "patch", "delete")
 
 SENT = (
-    *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Merging", "Reencoding"),
+    *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Erasing", "Merging", "Reencoding"),
     *("CalibrationOrder", "CameraDefinition", "NewKey", "KeyChanges", "Deletion", "LabelOrder"),
+    "RecordingOrder",
 )
 """Schemas of bodies. They lose their required fields, which the calls take by position."""
 

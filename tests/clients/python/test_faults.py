@@ -122,6 +122,7 @@ def campaign(server: Server, map_id: str, operations: int, seed: int) -> FaultPr
     return proxy
 
 
+@pytest.mark.thorough
 def test_a_bad_network_loses_and_doubles_nothing(server: Server) -> None:
     proxy = campaign(server, "bad-network", 120, seed=17)
     assert all(proxy.happened[fault] for fault in (*FAULTS, "cut-stream")), proxy.happened

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from placerec_client import InvalidFrame, Map, Picture
+from placerec_client import Enrolled, InvalidFrame, Located, Map, NewPlace, Picture
 from placerec_client.events import Event, Reader
 from placerec_client.frames import frame_bytes, media_type, png
 from placerec_client.requests import Part, dumps, form, query_string
@@ -170,3 +170,19 @@ def test_events_in_any_chunks() -> None:
         chunks = [stream[start : start + size] for start in range(0, len(stream), size)]
         found = [event for chunk in chunks for event in reader.take(chunk)]
         assert found == [Event("running", '{"a":\n1}', "7"), Event("message", "x", None)], size
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        (b"x" * 5000, "<5000 bytes>"),
+        (memoryview(b"xy"), "<2 bytes>"),
+        ("a/b.jpg", "'a/b.jpg'"),
+        (np.zeros((480, 640, 3), np.uint8), "<ndarray of shape [480, 640, 3]>"),
+        (Picture(np.zeros((4, 6), np.uint8)), "Picture(<ndarray of shape [4, 6]>, 'bgr', 'png', quality=90)"),
+    ],
+)
+def test_a_frame_is_shown_without_its_bytes(frame: Any, text: str) -> None:
+    assert repr(NewPlace("p", frame)) == f"NewPlace('p', {text}, {{}})"
+    assert repr(Located(frame, None)) == f"Located({text}, answer=None)"
+    assert repr(Enrolled(NewPlace("p", frame), "created")).startswith(f"Enrolled(place=NewPlace('p', {text}, {{}}), ")

@@ -27,6 +27,7 @@ def test_no_module_is_left_over() -> None:
     assert halves[0] == halves[1]
 
 
+@pytest.mark.thorough
 def test_what_is_not_used_is_not_imported() -> None:
     """That keeps the import short: of httpx's command line, of WebSockets, of the other half, nothing is there."""
     program = "import sys; from placerec_client import Client; print(*sys.modules)"

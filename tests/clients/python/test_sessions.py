@@ -24,8 +24,8 @@ from placerec_client import (
     InvalidOdometry,
     Map,
     Odometry,
-    PlacerecError,
     Retry,
+    Session,
     UnexpectedAnswer,
     models,
     problems,
@@ -180,22 +180,59 @@ def test_numbers_of_numpy_and_any_turn_are_taken(walk: Map) -> None:
         assert stream.send(jpeg(1, 64, 48), odometry=replace(pose, heading=370.0)).motion == "odometry"
 
 
-def test_a_session_that_has_not_begun_says_how_it_begins(lab: Map) -> None:
-    session = lab.sessions.begin()
-    uses: list[Callable[[], object]] = [
-        lambda: session.send(jpeg(1, 64, 48)),
-        session.read,
-        session.delete,
-        session.stream,
-    ]
-    for use in uses:
-        with pytest.raises(
-            PlacerecError, match=r"has not begun: .*`with lab\.sessions\.begin\(\) as session:`, or by sess"
-        ):
-            use()
-    assert session.begin().send(jpeg(1, 64, 48)).frames == 1
-    assert session.view is not None and session.view.id == session.id
+FIRST_CALLS: dict[str, Callable[[Session], object]] = {
+    "begin": lambda session: session.begin(),
+    "send": lambda session: session.send(jpeg(1, 64, 48)),
+    "read": lambda session: session.read(),
+    "stream": lambda session: session.stream().send(jpeg(1, 64, 48)),
+}
+
+
+@pytest.mark.parametrize("call", FIRST_CALLS)
+def test_a_session_begins_at_its_first_call(lab: Map, call: str) -> None:
+    session = lab.sessions.begin(lag=2)
+    session.delete()  # there is none
+    assert not session.id and "not begun" in repr(session) and list(lab.sessions) == []
+    FIRST_CALLS[call](session)
+    assert session.view is not None and session.view.id == session.id and session.view.lag == 2
+    assert session.read().id == session.id
     session.delete()
+
+
+def test_a_session_begins_once_whoever_sends_first(url: str, walk: Map) -> None:
+    session = walk.sessions.begin()
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda number: session.send(jpeg(number, 64, 48)), range(4)))
+    assert sorted(one.frames for one in answers) == [1, 2, 3, 4]
+    assert [one.id for one in walk.sessions] == [session.id]
+
+    async def work() -> None:
+        async with AsyncClient(url) as client:
+            sessions = client.maps[walk.id].sessions
+            awaited = await sessions.begin(lag=1)
+            assert awaited.id and awaited is await awaited
+            unbegun = sessions.begin()
+            found = await asyncio.gather(*(unbegun.send(jpeg(number, 64, 48)) for number in range(4)))
+            assert sorted(one.frames for one in found) == [1, 2, 3, 4]
+            assert {one.id async for one in sessions} == {session.id, awaited.id, unbegun.id}
+
+    asyncio.run(work())
+
+
+def test_beginning_takes_of_the_deadline_of_the_frame(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    with lab.sessions.begin() as begun:
+        assert begun.view is not None
+        view = begun.view.model_dump_json()
+    moments, requests = Moments(monkeypatch), list[tuple[str, float]]()
+
+    def slow(request: httpx.Request) -> httpx.Response:
+        requests.append((request.url.path.rpartition("/")[2], float(request.headers["X-Request-Timeout"])))
+        moments.now += 0.125
+        return httpx.Response(418 if request.url.path.endswith("frames") else 201, content=view)
+
+    with Client("robot", transport=httpx.MockTransport(slow)) as client, pytest.raises(UnexpectedAnswer):
+        client.maps["lab"].sessions.begin().send(b"frame", deadline=0.5)
+    assert requests == [("sessions", 0.5), ("frames", 0.375)]
 
 
 def test_a_session_that_is_entered_once_more_is_another_one(url: str, lab: Map) -> None:
@@ -354,9 +391,6 @@ def test_a_deadline_may_be_as_late_as_one_likes(url: str, lab: Map, deadline: fl
 
 def test_what_ends(walk: Map) -> None:
     session = walk.sessions.begin()
-    with pytest.raises(PlacerecError, match="has not begun"):
-        session.send(jpeg(0, 64, 48))
-    session.begin()
     with session.stream() as stream:
         stream.send(jpeg(0, 64, 48))
         session.delete()

@@ -81,6 +81,26 @@ def test_a_part_that_belongs_to_another_state_of_the_map(full: Map, tmp_path: Pa
     check_archive(tmp_path / "lab.tar")
 
 
+def test_nothing_is_sent_where_the_id_is_taken(full: Map, client: Client, tmp_path: Path) -> None:
+    full.export(tmp_path / "lab.tar")
+    sent: list[int] = []
+    for map_id in (None, full.id):
+        with pytest.raises(problems.MapExists, match="already"):
+            client.maps.import_(tmp_path / "lab.tar", id=map_id, progress=lambda done, _size: sent.append(done))
+    assert sent == []
+
+    name = f"{full.id}-meanwhile"
+
+    def overtake(done: int, _size: int) -> None:
+        if not sent:
+            client.maps.create(name)
+        sent.append(done)
+
+    with pytest.raises(problems.MapExists):
+        client.maps.import_(tmp_path / "lab.tar", id=name, progress=overtake).wait()
+    assert sent and client.maps[name].read().places == 0
+
+
 def test_a_file_that_is_no_map(client: Client, tmp_path: Path) -> None:
     with pytest.raises(TransferFailed, match="cannot be read"):
         client.maps.import_(tmp_path / "nothing.tar")

@@ -28,7 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, NavSatFix
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -92,6 +92,7 @@ class Peer:
             "map_to_odom": (TransformStamped, transform_of),
             "/initialpose": (PoseWithCovarianceStamped, pose_of),
             "/tf": (TFMessage, lambda message: transform_of(message.transforms[0])),
+            "fix": (NavSatFix, fix_of),
             "filtered_pose": (PoseWithCovarianceStamped, pose_of),
             "annotated/compressed": (CompressedImage, picture_of),
             "/diagnostics": (DiagnosticArray, diagnostics_of),
@@ -331,8 +332,20 @@ def pose_of(message: Any) -> dict[str, Any]:
         "frame": message.header.frame_id,
         "x": pose.position.x,
         "y": pose.position.y,
+        "z": pose.position.z,
         "heading": math.degrees(2 * math.atan2(pose.orientation.z, pose.orientation.w)) % 360,
         "covariance": list(map(float, message.pose.covariance)),
+    }
+
+
+def fix_of(message: Any) -> dict[str, Any]:
+    return {
+        "stamp": stamp_of(message),
+        "frame": message.header.frame_id,
+        "latitude": message.latitude,
+        "longitude": message.longitude,
+        "altitude": None if math.isnan(message.altitude) else message.altitude,
+        "covariance": list(map(float, message.position_covariance)),
     }
 
 

@@ -258,7 +258,12 @@ class Robot:
             assert self.transition("deactivate")
         if self.state == "inactive":
             assert self.transition("cleanup")
-        for topic in ("answer", "pose", "filtered_pose", "map_to_odom", "annotated/compressed", "/tf", "/diagnostics"):
+        for topic in (
+            *("answer", "pose", "filtered_pose", "fix", "map_to_odom"),
+            "annotated/compressed",
+            "/tf",
+            "/diagnostics",
+        ):
             self.peer.do("deafen", topic=topic)
             self.peer.take(topic)
         self.peer.do("deafen", topic="/initialpose")

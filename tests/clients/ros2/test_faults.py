@@ -118,6 +118,7 @@ def test_what_a_slow_service_cannot_take_is_dropped_oldest_first(driving: Robot,
     assert answers[2]["number"] - answers[0]["number"] == 8, "the service learns of the gap"
 
 
+@pytest.mark.thorough
 def test_a_clock_that_is_set_back_begins_a_new_run(driving: Robot) -> None:
     robot = driving
     robot.begin()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from placerec_ros.frame_queue import Frame, FrameQueue
+from placerec_ros.frame_queue import Frame, FrameQueue, Moments
 
 
 def frame(number: int, arrived: float | None = None) -> Frame:
@@ -36,3 +36,33 @@ def test_frames_that_are_cleared_were_not_dropped() -> None:
     queue.clear()
     assert queue.take(0.0) is None
     assert queue.dropped == 0
+
+
+def together(moments: Moments, *taken: tuple[str, int]) -> list[list[list[str]]]:
+    """For each frame that is taken in, the moments that are over by it, as the cameras of their frames."""
+    found = []
+    for number, (camera, stamp) in enumerate(taken):
+        over = moments.add(Frame(number, stamp, None, camera=camera))
+        found.append([[f"{one.camera} {one.stamp}" for one in group.moment] for group in over])
+    return found
+
+
+def test_frames_of_one_moment_are_put_together() -> None:
+    moments = Moments(["front", "left"], 5)
+    assert together(moments, ("front", 100), ("left", 103), ("left", 200), ("front", 196)) == [
+        *([], [["front 100", "left 103"]]),
+        *([], [["left 200", "front 196"]]),
+    ]
+
+
+def test_a_moment_ends_without_a_camera_that_sees_nothing() -> None:
+    moments = Moments(["front", "left", "rear"], 5)
+    assert together(moments, ("front", 100), ("left", 101), ("front", 200), ("left", 206)) == [
+        *([], []),
+        [["front 100", "left 101"]],
+        [["front 200"]],
+    ]
+    assert together(Moments(["front", "left"], 5), ("front", 100), ("front", 102)) == [[], [["front 100"]]]
+    moments.clear()
+    assert together(moments, ("rear", 300)) == [[]], "what waited is forgotten"
+    assert together(Moments(["front"], 0), ("front", 1), ("front", 2)) == [[["front 1"]], [["front 2"]]]

@@ -36,6 +36,15 @@ def values(**given: Any) -> dict[str, Any]:
         ({"image_type": "h264"}, "one of auto, compressed, raw"),
         ({"verify": "sometimes"}, "one of auto, always, never"),
         ({"map_frame": ""}, "name a frame"),
+        *(({"cameras": names}, "different names of topics") for names in ("a,a", "a,", "1st", "a/b", "ü")),
+        ({"cameras": "front,left", "camera": "lens"}, "parameter camera has to be empty"),
+        ({"cameras": "front,left", "camera_frame": "lens"}, "parameter camera_frame has to be empty"),
+        ({"cameras": "front,left", "use_tf_static": False}, "need use_tf_static"),
+        ({"rig_query": True}, "needs cameras"),
+        *(
+            ({"datum": text}, "latitude,longitude")
+            for text in ("48.8", "a,b", "1,2,3,4", "1,2,x", "91,0", "48,nan", "90,0", "1,2,nan")
+        ),
         *(({"sequence": name}, "cannot name a traverse") for name in ("a/b", ".", "..", "\u202e", "\x85", "x" * 129)),
         ({"key_file": "/nowhere/key"}, "key file /nowhere/key cannot be read: No such file"),
     ],

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from placerec_ros.pose import HEADING_VARIANCE, UNKNOWN_ANGLE, UNKNOWN_HEIGHT, estimate
+from placerec_ros.planar import Datum, Planar
+from placerec_ros.pose import (
+    HEADING_VARIANCE,
+    UNKNOWN_ANGLE,
+    UNKNOWN_HEIGHT,
+    PoseEstimate,
+    estimate,
+    estimate_of_rig,
+    in_metres,
+)
 
 
 def answer(**fields: Any) -> dict[str, Any]:
@@ -78,3 +87,63 @@ def test_a_place_without_a_heading_has_none() -> None:
     found = estimate(answer(single=single, place=place, candidates=[{"probability": 1.0, "place": place}]), 2.0)
     assert found is not None
     assert found.covariance[35] == UNKNOWN_ANGLE
+
+
+MOUNTS = {"front": Planar(0.3, 0.0, 0.0), "left": Planar(0.0, 0.2, math.radians(90))}
+NAMES: dict[str, str | None] = {"front": "lens-front", "left": "lens-left"}
+
+
+def of_rig(heading: float | None = 120.0, camera: str | None = "lens-left", **fields: Any) -> dict[str, Any]:
+    """The answer to a rig: recognized at (1, 2), by a place half a metre away that a camera saw."""
+    covariance = np.diag([0.5, 0.6, UNKNOWN_HEIGHT, 3.0, 3.0, 2.0]).ravel().tolist()
+    place = {"id": "p1", "pose": {"x": 1.5, "y": 2.0, "heading": heading}, "camera": camera}
+    far = {"id": "p2", "pose": {"x": 50.0, "y": 2.0, "heading": 0.0}, "camera": "lens-front"}
+    found = {"x": 1.0, "y": 2.0, "heading": 75.0, "covariance": covariance}
+    matches = [{"place": far}, {"place": place}]
+    return {"verdict": "recognized", "place": place, "pose": found, "matches": matches, **fields}
+
+
+def robot_of(answer: dict[str, Any], yaw: float | None = None) -> PoseEstimate:
+    found = estimate_of_rig(answer, MOUNTS, NAMES, 2.0, yaw)
+    assert found is not None
+    return found
+
+
+def test_the_robot_of_a_rig_is_where_the_answer_is_and_heads_as_the_camera_of_the_match_says() -> None:
+    found = robot_of(of_rig())
+    assert math.degrees(found.planar.yaw) == pytest.approx(30)
+    # The camera to the left stands 0.2 m to the left of a base that heads 30 degrees to the left of x.
+    assert (found.planar.x, found.planar.y) == pytest.approx((1.0 + 0.1, 2.0 - 0.2 * math.cos(math.radians(30))))
+    covariance = np.reshape(found.covariance, (6, 6))
+    assert covariance[5, 5] == pytest.approx(HEADING_VARIANCE)
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+@pytest.mark.parametrize(("yaw", "found"), [(25.0, 30.0), (110.0, 120.0), (-170.0, 120.0)])
+def test_of_cameras_with_one_name_that_counts_which_turns_the_robot_least(yaw: float, found: float) -> None:
+    for camera in (None, "other"):
+        turned = robot_of(of_rig(camera=camera), math.radians(yaw))
+        assert math.degrees(turned.planar.yaw) == pytest.approx(found)
+
+
+def test_the_heading_is_unknown_where_nothing_tells_it() -> None:
+    for answer in (of_rig(camera=None), of_rig(heading=None)):
+        assert robot_of(answer).covariance[35] == UNKNOWN_ANGLE
+
+
+def test_a_rig_that_is_not_localized_has_no_pose() -> None:
+    for answer in (of_rig(verdict="ambiguous"), of_rig(pose=None), of_rig(pose={"latitude": 1.0, "longitude": 2.0})):
+        assert estimate_of_rig(answer, MOUNTS, NAMES, 2.0, None) is None
+
+
+def test_the_answer_to_a_rig_in_degrees_becomes_one_in_metres() -> None:
+    datum = Datum(48.8462, 2.3464)
+    latitude, longitude, heading = datum.geographic(Planar(1.5, 2.0, math.radians(120)))
+    there = {"latitude": latitude, "longitude": longitude, "heading": heading}
+    place = {"id": "p1", "pose": there, "camera": "lens-left"}
+    whole = of_rig(
+        place=place, pose={**there, "covariance": of_rig()["pose"]["covariance"]}, matches=[{"place": place}]
+    )
+    found = estimate_of_rig(in_metres(whole, datum), MOUNTS, NAMES, 2.0, None)
+    assert found is not None and math.degrees(found.planar.yaw) == pytest.approx(30)
+    assert found.planar.then(MOUNTS["left"]).x == pytest.approx(1.5)

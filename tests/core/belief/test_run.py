@@ -58,6 +58,7 @@ def test_a_robot_is_found_and_found_again_when_carried_off() -> None:
     assert found[30:].index(True) <= 20 and all(found[50:]), "and after it was carried off"
 
 
+@pytest.mark.thorough
 def test_what_is_not_in_the_map_is_unknown_after_a_few_frames() -> None:
     random, graph = np.random.default_rng(4), graph_of(walk(300), Neighborhood(5, 3))
     run = Run(DEFAULT, graph)

@@ -62,6 +62,7 @@ def test_a_robot_is_followed_at_any_speed(advance: float, frames: int) -> None:
     assert abs(learnt - advance) <= 0.3 + 0.3 * abs(advance), "speeds between 0 and 0.3 are hard to tell apart"
 
 
+@pytest.mark.thorough
 def test_a_robot_that_stops_turns_round_and_goes_on_is_followed() -> None:
     random, graph = np.random.default_rng(3), graph_of(walk(PLACES), Neighborhood(5, 3))
     way = [*range(50, 110), *[110] * 60, *range(110, 60, -1), *[60] * 20, *range(60, 360, 3)]

@@ -369,6 +369,7 @@ REAL = [
 ]
 
 
+@pytest.mark.thorough
 @settings(max_examples=200)
 @given(st.sampled_from(REAL), st.data())
 def test_mutated_images_are_refused_or_decoded(data: bytes, draw: st.DataObject) -> None:

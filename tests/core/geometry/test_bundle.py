@@ -77,6 +77,7 @@ def begun(query: Stand, best: Stand, length: float = 0.5) -> Stand:
     return replace(query, position=best.position + length * away, covariance=LOOSE)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("spacing", [3.0, 8.0, 14.0])
 def test_places_on_one_line_tell_how_far_the_query_is(spacing: float) -> None:
     random, normalized, errors = np.random.default_rng(2), [], []

@@ -115,6 +115,7 @@ def test_the_covariance_of_a_turn_covers_its_error(kind: Kind, motion: Motion) -
     assert np.sum(normalized) < chi2.ppf(0.9999, 3 * draws)
 
 
+@pytest.mark.thorough
 def test_the_covariance_of_a_turn_is_no_larger_than_it_must_be() -> None:
     random, normalized = np.random.default_rng(8), []
     motion = MOTIONS["ahead, aside and a turn"]
@@ -147,6 +148,7 @@ def test_a_wall_allows_two_answers_and_the_spread_says_so() -> None:
     assert of_scene.heading_spread < 0.3 and of_scene.heading_offset == pytest.approx(-5, abs=1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrong", [0.1, 0.3])
 @pytest.mark.parametrize("motion", [MOTIONS["a turn"], MOTIONS["ahead, aside and a turn"]], ids=["turn", "shift"])
 def test_wrong_matches_change_little(motion: Motion, wrong: float) -> None:
@@ -214,6 +216,7 @@ def test_a_turn_is_measured_through_any_lens(camera: Intrinsics, degrees: float)
     assert abs(found.heading_offset - degrees) < max(0.3, 4 * found.heading_spread) and found.heading_spread < 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("focal", [300, 420, 700])
 @pytest.mark.parametrize("degrees", [-15, 0, 10])
 def test_without_intrinsics_the_spread_covers_the_range_of_lenses(focal: float, degrees: float) -> None:

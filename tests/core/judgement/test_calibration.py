@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,8 +22,10 @@ from core.judgement.calibration import (
     fit_encoder_calibration,
     fit_map_calibration,
 )
+from core.judgement.geometry import TERMS, GeometryTerms
 from core.judgement.probability import Curve
-from core.judgement.trials import Trials, joined
+from core.judgement.reliability import reliability
+from core.judgement.trials import StagedTrials, Trials, joined
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.places import Neighborhood, Whereabouts
 
@@ -274,6 +277,18 @@ def test_trials_are_the_same_as_json() -> None:
             Trials.of_record(wrong)  # type: ignore[arg-type]
 
 
+def test_trials_of_stages_are_the_same_as_json() -> None:
+    two = drawn(20)
+    staged = StagedTrials(two, replace(two, evidence=np.full(40, 8.0)))
+    again = StagedTrials.of_record(json.loads(json.dumps(staged.record(), allow_nan=False)))
+    assert again.record() == staged.record()
+    plain = StagedTrials.of_record(two.record())
+    assert plain.two.record() == plain.three.record() == two.record(), "what was stored before there were stages"
+    for wrong in ({}, {"two": two.record()}, {"two": two.record(), "three": drawn(19).record()}):
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            StagedTrials.of_record(wrong)
+
+
 def test_doubtful_labels_make_the_probabilities_of_all_answers_better() -> None:
     base = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-3)})  # too sure, for this environment
     asked, held_out = drawn(60), drawn(500, seed=1)
@@ -288,9 +303,110 @@ def test_doubtful_labels_make_the_probabilities_of_all_answers_better() -> None:
     assert found.measurement.trials == len(doubtful)
 
 
+@pytest.mark.thorough
+def test_for_a_precision_the_threshold_rises() -> None:
+    base = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-2), "threshold": 0.05})  # believes too much
+    asked, held_out = drawn(400), drawn(2000, seed=1)
+    plain, precise = (adjust_calibration(asked, base, "runs", one).calibration for one in (None, PRECISE))
+    assert precise.threshold > plain.threshold and precise.curve == plain.curve
+    right = held_out.right[held_out.recognized(precise)].mean()
+    assert right >= 0.93 and right > held_out.right[held_out.recognized(plain)].mean()
+    hopeless = asked.take(~asked.right)
+    assert not hopeless.recognized(adjust_calibration(hopeless, base, "runs", PRECISE).calibration).any()
+
+
+@pytest.mark.parametrize("target", [None, PRECISE])
+def test_without_strangers_the_threshold_does_not_fall(target: Target | None) -> None:
+    """Right answers alone make every answer likelier; strangers are recognized no more often for it."""
+    base = BASE.model_copy(update={"curve": LAW, "threshold": 0.1})
+    surely = drawn(200, Curve(slope=60, intercept=0))
+    strangers = np.cumsum(~surely.known)
+    nine, ten = (surely.take(surely.right | ((~surely.known) & (strangers <= most))) for most in (9, 10))
+    found = adjust_calibration(nine, base, "labels", target).calibration
+    assert found.threshold == base.threshold
+    assert found.curve is not None and found.curve.probability(0.1) > LAW.probability(0.1), "they are likelier"
+    assert adjust_calibration(ten, base, "labels", target).calibration.threshold < base.threshold
+
+
+def test_answers_without_their_place_keep_strangers_from_becoming_likely() -> None:
+    """Known places alone say that all is right; the same frames asked without their places say what strangers get."""
+    base, surely = BASE.model_copy(update={"curve": LAW}), Curve(slope=60, intercept=20)
+    both, held_out = drawn(150, surely), drawn(1000, surely, seed=1)
+    alone = both.take(both.known)
+    stated = {}
+    for name, some in (("alone", alone), ("both", both)):
+        found = adjust_calibration(some, base, "runs", PRECISE).calibration
+        stated[name] = held_out.probabilities(found)[~held_out.known].mean()
+    assert stated["both"] < 0.5 * stated["alone"]
+
+
+@pytest.mark.thorough
+def test_three_stages_recognize_more_at_the_same_precision() -> None:
+    """Evidence tells right from wrong where decision values do not; it is asked only where two stages leave doubt."""
+
+    def staged(frames: int, seed: int) -> StagedTrials:
+        two = drawn(frames, Curve(slope=20, intercept=-3), seed)
+        generator = np.random.default_rng(seed + 100)
+        evidence = np.where(two.right, generator.gamma(4, 20, len(two)), generator.gamma(1, 4, len(two)))
+        return StagedTrials(two, replace(two, evidence=evidence))
+
+    base = BASE.model_copy(update={"geometry": TERMS})
+    trials, held_out = staged(300, 0), staged(1500, 1)
+    shares = {}
+    for name, given in (("two", trials.two), ("three", trials)):
+        found = fit_map_calibration(given, base, PRECISE, "sequence:tuesday")
+        answers = held_out.two if name == "two" else held_out.answered(found.calibration)
+        believed = answers.recognized(found.calibration)
+        assert answers.right[believed].mean() > 0.9
+        assert found.measurement.cross_validated.precision.low < 0.95
+        shares[name] = (believed & answers.right).sum() / held_out.two.known.sum()
+        if name == "three":
+            asked = ~np.isnan(answers.evidence)
+            assert 0 < asked.sum() < len(answers), "an answer without doubt is not verified"
+            assert found.calibration.geometry is not None and found.calibration.geometry != TERMS
+    assert shares["three"] > 1.2 * shares["two"]
+    for rule in (Target(rule="false_accept_rate", value=0.05), Target(rule="mean_of_negatives")):
+        assert fit_map_calibration(trials, base, rule, "x").measurement.trials == 600
+    with pytest.raises(CalibrationImpossible, match=r"No threshold lets 99\.9% of the answers"):
+        fit_map_calibration(trials, base, Target(rule="precision", value=0.999), "x")
+
+
+@pytest.mark.thorough
+def test_blocks_held_out_take_nothing_from_the_promise() -> None:
+    """Twenty frames, all of them right where the map has their places, promise 95 % by the rule of succession."""
+
+    def walked(frames: int) -> StagedTrials:
+        known = np.arange(2 * frames) < frames
+        evidence = np.where(known, 300.0, 0.0)
+        decision = np.where(known, 0.4, 0.0) + 0.001 * np.tile(np.arange(frames), 2)
+        lead = np.full(2 * frames, np.inf)
+        two = Trials(decision, lead, known, known, np.tile(np.arange(frames), 2))
+        return StagedTrials(two, replace(two, evidence=evidence))
+
+    base = BASE.model_copy(update={"geometry": TERMS})
+    found = fit_map_calibration(walked(20), base, PRECISE, "frames")
+    assert found.measurement.cross_validated.recall.count == 20
+    with pytest.raises(CalibrationImpossible, match=r"best that 34 answers can promise is 94\.7%\. Ask for less"):
+        fit_map_calibration(walked(17), base, PRECISE, "frames")
+
+
+def test_outcomes_of_verified_answers_move_the_terms_of_evidence() -> None:
+    """What evidence is worth on this map: here the terms of the base deny answers that are right."""
+    curve = Curve(slope=40, intercept=-5)
+    doubting = GeometryTerms(support=0.5, slope=1.0, intercept=-6.0)
+    base = BASE.model_copy(update={"curve": curve, "geometry": doubting})
+    asked, held_out = (replace(one, evidence=np.full(len(one), 5.0)) for one in (drawn(80), drawn(500, seed=1)))
+    found = adjust_calibration(asked, base, "runs").calibration
+    assert found.geometry is not None and found.geometry != doubting
+    errors = [reliability(held_out.probabilities(one), held_out.right).ece for one in (base, found)]
+    assert errors[1] < errors[0] / 2
+    unverified = adjust_calibration(drawn(80), base, "runs").calibration
+    assert unverified.geometry == doubting, "without evidence nothing is known of it"
+
+
 def test_a_calibration_is_not_adjusted_to_next_to_nothing() -> None:
     few = drawn(60).take(np.arange(120) < 9)
-    with pytest.raises(CalibrationImpossible, match="at least 10 labelled frames; here are 9"):
+    with pytest.raises(CalibrationImpossible, match="at least 10 frames whose place is known; here are 9"):
         adjust_calibration(few, BASE.model_copy(update={"curve": LAW}), "labels")
     with pytest.raises(CalibrationImpossible, match="no curve"):
         adjust_calibration(drawn(60), BASE, "labels")

@@ -52,6 +52,7 @@ def test_auc_roc_needs_both_kinds() -> None:
     assert auc_roc([0.3, 0.4], [False, False]) is None
 
 
+@pytest.mark.thorough
 @given(LABELLED)
 def test_auc_roc_is_that_of_scikit_learn(labelled: list[tuple[float, bool]]) -> None:
     scores, positive = zip(*labelled, strict=True)

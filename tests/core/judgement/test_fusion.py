@@ -106,6 +106,17 @@ def test_geometry_settles_what_two_cameras_disagree_about() -> None:
     assert settled.rows[0] == 3 and settled.judgement.verdict == "recognized"
 
 
+def test_of_places_that_fit_one_has_to_be_four_times_as_likely() -> None:
+    """Whatever shares the view fits: what stands a little farther is no reason for doubt, but a place as likely is."""
+    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
+    scores = {3: 0.5, 5: 0.48, **BACKGROUND}
+    for evidence, verdict in ((60.0, "recognized"), (280.0, "ambiguous")):
+        cameras = [verified(view(scores), {3: 300.0, 5: evidence})] * 2
+        found = fuse(cameras, weighing, NEIGHBORHOOD)
+        assert found.rows.tolist()[:2] == [3, 5] and found.judgement.verdict == verdict
+        assert found.log_odds[1] > 0, "it would be believed alone"
+
+
 def test_a_place_that_a_verified_camera_left_out_has_no_evidence() -> None:
     weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
     one = view({3: 0.4, 5: 0.39, **BACKGROUND})

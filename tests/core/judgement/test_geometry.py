@@ -165,6 +165,15 @@ def test_trials_are_judged_as_their_queries_were() -> None:
     assert trials.probabilities(CALIBRATION) == pytest.approx([one.probability for one in judgements])
 
 
+def test_a_strict_threshold_leaves_more_in_doubt() -> None:
+    """An answer that is too weak for a calibration's threshold may still be settled by evidence."""
+    assert CALIBRATION.curve is not None
+    likely = Judgement("recognized", 0.3, CALIBRATION.curve.decision(0.7), None, None, 0.7)
+    assert not worth_verifying(likely, CALIBRATION)
+    strict = CALIBRATION.model_copy(update={"threshold": CALIBRATION.curve.decision(0.9)})
+    assert worth_verifying(likely, strict)
+
+
 def test_calibrations_that_are_fitted_keep_the_terms() -> None:
     random = np.random.default_rng(0)
     known = np.arange(200) % 2 == 0

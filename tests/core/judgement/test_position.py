@@ -169,6 +169,7 @@ def test_one_view_says_where_to_and_not_how_far() -> None:
     assert found.pose.y is not None and found.pose.y > 5.3
 
 
+@pytest.mark.thorough
 def test_the_normalized_error_is_that_of_the_covariance() -> None:
     """200 queries between places, with views whose errors are as large as they say."""
     random = np.random.default_rng(5)

@@ -103,6 +103,7 @@ def test_outcomes_as_expected_do_not_move_a_curve_and_few_move_it_little() -> No
     assert one.slope > 40 * np.exp(-3 * STRETCH) and one.probability(0.3) < law.probability(0.3)
 
 
+@pytest.mark.thorough
 @given(st.lists(st.tuples(st.floats(0, 0.5), st.booleans()), max_size=30), st.floats(0.5, 1))
 def test_whatever_the_outcomes_a_curve_is_a_curve(outcomes: list[tuple[float, bool]], factor: float) -> None:
     decisions, right = np.array([d for d, _ in outcomes]), np.array([r for _, r in outcomes], np.bool_)

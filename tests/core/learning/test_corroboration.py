@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from core.judgement.verdict import Calibration
-from core.learning import PendingProposal, Proposal, corroborated
+from core.learning import PendingProposal, Proposal, Witness, corroborated
 from tests.core.learning.runs import way
 
 CALIBRATION = Calibration(source="made up", threshold=0.2, margin=0.02, background_mean=0.05, background_deviation=0.03)
 GRAPH = way(60)
 TUESDAY = [*range(10, 40, 2)]
+LATE = Witness("A", datetime(2026, 11, 20, 23, 50, tzinfo=UTC))
 
 
-def pending(row: int, run: str, geometry: float | None = None, source: str = "") -> PendingProposal:
+def pending(row: int, run: str, geometry: float | None = None, source: Witness | None = None) -> PendingProposal:
     proposal = Proposal(row, row, 0.99, (row - 1, row + 1), 0.5, 0.5, geometry, "it was dark")
-    return PendingProposal(proposal, run, source or run)
+    return PendingProposal(proposal, run, source or replace(LATE, robot=run))
 
 
 class Scores:
@@ -49,9 +52,11 @@ def test_one_run_alone_is_not() -> None:
     assert taken([pending(row, "tuesday") for row in TUESDAY]) == {}
 
 
-def test_two_runs_of_one_robot_and_day_are_one_witness() -> None:
-    waiting = [pending(20, "first", source="A"), *(pending(row, "second", source="A") for row in TUESDAY)]
-    assert taken(waiting) == {}
+@pytest.mark.parametrize(("hours", "count"), [(1 / 3, 0), (11.9, 0), (12, 2)])
+def test_two_runs_of_one_robot_are_one_witness_until_half_a_day_lies_between(hours: float, count: int) -> None:
+    after = replace(LATE, began=LATE.began + timedelta(hours=hours))
+    waiting = [pending(20, "first", source=LATE), *(pending(row, "second", source=after) for row in TUESDAY)]
+    assert len(taken(waiting)) == count
 
 
 @pytest.mark.parametrize("elsewhere", [0.59, 0.7])

@@ -47,6 +47,13 @@ def test_the_first_stays_and_every_look_that_goes_is_like_one_that_stays(most: i
         assert len(found) == most or alike[gone, found].max() >= REPEATS * 0.3
 
 
+def test_looks_that_people_added_stay_and_count() -> None:
+    assert kept(table(0, 1, 1, 2), 0.3, 3, fixed=3).tolist() == [0, 1, 2], "there is no room for a further one"
+    assert kept(table(0, 1, 1, 2), 0.3, 4, fixed=3).tolist() == [0, 1, 2, 3]
+    assert kept(table(0, 1, 2, 1), 0.3, 9, fixed=3).tolist() == [0, 1, 2], "it repeats what a person added"
+    assert kept(table(0, 1, 2), 0.3, 2, [LookStatistics(wrong=9)] * 3, fixed=3).tolist() == [0, 1, 2]
+
+
 def test_a_place_keeps_its_first_look() -> None:
     with pytest.raises(ValueError, match="first"):
         kept(np.zeros((0, 0), np.float32), 0.3)

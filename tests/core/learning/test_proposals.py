@@ -40,6 +40,7 @@ def test_missed_frames_are_proposed_at_their_places(graph: PlaceGraph) -> None:
         assert "unknown" in one.why and str(one.anchors[0]) in one.why
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=25)
 @given(st.sets(st.integers(6, 53), max_size=30), st.integers(0, 1000))
 def test_no_frame_is_proposed_at_another_place(hidden: set[int], seed: int) -> None:

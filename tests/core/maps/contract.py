@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -211,6 +211,19 @@ class StoreContract(RuleBasedStateMachine):
     @rule(run=st.sampled_from(["night", "snow"]))
     def forget_learnt(self, run: str) -> None:
         self.agree(lambda model: model.forget_learnt(run), lambda lab: lab.forget_learnt(run))
+
+    @rule(back=st.booleans())
+    def forget_learnt_in_a_period(self, back: bool) -> None:
+        """All that was ever learnt was added before now, and nothing after."""
+        now = datetime.now(UTC) + timedelta(seconds=1)
+
+        def forgotten(model: MapModel) -> int:
+            return sum(map(model.forget_learnt, ("night", "snow"))) if back else 0
+
+        self.agree(
+            forgotten,
+            lambda lab: lab.forget_learnt(None, until=now) if back else lab.forget_learnt(None, since=now),
+        )
 
     @rule(place_id=ids)
     def forget(self, place_id: str) -> None:

@@ -7,10 +7,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
+from core.networks.backbone import Array
 from core.networks.gathering import GatheredPass
 from core.threads import each
 
@@ -23,17 +23,17 @@ class Lane:
         self.free, self.entered = threading.Event(), threading.Event()
         self.free.set()
 
-    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
+    def __call__(self, images: Array) -> tuple[Array, ...]:
         self.entered.set()
         assert self.free.wait(20)
         self.batches.append(len(images))
-        if images.isnan().any():
+        if np.isnan(images).any():
             raise ValueError("not a number")
         return images * 2, images.sum((1, 2, 3))
 
 
-def image(value: float, count: int = 1, side: int = 2) -> Tensor:
-    return torch.full((count, 3, side, side), value)
+def image(value: float, count: int = 1, side: int = 2) -> Array:
+    return np.full((count, side, side, 3), value, np.float32)
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def held(lane: Lane, gathered: GatheredPass) -> Iterator[None]:
         thread.join(20)
 
 
-def called(gathered: GatheredPass, shown: list[Tensor]) -> list[threading.Thread]:
+def called(gathered: GatheredPass, shown: list[Array]) -> list[threading.Thread]:
     """Threads that call one after the other and now wait."""
     threads = []
     for count, images in enumerate(shown, 1):
@@ -69,7 +69,7 @@ def test_each_caller_gets_the_maps_of_its_own_images() -> None:
     found = each(lambda value: gathered(image(value, 1 + value % 3)), range(60), 12)
     for value, (doubled, sums) in enumerate(found):
         count = 1 + value % 3
-        assert doubled.equal(image(2 * value, count)) and sums.tolist() == [12.0 * value] * count
+        assert np.array_equal(doubled, image(2 * value, count)) and sums.tolist() == [12.0 * value] * count
     assert sum(lanes[0].batches + lanes[1].batches) == sum(1 + value % 3 for value in range(60))
     assert max(lanes[0].batches + lanes[1].batches) <= 4
 
@@ -89,4 +89,4 @@ def test_an_error_reaches_those_whose_images_were_in_the_batch_and_nobody_later(
     gathered = GatheredPass([lane], 4)
     with pytest.raises(ValueError, match="not a number"):
         gathered(image(float("nan")))
-    assert gathered(image(1))[0].equal(image(2))
+    assert np.array_equal(gathered(image(1))[0], image(2))

@@ -23,13 +23,11 @@ from core.networks.network import (
     Normalization,
     Pooling,
     Relu,
-    ShallowNetwork,
-    build_layer,
     caffenet_definition,
-    load_network,
     read_definition,
     save_network,
 )
+from core.networks.torch_network import TorchNetwork, arrays_of, build_layer, load_torch_network
 
 SHOWN = InputDefinition(height=35, width=43, mean=(104.0, 117.0, 123.0))
 
@@ -63,7 +61,7 @@ def random_weights(definition: NetworkDefinition, seed: int = 0) -> dict[str, Te
 
 
 def run(definition: NetworkDefinition, weights: dict[str, Tensor], outputs: list[str], images: Tensor) -> list[Tensor]:
-    network = ShallowNetwork(definition, outputs)
+    network = TorchNetwork(definition, outputs)
     network.load_weights(weights)
     with torch.inference_mode():
         return list(network(images))
@@ -197,7 +195,7 @@ def test_the_images_are_left_as_they_are() -> None:
 
 
 def test_only_the_layers_in_use_are_built() -> None:
-    network = ShallowNetwork(LITTLE, ["conv2"])
+    network = TorchNetwork(LITTLE, ["conv2"])
     assert list(network.stages) == ["conv1", "relu1", "pool1", "norm1", "conv2", "relu2"]
     assert set(network.weights()) == {"conv1.weight", "conv1.bias", "conv2.weight", "conv2.bias"}
     assert [layer.name for layer in LITTLE.truncated(["conv1"]).layers] == ["conv1", "relu1"]
@@ -206,29 +204,29 @@ def test_only_the_layers_in_use_are_built() -> None:
 @pytest.mark.parametrize("outputs", [[], ["conv9"], ["relu1"], ["conv1", "norm1"]])
 def test_only_convolutions_and_poolings_can_be_outputs(outputs: list[str]) -> None:
     with pytest.raises(InvalidModel):
-        ShallowNetwork(LITTLE, outputs)
+        TorchNetwork(LITTLE, outputs)
 
 
 def test_a_pooling_is_what_its_convolution_is_shrunk_to() -> None:
     torch.manual_seed(0)
-    network = ShallowNetwork(LITTLE, ["pool1", "conv2", "conv1"]).eval()
+    network = TorchNetwork(LITTLE, ["pool1", "conv2", "conv1"]).eval()
     shown = LITTLE.input
     with torch.no_grad():
         pooled, _, convolved = network(torch.rand(1, 3, shown.height, shown.width))
         torch.testing.assert_close(pooled, network.stages["pool1"](convolved))
-    assert list(ShallowNetwork(LITTLE, ["pool1"]).stages) == ["conv1", "relu1", "pool1"]
+    assert list(TorchNetwork(LITTLE, ["pool1"]).stages) == ["conv1", "relu1", "pool1"]
 
 
 def test_the_weights_of_deeper_layers_are_not_needed() -> None:
     weights = {key: value for key, value in random_weights(LITTLE).items() if not key.startswith("conv3")}
-    ShallowNetwork(LITTLE, ["conv2"]).load_weights(weights)
+    TorchNetwork(LITTLE, ["conv2"]).load_weights(weights)
     with pytest.raises(InvalidModel, match="conv3"):
-        ShallowNetwork(LITTLE, ["conv3"]).load_weights(weights)
+        TorchNetwork(LITTLE, ["conv3"]).load_weights(weights)
 
 
 @pytest.mark.parametrize("key", ["conv1.weight", "conv1.bias", "conv2.weight", "conv2.bias"])
 def test_missing_misshapen_and_infinite_weights_are_refused_by_name(key: str) -> None:
-    network = ShallowNetwork(LITTLE, ["conv2"])
+    network = TorchNetwork(LITTLE, ["conv2"])
     weights = random_weights(LITTLE)
     infinite = weights[key].clone()
     infinite.view(-1)[0] = math.inf
@@ -245,14 +243,14 @@ def test_a_definition_needs_a_convolution_and_different_names() -> None:
 
 
 def test_the_description_changes_with_what_changes_an_activation_and_not_with_the_name() -> None:
-    plain = ShallowNetwork(LITTLE, ["conv2"]).describe()
+    plain = TorchNetwork(LITTLE, ["conv2"]).describe()
     renamed = LITTLE.model_copy(update={"name": "other"})
     wider = LITTLE.model_copy(update={"input": SHOWN.model_copy(update={"width": 44})})
     stronger = little(*LITTLE.layers[:3], Normalization(name="norm1", alpha=2e-4), *LITTLE.layers[4:])
-    assert ShallowNetwork(renamed, ["conv2"]).describe() == plain
-    assert ShallowNetwork(wider, ["conv2"]).describe() != plain
-    assert ShallowNetwork(stronger, ["conv2"]).describe() != plain
-    assert ShallowNetwork(LITTLE, ["conv1"]).describe() != plain
+    assert TorchNetwork(renamed, ["conv2"]).describe() == plain
+    assert TorchNetwork(wider, ["conv2"]).describe() != plain
+    assert TorchNetwork(stronger, ["conv2"]).describe() != plain
+    assert TorchNetwork(LITTLE, ["conv1"]).describe() != plain
 
 
 # Its file
@@ -260,9 +258,9 @@ def test_the_description_changes_with_what_changes_an_activation_and_not_with_th
 
 def test_a_network_comes_back_from_its_file(tmp_path: Path) -> None:
     path, weights = tmp_path / "little.network.safetensors", random_weights(LITTLE)
-    save_network(path, LITTLE, weights)
+    save_network(path, LITTLE, arrays_of(weights))
     assert read_definition(path) == LITTLE
-    network = load_network(path, ["conv2"])
+    network = load_torch_network(path, ["conv2"])
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
     images = torch.randn(1, 3, 35, 43)
@@ -270,20 +268,21 @@ def test_a_network_comes_back_from_its_file(tmp_path: Path) -> None:
         wanted = run(LITTLE, weights, ["conv2"], images)[0]
         # The loaded network lies channels last in memory, which adds in another order.
         torch.testing.assert_close(network(images)[0], wanted, rtol=1e-4, atol=1e-5)
-    for name, tensor in network.weights().items():
+    for name, tensor in network.tensors().items():
         torch.testing.assert_close(tensor, weights[name], rtol=0, atol=0)
 
 
 def test_files_that_are_no_networks_are_refused(tmp_path: Path) -> None:
     weights = random_weights(LITTLE)
-    save_network(tmp_path / "whole", LITTLE, weights)
+    save_network(tmp_path / "whole", LITTLE, arrays_of(weights))
     (tmp_path / "cut").write_bytes((tmp_path / "whole").read_bytes()[:-10])
     (tmp_path / "text").write_bytes(b"not a network")
     (tmp_path / "empty").touch()
     save_file(weights, tmp_path / "bare")
     save_file(weights, tmp_path / "undefined", {"format": "placerec-network/1"})
     save_file(weights, tmp_path / "odd", {"format": "placerec-network/1", "definition": '{"layers": []}'})
-    save_network(tmp_path / "light", LITTLE, {key: value for key, value in weights.items() if key != "conv1.bias"})
+    light = {key: value for key, value in arrays_of(weights).items() if key != "conv1.bias"}
+    save_network(tmp_path / "light", LITTLE, light)
     for name in ("missing", "cut", "text", "empty", "bare", "undefined", "odd", "light"):
         with pytest.raises(InvalidModel):
-            load_network(tmp_path / name, ["conv2"])
+            load_torch_network(tmp_path / name, ["conv2"])

@@ -80,6 +80,7 @@ def expect_alike(one: CodedMap, address: str) -> None:
         fresh.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("places", [20, 400])
 def test_each_change_is_seen_by_the_next_search_of_another_service(
     stores: list[CodedStore], empty: Postgres, places: int
@@ -107,6 +108,7 @@ def test_each_change_is_seen_by_the_next_search_of_another_service(
     assert before.alive[4] and len(before) == places  # a snapshot does not change
 
 
+@pytest.mark.thorough
 def test_a_map_that_grows_gets_codes_and_one_that_shrinks_loses_them(stores: list[CodedStore], empty: Postgres) -> None:
     here, there = maps_of(stores)
     here.enrol([frame(f"p{number}", number + 1) for number in range(250)])
@@ -120,6 +122,7 @@ def test_a_map_that_grows_gets_codes_and_one_that_shrinks_loses_them(stores: lis
     expect_alike(there, empty.address)
 
 
+@pytest.mark.thorough
 def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[CodedStore], empty: Postgres) -> None:
     first, second = maps_of(stores)
     first.enrol([frame(f"p{number}", number + 1, sequence="walk") for number in range(300)])
@@ -188,6 +191,7 @@ def swap_databases(server: Postgres, away: str, back: str) -> None:
         connection.execute(f"ALTER DATABASE {back} RENAME TO postgres")
 
 
+@pytest.mark.thorough
 def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(stores: list[CodedStore], empty: Postgres) -> None:
     here, there = maps_of(stores)
     here.enrol([frame(f"p{number}", number + 1) for number in range(300)])

@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import psycopg
 import pytest
 
-from core.errors import MapExists, StoreOfAnotherVersion, StoreUnavailable
+from core.errors import MapExists, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
 from core.ledger.maps import frames
 from core.maps import MapSettings
 from core.maps.archives.reading import Archive
@@ -46,6 +47,7 @@ def execute(postgres: Postgres, query: str) -> list[tuple[object, ...]]:
         return [] if cursor.description is None else cursor.fetchall()
 
 
+@pytest.mark.thorough
 def test_writers_at_the_same_time_lose_nothing(postgres: Postgres, store: CodedStore) -> None:
     others = [CodedStore(postgres.address) for _ in range(3)]
     check_writers_lose_nothing(store, others)
@@ -142,3 +144,35 @@ def test_a_postgres_that_is_gone() -> None:
         with pytest.raises(StoreUnavailable, match="PostgreSQL cannot be reached"):
             ask()
     store.close()
+
+
+def test_erased_places_leave_no_row(postgres: Postgres, store: CodedStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = made(store)
+    lab.enrol([frame(f"p{i}", sequence="monday" if i % 2 else None) for i in range(6)])
+    lab.forget_sequence("monday")
+    left = "SELECT count(*) FROM descriptors UNION ALL SELECT count(*) FROM pictures"
+    assert execute(postgres, left) == [(6,), (6,)]  # a query may still need them
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    report = lab.erase()
+    assert (report.rows, execute(postgres, left)) == (3, [(3,), (3,)])
+    assert lab.erase().rows == 0 and lab.count_places() == 3
+
+
+def test_erased_looks_leave_no_row(postgres: Postgres, store: CodedStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = made(store)
+    lab.enrol([frame("p1"), frame("p2")])
+    lab.enrol([replace(frame("one look"), id=f"p1/{'0' * 16}"), replace(frame("other look"), id=f"p2/{'1' * 16}")])
+    follower = CodedStore(postgres.address)
+    assert follower.get("lab").snapshot().alive.sum() == 4 and follower.get("lab").thumbnail(f"p1/{'0' * 16}")
+    lab.forget("p1")
+    assert lab.forget_looks([f"p2/{'1' * 16}", "p2", f"p1/{'0' * 16}"]) == 1
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    left = " UNION ALL ".join(f"SELECT count(*) FROM {table}" for table in ("descriptors", "pictures", "keypoints"))
+    assert (lab.erase().rows, execute(postgres, left)) == (3, [(1,), (1,), (1,)])
+    # Another service neither finds nor shows them any more.
+    there = follower.get("lab")
+    assert there.snapshot().alive.sum() == 1 and there.all_looks(None, 10) == ([], None)
+    for gone in (f"p1/{'0' * 16}", f"p2/{'1' * 16}"):
+        with pytest.raises(UnknownPlace):
+            there.thumbnail(gone)
+    follower.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -78,6 +80,24 @@ def test_the_most_promising_of_the_screened_places_are_examined() -> None:
     close = in_sequence(10, [0, 4, 100, 200, 5, 300, 400, 500, 600, 700])  # 1 and 4 are one place
     examine(scores, close, Neighborhood(5.0, 3), 2, examined, 6, lambda rows: promises[rows], others=3)
     assert asked == [4, 1, 5, 0, 2]
+
+
+@pytest.mark.parametrize("screened", [0, 6])
+def test_a_look_that_is_not_believed_does_not_take_the_turn_of_its_place(screened: int) -> None:
+    """Frames 0 and 5 are of one place; the first is a learnt look, which a match of 0.8 at least makes believed."""
+    scores = np.array([0.6, 0.55, 0.5, 0.45, 0.4, 0.35], np.float32)
+    gains = np.array([0.1, 0, 0, 0, 0, 0.5], np.float32)
+    places = replace(in_sequence(6, [0, 100, 200, 300, 400, 0]), least=np.array([0.8, *[-np.inf] * 5], np.float32))
+    promise = (lambda rows: np.where(rows == 0, 0.5, 0.0).astype(np.float32)) if screened else None
+    found = examine(scores, places, Neighborhood(5.0, 3), 2, lambda rows: gains[rows], screened, promise, others=1)
+    assert found.order[0] == 5 and found.examined[0]
+    assert sorted(found.order[found.examined].tolist()) == [0, 1, 5]
+    believed = replace(places, least=np.array([0.65, *[-np.inf] * 5], np.float32))
+    found = examine(scores, believed, Neighborhood(5.0, 3), 2, lambda rows: gains[rows], others=1)
+    assert sorted(found.order[found.examined].tolist()) == [0, 1], "one frame of a view is enough"
+    # A prior raises the value of a frame, and not the score by which it is believed.
+    found = examine(scores + 0.3, places, Neighborhood(5.0, 3), 2, lambda rows: gains[rows], others=1, alone=scores)
+    assert 5 in found.order[found.examined]
 
 
 @pytest.mark.parametrize("n", [0, 1, 4])

@@ -141,6 +141,7 @@ def test_equal_doors_one_after_the_other_are_rivals(atlas: Atlas, encoder: Encod
     assert ask(map_, encoder, encoder.encode(noisy(scene(5000), 7))).judgement.verdict == "ambiguous"
 
 
+@pytest.mark.thorough
 def test_a_stop_is_one_place_of_a_session(
     atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
 ) -> None:

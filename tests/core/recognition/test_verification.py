@@ -26,7 +26,7 @@ from core.places import PlaceFields, Whereabouts
 from core.recognition.question import Query, Question, Verifier, Verify
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
 from core.recognition.stages import Candidates
-from core.recognition.verification import CANDIDATES, verify_candidates
+from core.recognition.verification import CANDIDATES, OF_MATCHES, verify_candidates
 from core.storage import Atlas, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -112,6 +112,7 @@ class KnownComparison:
     matches: list[int]
     inliers: list[float]
     asked: list[int] = field(default_factory=list)
+    least: dict[int, float] = field(default_factory=dict)
 
     def matches_at_a_glance(self, rows: Sequence[int]) -> NDArray[np.int64]:
         return np.array([self.matches[row] for row in rows], np.int64)
@@ -119,8 +120,9 @@ class KnownComparison:
     def agreements(self, rows: Sequence[int]) -> NDArray[np.float32]:
         return np.zeros(len(rows), np.float32)
 
-    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
+    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
         self.asked += rows
+        self.least.update(zip(rows, least, strict=True))
         inliers = [round(100 * self.inliers[row]) for row in rows]
         pairs, flags = np.zeros((100, 2), np.int64), np.arange(100)
         return [Verification((100, 100), pairs, flags < count, float(count), 0.5) for count in inliers]
@@ -153,6 +155,16 @@ def test_what_matches_at_a_glance_is_verified_however_two_stages_rank_it() -> No
     comparison = KnownComparison([3] * 60 + [30] + [3] * 38, [0.0] * 60 + [0.5] + [0.0] * 38)
     found = compare(first, [0.02] * 99, comparison)
     assert found.rows[0] == 60 and len(set(comparison.asked)) == len(comparison.asked) <= CANDIDATES
+
+
+def test_geometry_is_estimated_where_the_matches_let_a_place_still_win() -> None:
+    """Place 2 fits so well that another needs many matches; the first two are compared whatever they have."""
+    comparison = KnownComparison([20] * 8, [0.05, 0.04, 0.3] + [0.05] * 5)
+    found = compare([0.2, 0.19, 0.18, 0.17, 0.16, 0.15, 0.14, 0.13], [0.0] * 8, comparison)
+    assert found.rows[0] == 2
+    assert comparison.least[0] == comparison.least[1] == -np.inf
+    behind = 2 * (0.2 - 0.18) + INLIERS * 0.05
+    assert comparison.least[2] * OF_MATCHES * INLIERS == pytest.approx(behind, rel=1e-5)
 
 
 def test_the_best_of_the_first_stage_are_never_lost() -> None:

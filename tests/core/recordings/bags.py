@@ -13,7 +13,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tests.service.scenes import jpeg
 
@@ -23,6 +23,7 @@ CAMERA, ODOMETRY = "/camera/image_raw/compressed", "/odom"
 COMPRESSED, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,26 @@ def compressed(stamp: int, data: bytes, topic: str = CAMERA, received: int | Non
         return store.types[COMPRESSED](header=header(store, stamp), format=form, data=np.frombuffer(data, np.uint8))
 
     return Said(topic, COMPRESSED, stamp if received is None else received, make)
+
+
+def camera_info(stamp: int, topic: str = "/camera/camera_info", focal: float = 150.0) -> Said:
+    """The intrinsics of a camera of 320 x 240 pixels, of which the frames are half as wide and high."""
+    kind = "sensor_msgs/msg/CameraInfo"
+
+    def make(store: Any) -> Any:
+        region = store.types["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        k = np.array([focal, 0, 159.5, 0, focal, 119.5, 0, 0, 1], np.float64)
+        named = {"d": np.array([-0.2, 0.05, 0.001, 0, 0]), "k": k, "r": np.eye(3).ravel(), "p": np.zeros(12)}
+        if store is ROS1:
+            named = {name.upper(): value for name, value in named.items()}
+        return store.types[kind](
+            header=header(store, stamp), height=240, width=320, distortion_model="plumb_bob", **named,
+            binning_x=2, binning_y=2, roi=region,
+        )  # fmt: skip
+
+    return Said(topic, kind, stamp, make)
 
 
 def image(

@@ -115,6 +115,16 @@ def test_frames_that_show_what_the_last_one_shows_are_left_out() -> None:
     assert [one.id for one in kept] == ["0", "3", "5", "6", "7", "9"]
 
 
+def test_who_looks_again_where_it_was_broken_off_leaves_out_the_same_frames() -> None:
+    seen: dict[str, float | None] = dict(zip("0123456789", [0, 0.1, 0.2, 5, 5.1, None, 5, 0, 0.3, 0.6], strict=True))
+    frames = [frame(number) for number in range(10)]
+    for begin in range(11):
+        found = [frames[number] for number in (0, 3, 5, 6, 7, 9) if number < begin]
+        before = found[-1] if found else None
+        found += moving(frames, lambda one: seen[one.id], lambda a, b: abs(a - b) < 0.5, begin, before)
+        assert [one.id for one in found] == ["0", "3", "5", "6", "7", "9"], begin
+
+
 def test_a_robot_whose_poses_say_that_it_moves_does_not_stand() -> None:
     frames = [frame(number, 0.4 * number) for number in range(12)]
     assert [one.id for one in moving(frames, lambda one: 0, lambda a, b: True)] == ["0", "3", "6", "9"]

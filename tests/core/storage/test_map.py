@@ -67,12 +67,26 @@ def test_a_place_is_remembered_with_all_that_was_said_of_it(lab: Map) -> None:
 
 
 def test_a_geographic_pose_and_its_position(lab: Map) -> None:
-    pose = Pose(latitude=48.8566, longitude=2.3522)
+    pose = Pose(latitude=48.8566, longitude=2.3522, z=83.0)
     lab.enrol([replace(frame("paris"), fields=PlaceFields(pose=pose))])
     assert lab.place("paris").pose == pose
     there = lab.snapshot().whereabouts
     assert there.kind.tolist() == [2]
     np.testing.assert_array_equal(there.position[0], pose.position())
+
+
+def test_a_height_on_the_earth_is_there_when_the_map_is_opened_again(atlas: Atlas, lab: Map, directory: Path) -> None:
+    poses = {"hill": Pose(latitude=48.9, longitude=2.35, z=130.5), "plain": Pose(latitude=48.8, longitude=2.35)}
+    lab.enrol([replace(frame(name), fields=PlaceFields(pose=pose)) for name, pose in poses.items()])
+    atlas.close()
+    again = Atlas(directory)
+    try:
+        map_ = again.get("lab")
+        map_.open()
+        assert {name: map_.place(name).pose for name in poses} == poses
+        np.testing.assert_allclose(map_.snapshot().whereabouts.position, [one.position() for one in poses.values()])
+    finally:
+        again.close()
 
 
 def test_the_four_changes(lab: Map) -> None:

@@ -63,6 +63,7 @@ def test_a_frame_that_is_not_stored_is_named(tmp_path: Path) -> None:
     review.close()
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(1, 30_000), st.booleans()), max_size=14))
 def test_the_oldest_go_first_and_those_with_a_label_last(

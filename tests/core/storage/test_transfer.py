@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from core.maps import Enrolment, History, MapSettings
-from core.maps.records import Outline
-from core.places import PlaceFields
+from core.maps.records import MOST_LOOKS, Outline
+from core.places import PlaceFields, look_address
 from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
@@ -66,6 +67,27 @@ def test_the_same_frame_again_only_takes_fields_and_history(hall: Map) -> None:
     (place,) = hall.transfer.outline()
     assert (place.row, place.sequence, place.ordinal) == (0, "tuesday", 9)
     assert hall.snapshot().whereabouts.ordinal.tolist() == [9]
+    assert hall.verify().ok
+
+
+def test_a_look_whose_place_cannot_have_it_is_left_out(hall: Map) -> None:
+    def look(place_id: str, shown: str) -> Enrolment:
+        return replace(frame(place_id, shown), id=look_address(place_id, digest_of(shown).hex()[:16]))
+
+    hall.enrol([frame("full"), *(look("full", f"look {number}") for number in range(MOST_LOOKS))])
+    items = [frame("a"), look("a", "a"), look("a", "by night"), look("gone", "by night"), look("full", "by night")]
+    refused = hall.transfer.adopt([(item, history()) for item in items])
+    assert refused == [items[at].id for at in (1, 3, 4)]
+    assert [look.name for look in hall.looks("a")] == [digest_of("by night").hex()[:16]]
+    assert hall.transfer.adopt([(item, history()) for item in items]) == refused, "again"
+    assert hall.verify().ok
+
+
+def test_a_new_frame_of_a_place_takes_the_look_that_shows_it(hall: Map) -> None:
+    night = look_address("a", digest_of("night").hex()[:16])
+    hall.enrol([frame("a"), replace(frame("a", "night"), id=night)])
+    hall.enrol([frame("a", "night")])
+    assert hall.looks("a") == [] and hall.place("a").looks == 0
     assert hall.verify().ok
 
 

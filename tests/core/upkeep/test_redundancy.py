@@ -98,6 +98,7 @@ def test_whatever_goes_has_a_stand_in_that_stays(graph: Graph) -> None:
         assert any(retained[other] for pair in alike if place in pair for other in pair if other != place)
 
 
+@pytest.mark.thorough
 @given(graphs())
 def test_nothing_is_left_that_could_go(graph: Graph) -> None:
     """Greedy, but to the end: no retained place with a stand-in could go without leaving another one alone."""

@@ -85,6 +85,7 @@ def test_one_channel_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.asarray(found.arrays["descriptor"]), wanted / np.linalg.norm(wanted), atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("generation", "form"), [("new", "new"), ("old", "old")])
 def test_it_is_what_opencv_makes_of_the_file(tmp_path: Path, generation: str, form: str) -> None:
     layers = written(*random_weights())
@@ -112,6 +113,7 @@ def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
     assert system.index([blank, blank]).score([blank]).tolist() == [[0, 0]]
 
 
+@pytest.mark.thorough
 def test_networks_that_are_not_calc(tmp_path: Path) -> None:
     wide = {**zeros(), "conv1": np.zeros((64, 3, 5, 5), np.float32)}
     for layers, what in (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.errors import InvalidModel, MissingWeights
 from core.method.catalogue import EncoderCatalogue
 from core.networks.network import save_network
+from core.networks.torch_network import arrays_of
 from lab.baselines import registry
 from lab.baselines.convnets import ALEXNET, AMOSNET, HYBRIDNET, PLACES365, Differences
 from lab.baselines.system import Description, System
@@ -81,7 +82,7 @@ def test_alexnet_takes_imagenets_mean_where_no_file_says_another(tmp_path: Path)
 def test_a_network_file_that_was_imported_before_is_taken_too(tmp_path: Path) -> None:
     path = write(tmp_path / "a.caffemodel", trunk(), "a_mean.npy")
     definition, weights = import_caffe(path, MEAN, input_size=(227, 227))
-    save_network(tmp_path / "a.network.safetensors", definition, weights)
+    save_network(tmp_path / "a.network.safetensors", definition, arrays_of(weights))
     ours, theirs = (build("alexnet", tmp_path / name) for name in ("a.network.safetensors", "a.caffemodel"))
     np.testing.assert_allclose(vector(ours, FRAME), vector(theirs, FRAME), atol=1e-6)
     assert ours.identity == theirs.identity
@@ -126,6 +127,7 @@ def test_scores_fall_with_the_differences() -> None:
     assert Differences(references).score(queries).tolist() == [[1, -1], [-0.5, -0.5]]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["amosnet", "hybridnet", "places365"])
 def test_a_missing_mean_is_named(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / "Net.caffemodel", [*trunk(), *fully_connected()])
@@ -169,6 +171,7 @@ def fully_connected(values: int = 12) -> list[Layer]:
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("generation", "form"), [("new", "new"), ("old", "old")])
 def test_places365_is_fc7_by_the_cosine(tmp_path: Path, generation: str, form: str) -> None:
     path = tmp_path / "alexnet_places365.caffemodel"

@@ -97,6 +97,7 @@ def crn() -> list[Layer]:
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", ["new", "old"])
 def test_fix_context_reads_the_authors_network(tmp_path: Path, form: str) -> None:
     path = tmp_path / "rw_netvlad_vgg.caffemodel"
@@ -116,6 +117,7 @@ def test_fix_context_reads_the_authors_network(tmp_path: Path, form: str) -> Non
     assert mask.std() > 0.1 and system.identity.startswith("fix-context@")
 
 
+@pytest.mark.thorough
 def test_a_layer_that_is_missing_or_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "a.caffemodel"
     path.write_bytes(caffemodel([one for one in crn() if one["name"] != "rw_map/single"]))

@@ -213,7 +213,7 @@ def test_the_authors_filters_are_turned_the_right_way(tmp_path: Path) -> None:
     vgg = {name: random.standard_normal(weight.shape).astype(np.float32) for name, weight in plain_vgg().items()}
     savemat(tmp_path / "a.mat", {"net": matconvnet(vlad_core(), vgg=vgg)})
     network, _, _ = load_netvlad(tmp_path / "a.mat")
-    found = network.weights()
+    found = network.tensors()
     assert sorted(found) == sorted(vgg)
     for name, weight in vgg.items():
         np.testing.assert_array_equal(found[name].numpy(), weight)

@@ -96,6 +96,7 @@ def view(place: float, generator: np.random.Generator, noise: float) -> Pixels:
     return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("velocity", [0.85, 1.0, 1.15])
 def test_a_drive_of_known_velocity_is_found_through_noise(velocity: float) -> None:
     generator = np.random.default_rng(11)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from core.method.catalogue import EncoderCatalogue
-from core.networks.network import load_network, read_definition
+from core.networks.network import read_definition
+from core.networks.torch_network import load_torch_network
 from tests.lab.conversion.caffe_writer import caffemodel, input_dim, small_network
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, scene
@@ -22,6 +23,7 @@ def caffe_files(tmp_path: Path) -> tuple[Path, Path]:
     return model, mean
 
 
+@pytest.mark.thorough
 def test_a_caffe_network_is_imported_and_used(
     placerec: Placerec, caffe_files: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -32,9 +34,9 @@ def test_a_caffe_network_is_imported_and_used(
     assert "channels=12" in shown.stdout
     path = tmp_path / "models" / "small-net.network.safetensors"
     assert str(path) in shown.stderr.replace("\n", "")
-    network = load_network(path, ["conv3"])
+    network = load_torch_network(path, ["conv3"])
     weight = small_network()[8]["blobs"][0]
-    np.testing.assert_array_equal(network.weights()["conv3.weight"].numpy(), weight)
+    np.testing.assert_array_equal(network.weights()["conv3.weight"], weight)
 
     pictures = tmp_path / "pictures"
     pictures.mkdir()

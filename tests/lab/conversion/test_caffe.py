@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from core.errors import InvalidModel
-from core.networks.network import Convolution, Normalization, Pooling, Relu, ShallowNetwork, load_network, save_network
+from core.networks.network import Convolution, Normalization, Pooling, Relu, save_network
+from core.networks.torch_network import TorchNetwork, arrays_of, load_torch_network
 from lab.conversion.caffe import import_caffe
 from tests.lab.conversion import in_process
 from tests.lab.conversion.caffe_writer import (
@@ -69,7 +70,7 @@ def test_the_outputs_are_those_of_opencv(
     wanted = with_opencv(layers, caffemodel(layers), images)
 
     definition, weights = imported(caffemodel(layers + HEAD, generation, form, input_dim(1, 3, *size)))
-    network = ShallowNetwork(definition, NAMES)
+    network = TorchNetwork(definition, NAMES)
     network.load_weights(weights)
     with torch.inference_mode():
         found = network(torch.from_numpy(images))
@@ -105,15 +106,16 @@ def test_weights_and_description_are_taken_exactly(imported: Any) -> None:
 
 def test_an_imported_network_can_be_stored_as_a_file(imported: Any, tmp_path: Path) -> None:
     definition, weights = imported(caffemodel(small_network() + HEAD, start=input_dim(1, 3, 47, 61)))
-    save_network(tmp_path / "small.network.safetensors", definition, weights)
-    network = load_network(tmp_path / "small.network.safetensors", ["conv3"])
+    save_network(tmp_path / "small.network.safetensors", definition, arrays_of(weights))
+    network = load_torch_network(tmp_path / "small.network.safetensors", ["conv3"])
     assert set(network.weights()) == {f"conv{n}.{kind}" for n in (1, 2, 3) for kind in ("weight", "bias")}
-    assert torch.equal(network.weights()["conv3.weight"], weights["conv3.weight"])
+    assert torch.equal(network.tensors()["conv3.weight"], weights["conv3.weight"])
 
 
 PLAIN = [convolution("conv1", "data", 3, 4, 3), relu("relu1", "conv1")]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("generation", ["new", "old"])
 def test_a_training_network_says_its_crop_mean_and_scale(tmp_path: Path, generation: str) -> None:
     transform = {"scale": 0.5, "crop_size": 32, "mean_value": [104.0, 117.0, 123.0]}
@@ -131,6 +133,7 @@ def test_the_crop_and_scale_of_older_data_layers(imported: Any) -> None:
     assert (shown.height, shown.width, shown.scale) == (33, 33, (0.25, 0.25, 0.25))
 
 
+@pytest.mark.thorough
 def test_the_input_layer_comes_before_the_crop_and_the_argument_before_both(imported: Any) -> None:
     shape = field(1, b"".join(varint(side) for side in (1, 3, 40, 50)))
     described = field(1, "data") + field(2, "Input") + field(4, "data") + field(143, field(1, shape))
@@ -209,6 +212,7 @@ def test_what_cannot_be_said_exactly_is_refused_by_name(imported: Any, case: str
         imported(caffemodel(layers, start=input_dim(1, 3, 32, 32)))
 
 
+@pytest.mark.thorough
 def test_what_the_files_do_not_say_must_be_given(tmp_path: Path) -> None:
     path = tmp_path / "net.caffemodel"
     path.write_bytes(caffemodel(PLAIN))
@@ -224,6 +228,7 @@ def test_what_the_files_do_not_say_must_be_given(tmp_path: Path) -> None:
         import_caffe(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"PK\3\4", bytes(100)])
 def test_other_files_are_refused(imported: Any, content: bytes) -> None:
     with pytest.raises(InvalidModel):
@@ -264,4 +269,4 @@ def test_a_mutated_model_is_refused_or_imported(
         definition, weights = imported(bytes(mutated))
     except InvalidModel:
         return
-    ShallowNetwork(definition, [one.name for one in definition.convolutions()]).load_weights(weights)
+    TorchNetwork(definition, [one.name for one in definition.convolutions()]).load_weights(weights)

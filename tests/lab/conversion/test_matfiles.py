@@ -23,6 +23,7 @@ def cell(*values: Any) -> np.ndarray[Any, Any]:
     return row
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("compressed", [False, True])
 def test_plain_values(tmp_path: Path, compressed: bool) -> None:
     weight = np.arange(24, dtype=np.float32).reshape(2, 3, 4)  # of 2 x 3 x 4 x 1: MATLAB drops the last side
@@ -44,6 +45,7 @@ def test_plain_values(tmp_path: Path, compressed: bool) -> None:
     assert is_mat(tmp_path / "a.mat") and not is_mat(tmp_path / "b.mat")
 
 
+@pytest.mark.thorough
 def test_objects_of_matlab_are_named_not_read(tmp_path: Path) -> None:
     inside = np.zeros((1, 1), [("K", object)])
     inside[0, 0]["K"] = np.array([[64.0]])
@@ -96,6 +98,7 @@ def nested(depth: int) -> bytes:
     return b"".join(reversed(heads)) + struct.pack("<II", 14, len(number)) + number
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("compressed", [False, True])
 def test_nesting_ends_in_an_error_not_in_the_process(tmp_path: Path, compressed: bool) -> None:
     element = nested(20_000)

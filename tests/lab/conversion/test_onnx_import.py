@@ -14,6 +14,7 @@ from core.errors import InvalidModel
 from core.networks.description import Aggregation, NetworkDescription, Output, checked, read_description
 from core.networks.files import network_name, open_network
 from core.networks.onnx_network import OnnxNetwork, load_onnx_network, save_onnx_network
+from core.networks.torch_network import as_array
 from lab.conversion import onnx_import
 from lab.conversion.onnx_import import import_onnx
 from tests.lab.conversion.in_process import use
@@ -39,18 +40,19 @@ def test_an_imported_network_computes_as_torch_does(tmp_path: Path) -> None:
     path = write(tmp_path, onnx_network(shape=("frames", 3, "height", "width")))
     network = OnnxNetwork("small", import_onnx(path, MAPS), MAPS)
     images = torch.randn(3, 3, SIDE, SIDE)
-    (found,) = network(images)
+    (found,) = network(as_array(images))
     wanted = torch.nn.functional.conv2d(images, torch.from_numpy(weights()), stride=8)
-    assert (found - wanted).abs().max() < 1e-4
+    assert np.abs(found - as_array(wanted)).max() < 1e-4
 
     save_onnx_network(tmp_path / "small.network.safetensors", "small", network._graph, MAPS)
     again = load_onnx_network(tmp_path / "small.network.safetensors")
-    assert torch.equal(again(images)[0], found) and again.describe() == network.describe()
+    assert np.array_equal(again(as_array(images))[0], found) and again.describe() == network.describe()
     assert network_name(tmp_path / "small.network.safetensors") == "small"
     with pytest.raises(InvalidModel, match="has no layers but output"):
         open_network(tmp_path / "small.network.safetensors", ("conv3",))
 
 
+@pytest.mark.thorough
 def test_tokens_are_the_cells_of_a_map_row_by_row(tmp_path: Path) -> None:
     tokens = [
         CONVOLUTION,
@@ -65,7 +67,7 @@ def test_tokens_are_the_cells_of_a_map_row_by_row(tmp_path: Path) -> None:
     network = OnnxNetwork("tokens", import_onnx(path, description), description)
     images = torch.randn(1, 3, SIDE, SIDE)
     wanted = torch.nn.functional.conv2d(images, torch.from_numpy(weights()), stride=8).relu()
-    assert (network(images)[0] - wanted).abs().max() < 1e-4
+    assert np.abs(network(as_array(images))[0] - as_array(wanted)).max() < 1e-4
     wrong = checked(description.model_dump() | {"output": {"kind": "tokens", "patch": 8, "skip": 1}})
     with pytest.raises(InvalidModel, match="not 17 tokens"):
         import_onnx(path, wrong)
@@ -235,6 +237,7 @@ def test_no_size_depends_on_the_picture(what: str) -> None:
         OnnxNetwork("growing", graph, MAPS)
 
 
+@pytest.mark.thorough
 def test_sizes_may_depend_on_the_size_of_the_input(tmp_path: Path) -> None:
     """As exporters write them for an input of any size: from its shape, over numbers, to where a shape is needed."""
     nodes = [
@@ -254,11 +257,12 @@ def test_sizes_may_depend_on_the_size_of_the_input(tmp_path: Path) -> None:
         numpy_helper.from_array(np.array(2, np.float32), "two"),
     ]
     graph = import_onnx(write(tmp_path, onnx_network(nodes, "sum", tensors=extra)), MAPS)
-    images = torch.randn(1, 3, SIDE, SIDE)
+    images = as_array(torch.randn(1, 3, SIDE, SIDE))
     plain = OnnxNetwork("plain", onnx_network().SerializeToString(), MAPS)
-    assert torch.allclose(OnnxNetwork("any size", graph, MAPS)(images)[0], plain(images)[0] + 2)
+    assert np.allclose(OnnxNetwork("any size", graph, MAPS)(images)[0], plain(images)[0] + 2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_no_network_may_do_is_refused(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if what != "enormous shape":  # which is to be met in a process of its own
@@ -299,7 +303,7 @@ def test_a_value_that_is_not_finite_is_never_given_on(tmp_path: Path) -> None:
     root = onnx_network([CONVOLUTION, node("Sqrt", ["maps"], "roots")], "roots")
     network = OnnxNetwork("roots", root.SerializeToString(), MAPS)
     with pytest.raises(InvalidModel, match="not finite"):
-        network(torch.randn(1, 3, SIDE, SIDE))
+        network(as_array(torch.randn(1, 3, SIDE, SIDE)))
 
 
 def test_descriptions(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ def test_an_entry_without_arrays(tmp_path: Path) -> None:
     assert cache.load("a") == CacheEntry({"points": []})
 
 
+@pytest.mark.thorough
 def test_any_changed_byte_or_missing_end_counts_as_absent(tmp_path: Path) -> None:
     cache = EvaluationCache(tmp_path)
     cache.store("a", ENTRY)

@@ -100,6 +100,7 @@ def test_lip6(encoder: Encoder, lip6: list[Trials]) -> None:
     assert held.recall.value is not None and held.recall.value >= 0.5, held.recall
 
 
+@pytest.mark.thorough
 def test_the_default_on_a_walk_that_it_never_saw(encoder: Encoder, corridor: list[Trials]) -> None:
     exact = corridor[0]
     found = held_figures(exact, exact.recognized(encoder.calibration), exact.probabilities(encoder.calibration))

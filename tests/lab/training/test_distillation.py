@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.training.distillation import cosine_loss, distill, learning_rate
 from lab.training.student import SCALE, Student
 from lab.training.teacher import BLOCKS, Teacher
@@ -75,13 +75,14 @@ def test_a_run_goes_on_from_earlier_weights(photographs: Path, teacher_weights: 
     pixels = torch.rand(1, 3, SIDE, SIDE) * 255
     maps = []
     for weights in (before, after):
-        network = ShallowNetwork(Student().definition, ("conv4",))
+        network = TorchNetwork(Student().definition, ("conv4",))
         network.load_weights(weights)
         with torch.no_grad():
             maps.append(network((pixels - 115) * SCALE)[0].flatten())
     assert torch.nn.functional.cosine_similarity(maps[0], maps[1], dim=0) > 0.98
 
 
+@pytest.mark.thorough
 def test_loading_folded_weights_keeps_the_features() -> None:
     torch.manual_seed(1)
     student, other = Student(), Student()
@@ -97,6 +98,7 @@ def test_loading_folded_weights_keeps_the_features() -> None:
             torch.testing.assert_close(taken, original, rtol=1e-2, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_folding_keeps_the_features() -> None:
     torch.manual_seed(0)
     student = Student()
@@ -105,7 +107,7 @@ def test_folding_keeps_the_features() -> None:
         for _ in range(3):  # moves the running statistics away from their start
             student.features(torch.rand(8, 3, SIDE, SIDE) * 255)
     student.eval()
-    network = ShallowNetwork(student.definition, ("conv3", "conv4"))
+    network = TorchNetwork(student.definition, ("conv3", "conv4"))
     network.load_weights(student.folded_weights())
     pixels = torch.rand(1, 3, SIDE, SIDE) * 255
     with torch.no_grad():

@@ -61,6 +61,7 @@ def test_a_map_is_a_run_or_drawn() -> None:
     assert (np.diff(drawn) > 0).all() and len(drawn) == 10 and (np.diff(drawn) > 1).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", SMALL)
 def test_trials_are_of_known_places_and_of_strangers(size: int) -> None:
     trials, judgements = trials_of_size(traverse(0.1, 0), size, "run", CALIBRATION, 4)
@@ -139,6 +140,7 @@ def test_a_pair_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == [2, 1]
 
 
+@pytest.mark.thorough
 def test_verification_puts_the_candidates_into_another_order() -> None:
     one, retained, sequence = verifiable(0.1, 0), np.arange(COUNT), np.zeros(COUNT, np.int64)
     calibration = CALIBRATION.model_copy(update={"geometry": TERMS})
@@ -152,6 +154,7 @@ def test_verification_puts_the_candidates_into_another_order() -> None:
     assert 1.2 * right[0] < right[1]
 
 
+@pytest.mark.thorough
 def test_auto_verifies_where_two_stages_leave_doubt() -> None:
     one, calibration = verifiable(0.1, 0), CALIBRATION.model_copy(update={"geometry": TERMS})
     _, small = trials_of_size(one, 2, "run", calibration, 4, verify="auto")

@@ -14,7 +14,7 @@ from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.projection import Projection, discriminant
 from core.method.vocabulary import Vocabulary
-from core.networks.network import ShallowNetwork
+from core.networks.torch_network import TorchNetwork
 from lab.training.default_calibration import UNCALIBRATED
 from lab.training.loss_curve import draw_loss_curve
 from lab.training.projections import (
@@ -35,9 +35,9 @@ from lab.training.views.displaced_views import Displacement
 STAGE = AgreementDefinition(layers=("a",), values=4, weights=(1.0,), reach=(1, 1), candidates=3, share=0.5)
 
 
-def network(*layers: str) -> ShallowNetwork:
+def network(*layers: str) -> TorchNetwork:
     torch.manual_seed(0)
-    return ShallowNetwork(student_definition(), layers).eval().requires_grad_(False)
+    return TorchNetwork(student_definition(), layers).eval().requires_grad_(False)
 
 
 @pytest.mark.thorough
@@ -63,7 +63,7 @@ def encoder(stage: AgreementDefinition, photographs: Path) -> Encoder:
     )
     made = network(*definition.outputs)
     projections = fit_projections(made, definition.projected(), photographs, 4)
-    extractor = FeatureExtractor(made, definition, projections)
+    extractor = FeatureExtractor(made.as_data(), definition, projections)
     centers = np.random.default_rng(0).standard_normal((4, 6)).astype(np.float32)
     return Encoder("small", extractor, definition, Vocabulary(centers, extractor.origin), UNCALIBRATED)
 
@@ -105,6 +105,7 @@ def test_a_discriminant_tells_wrong_matches_from_right_ones() -> None:
     np.testing.assert_allclose(plain.T @ within @ plain, np.eye(2), atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_refining_finds_the_directions_that_conditions_leave_alone(photographs: Path) -> None:
     generator = np.random.default_rng(3)
     spot = generator.standard_normal((20, 16, 4))

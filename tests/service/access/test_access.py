@@ -211,6 +211,37 @@ def test_names_of_this_machine() -> None:
         assert not is_loopback_host(host), host
 
 
+HOSTS = {
+    b"10.0.0.1:8000": 200, b"[fd00::1]:8000": 200, b"placerec:8000": 200, b"localhost": 200, b"LAB.example:80": 200,
+    b"evil.example": 403, b"lab.example.evil.example": 403, b"placerec.": 403, b"127.0.0.1.evil.example": 403,
+    b"": 403, b"0x7f.1": 403, b"\xff": 403,
+}  # fmt: skip
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("host", HOSTS)
+async def test_a_container_without_keys_is_not_reached_under_a_name_that_leads_to_it(
+    tmp_path: Path, host: bytes
+) -> None:
+    """On all addresses: a page may have its own name lead to the published port, and send to it as if to itself."""
+    settings = Settings(host="0.0.0.0", allow_anonymous=True, allowed_hosts="lab.example,yard", data_dir=tmp_path)
+    app = create_app(settings)
+    with app.state.gate.keyring:
+        async with asking(app) as client:
+            page = [(b"Host", host), (b"Sec-Fetch-Site", b"same-origin")]
+            response = await client.get("/v1/nowhere", headers=page)
+            if HOSTS[host] == 403:
+                assert_problem(response, 403, "foreign-page")
+            else:
+                assert_problem(response, 404, "unknown-path")
+
+
+@pytest.mark.parametrize("given", ["lab.example,", "a b", "lab.example:80", "*", "http://lab"])
+def test_names_of_hosts_are_checked(given: str) -> None:
+    with pytest.raises(ValueError, match="allowed_hosts"):
+        Settings(allowed_hosts=given)
+
+
 # Over the wire
 
 
@@ -319,7 +350,7 @@ def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
     key, token = keyed.store.create("streamer", "query", ["lab"])
     alike = keyed.as_(token)
     assert known(alike)
-    session = keyed.server.client.post("/v1/maps/lab/sessions", json={}).json()["id"]
+    session = alike.post("/v1/maps/lab/sessions", json={}).json()["id"]
     for wrong, map_id, status in ((None, "lab", 401), (token[:-1] + "~", "lab", 401), (keyed.query, "yard", 403)):
         with pytest.raises(InvalidStatus) as refused, stream(keyed, wrong, map_id, session):
             pass
@@ -336,6 +367,24 @@ def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
         with pytest.raises(ConnectionClosed) as closed:
             connection.recv(timeout=60)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+
+
+@pytest.mark.thorough
+def test_idle_streams_end_with_their_key(keyed: Keyed) -> None:
+    """Nothing is sent and nothing happens: the service looks at the key of who waits."""
+    key, token = keyed.store.create("idler", "query", ["lab"])
+    with keyed.as_(token) as idler:
+        assert known(idler)
+        session = idler.post("/v1/maps/lab/sessions", json={}).json()["id"]
+        with stream(keyed, token, "lab", session) as robot, idler.stream("GET", "/v1/maps/lab/events") as events:
+            lines = events.iter_lines()
+            assert next(lines)
+            keyed.store.revoke(key.id)
+            assert json.loads(robot.recv(timeout=60))["problem"]["type"].endswith("key-refused")
+            with pytest.raises(ConnectionClosed) as closed:
+                robot.recv(timeout=60)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+            assert list(lines) is not None, "it ends"
 
 
 @pytest.mark.thorough
@@ -404,3 +453,34 @@ def test_a_bind_to_the_network_is_served_once_there_are_keys(tmp_path: Path) -> 
     settings = Settings(host="0.0.0.0", data_dir=tmp_path, allow_anonymous=False)
     Keys.of(tmp_path).create("ann", "admin")
     assert create_app(settings).state.gate.keyring is not None
+
+
+# Sessions
+
+
+@pytest.mark.thorough
+def test_a_session_belongs_to_the_key_that_began_it(keyed: Keyed) -> None:
+    """Others neither send frames into it nor end it, but for keys of the role admin, which may end it."""
+    tokens = {name: keyed.store.create(name, "query", ["lab"])[1] for name in ("walker", "other")}
+    with keyed.as_(tokens["walker"]) as walker, keyed.as_(tokens["other"]) as other, keyed.as_(keyed.enrol) as eve:
+        assert known(walker) and known(other)
+        begun = walker.post("/v1/maps/lab/sessions", json={}).json()["id"]
+        path, kind = f"/v1/maps/lab/sessions/{begun}", {"Content-Type": "image/jpeg"}
+        for client in (other, eve, keyed.server.client):
+            sent = client.post(f"{path}/frames", content=jpeg(1), headers=kind)
+            assert_problem(sent, 403, "session-of-another")
+        for token in (tokens["other"], keyed.enrol, keyed.admin):
+            with pytest.raises(InvalidStatus) as refused, stream(keyed, token, "lab", begun):
+                pass
+            assert refused.value.response.status_code == 403
+        assert walker.post(f"{path}/frames", content=jpeg(1), headers=kind).status_code == 200
+        for client in (other, eve):
+            assert_problem(client.delete(path), 403, "session-of-another")
+            assert client.get(path).status_code == 200
+        keyed.store.revoke("walker")
+    _, again = keyed.store.create("walker", "query", ["lab"])  # the robot's key is replaced by another
+    with keyed.as_(again) as walker:
+        assert known(walker)
+        assert walker.post(f"{path}/frames", content=jpeg(2), headers=kind).status_code == 200
+        assert keyed.server.client.delete(path).status_code == 204
+        assert walker.get(path).status_code in (404, 410)

@@ -24,7 +24,7 @@ from service.access.key_table import KEYS
 from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
 from service.access.keys import Key, Keys
 from service.access.roles import TOKEN, Principal, Role
-from service.errors.faults import Fault, InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable, LastAdminKey
+from service.errors.faults import Fault, InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable, KeyWidened, LastAdminKey
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
@@ -102,6 +102,8 @@ def test_what_cannot_be_a_key_is_refused(store: Keys) -> None:
             store.create("ann", role)  # type: ignore[arg-type]
     with pytest.raises(InvalidRequest):
         store.create("ann", "query", None, past)
+    with pytest.raises(InvalidRequest, match="learn"):
+        store.create("ann", "query", learn=True)
     with pytest.raises(InvalidIdentifier):
         store.create("ann", "query", ["Not A Map"])
     assert not store.exists(), "nothing was made on the way"
@@ -121,6 +123,7 @@ def test_a_name_is_free_again_when_its_key_is_revoked(store: Keys) -> None:
             store.revoke(unknown)
 
 
+@pytest.mark.thorough
 def test_first_keys_at_one_moment_are_all_stored(store: Keys, tmp_path: Path) -> None:
     threads = [threading.Thread(target=store.create, args=(f"key-{number}", "query")) for number in range(8)]
     for thread in threads:
@@ -170,7 +173,31 @@ def test_a_damaged_file_lets_nobody_in(file_store: Keys, tmp_path: Path, damage:
         Keyring(file_store).start()
 
 
-@pytest.mark.parametrize("change", [{"role": "admin", "maps": None}, {"expires_at": None}, {"digest": bytes(32)}])
+def test_only_keys_that_say_so_teach(store: Keys) -> None:
+    made = {
+        "robot": store.create("robot", "query")[0],
+        "mapper": store.create("mapper", "enrol")[0],
+        "teacher": store.create("teacher", "enrol", learn=True)[0],
+        "boss": store.create("boss", "admin")[0],
+    }
+    assert {key.name: key.teaches for key in store.all()} == {
+        "robot": False, "mapper": False, "teacher": True, "boss": True,
+    }  # fmt: skip
+    with pytest.raises(KeyWidened):
+        store.narrow(made["mapper"].id, {"learn": True})
+    with pytest.raises(InvalidRequest, match="query"):
+        store.narrow(made["teacher"].id, {"role": "query", "learn": True})
+    with pytest.raises(InvalidRequest, match="admin"):
+        store.narrow(made["boss"].id, {"learn": False})
+    assert store.narrow(made["boss"].id, {"role": "enrol"}).teaches, "what it had, and was not narrowed"
+    assert not store.narrow(made["boss"].id, {"learn": False}).teaches
+    assert not store.narrow(made["teacher"].id, {"role": "query"}).teaches
+    assert [key.teaches for key in store.all()] == [False] * 4
+
+
+@pytest.mark.parametrize(
+    "change", [{"role": "query+learn"}, {"role": "admin", "maps": None}, {"expires_at": None}, {"digest": bytes(32)}]
+)
 def test_a_row_that_was_changed_lets_nobody_in(store: Keys, change: dict[str, Any]) -> None:
     _, token = store.create("ann", "query", ["lab"], datetime.now(UTC) + timedelta(days=1))
 
@@ -246,6 +273,7 @@ def traits(key: Key) -> tuple[object, ...]:
     return key.name, key.role, key.maps, key.expires_at, key.revoked_at is None, key.last_used_at
 
 
+@pytest.mark.thorough
 @pytest.mark.postgres
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(STEPS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,18 @@ def test_lines_wait_for_a_database_that_is_away(monkeypatch: pytest.MonkeyPatch)
         trail._write()
     assert [json.loads(line)["map"] for line in trail._waiting] == list("defgh")
     detach(trail)
+
+
+def test_old_lines_of_a_table_are_dropped(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trails, "LINES_AT_ONCE", 3)
+    trail = AuditTable(ledger, "r-1")
+    trail.start()
+    note(*"abcdefgh")
+    detach(trail)
+    last = next(trail.lines(None))
+    trail.forget_before(datetime(2020, 1, 1, tzinfo=UTC))
+    assert maps(trail) == list("hgfedcba")
+    trail.forget_before(datetime.fromisoformat((last.fields or {})["time"]))
+    assert maps(trail)[0] == "h"
+    trail.forget_before(datetime.now(UTC) + timedelta(days=1))
+    assert maps(trail) == []

@@ -57,6 +57,7 @@ def test_a_new_key_works_at_once_and_its_secret_is_shown_once(keyed: Server) -> 
             "name": "robot-1",
             "role": "query",
             "maps": ["lab"],
+            "learn": False,
             "expires_at": "2099-01-30T23:00:00Z",
             "keys_needed": True,
         }
@@ -104,6 +105,19 @@ def test_a_revoked_key_lets_nobody_in_from_the_next_request_on(keyed: Server) ->
         assert_problem(keyed.client.patch(f"/v1/keys/{unknown}", json={}), 404, "unknown-key")
     assert created(keyed, "robot-2")["id"] != made["id"], "its name is free again"
     assert_problem(keyed.client.post("/v1/keys", json={"name": "robot-2", "role": "query"}), 409, "key-exists")
+
+
+def test_a_key_says_whether_maps_learn_from_its_runs(keyed: Server) -> None:
+    made = created(keyed, "teacher", "enrol", learn=True)
+    path = f"/v1/keys/{made['id']}"
+    with asking(keyed, made["key"]) as robot:
+        assert made["learn"] and robot.get("/v1/key").json()["learn"]
+        assert keyed.client.patch(path, json={"learn": False}).json()["learn"] is False
+        assert not robot.get("/v1/key").json()["learn"]
+    assert_problem(keyed.client.patch(path, json={"learn": True}), 409, "key-widened")
+    assert_problem(keyed.client.patch(path, json={"learn": None}), 422, "invalid-request")
+    query = {"name": "asker", "role": "query", "learn": True}
+    assert_problem(keyed.client.post("/v1/keys", json=query), 422, "invalid-request")
 
 
 def test_a_key_is_narrowed_at_once_and_never_widened(keyed: Server) -> None:
@@ -210,6 +224,7 @@ def test_the_first_key_of_an_open_service_turns_keys_on(tmp_path: Path) -> None:
             "name": "anonymous",
             "role": "admin",
             "maps": None,
+            "learn": True,
             "expires_at": None,
             "keys_needed": False,
         }

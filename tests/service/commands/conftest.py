@@ -12,7 +12,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner, Result
 
-from service.commands import application
+from service.commands.application import application
 from tests.service.scenes import encoded, scene
 
 COMMAND = typer.main.get_command(application)

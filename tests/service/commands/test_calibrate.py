@@ -59,6 +59,7 @@ def test_pairs_of_a_file(placerec: Placerec, tmp_path: Path, strip: str, there: 
     assert json.loads(placerec(*words, *there).stdout)["measurement"]["known"] == 11
 
 
+@pytest.mark.thorough
 def test_labelled_frames_of_a_folder(placerec: Placerec, tmp_path: Path, strip: str, there: list[str]) -> None:
     rows = ["file,place"]
     for number in range(PLACES):

@@ -12,7 +12,7 @@ import typer.main
 from placerec_client.problems import KeyNeeded
 from service.access.keys import Keys
 from service.access.roles import TOKEN
-from service.commands import application
+from service.commands.application import application
 from service.commands.connection.client import Refused, failures
 from service.commands.connection.credentials import is_unencrypted
 from service.commands.console import Failure
@@ -39,6 +39,21 @@ def test_a_key_is_shown_once(placerec: Placerec, tmp_path: Path) -> None:
     assert "No key is in force" in told
     assert [key["state"] for key in json.loads(placerec("keys", "list", "--json").stdout)] == ["revoked"] * 2
     assert (tmp_path / "data" / "keys.sqlite").exists() and not (tmp_path / "data" / "maps").exists()
+
+
+def test_the_audit_file_knows_the_keys_of_the_command_line(
+    placerec: Placerec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PLACEREC_AUDIT_FILE", str(tmp_path / "audit.jsonl"))
+    token = placerec("keys", "create", "robot-7", "--role", "query", "--map", "lab").stdout.strip()
+    placerec("keys", "delete", "robot-7")
+    written = (tmp_path / "audit.jsonl").read_text()
+    created, deleted = map(json.loads, written.splitlines())
+    assert token not in written and created["changed_key"] == deleted["changed_key"] == token.split("_")[1]
+    for line, operation, status in ((created, "create_key", 201), (deleted, "delete_key", 200)):
+        told = (line["message"], line["principal"], line["operation"], line["changed_key_name"], line["status"])
+        assert told == ("change", "owner", operation, "robot-7", status)
+    assert (created["role"], created["maps"]) == ("query", ["lab"])
 
 
 def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Path) -> None:

@@ -52,6 +52,10 @@ class Operator:
         self.settle(view)
         return self.page
 
+    def leave(self) -> None:
+        """Go to an empty page, so that nothing of the service is read any more; a map may then be deleted."""
+        self.page.goto("about:blank")
+
     def settle(self, view: str | None = None) -> None:
         """Wait until the view is there and nothing is being read."""
         path = "" if view is None else f"[data-view='{view.partition('?')[0]}']"
@@ -117,7 +121,8 @@ def keys(folder: Path) -> dict[str, str]:
 @pytest.fixture(scope="package")
 def keyed(folder: Path, keys: dict[str, str]) -> Iterator[Server]:
     """A service with keys, an audit trail in a file, and the drawn map; its client has an admin key."""
-    server = Server(folder, {"audit_file": folder / "audit.jsonl"}, key=keys["admin"]).wait()
+    settings = {"audit_file": folder / "audit.jsonl", "backup_dir": folder / "backups"}
+    server = Server(folder, settings, key=keys["admin"]).wait()
     world.fill(server)
     world.ask(server)
     yield server
@@ -126,7 +131,8 @@ def keyed(folder: Path, keys: dict[str, str]) -> Iterator[Server]:
 
 def given_key(key: str) -> str:
     """A script by which a new tab has a key, as if it had been typed; one that is forgotten stays so."""
-    return f"sessionStorage.getItem('placerec.key') ?? sessionStorage.setItem('placerec.key', '{key}')"
+    keep = f"sessionStorage.getItem('placerec.key') ?? sessionStorage.setItem('placerec.key', '{key}')"
+    return f"if (location.protocol !== 'about:') {keep}"  # an empty page has no storage
 
 
 Visit = Callable[..., Operator]

@@ -7,6 +7,7 @@ most 256 colours each.
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import sys
 import tempfile
@@ -178,6 +179,15 @@ def try_one(folder: Path) -> Callable[[Page], None]:
     return act
 
 
+def replay(page: Page) -> None:
+    """A robot's run on the plan, near its end."""
+    page.get_by_role("link", name=re.compile("^Replay the run")).first.click()
+    slider = page.get_by_role("slider", name="Answer of the run")
+    slider.focus()
+    for _ in range(7):
+        page.keyboard.press("ArrowRight")
+
+
 def take(browser: Browser, url: str, theme: str, size: tuple[int, int], act: Callable[[Page], None] | None) -> bytes:
     """One picture, as PNG with a palette."""
     context = browser.new_context(
@@ -209,11 +219,13 @@ def main(target: Path) -> None:
         fill(server)
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         figures: list[tuple[str, str, str, tuple[int, int], Callable[[Page], None] | None]] = [
+            ("home", "home", "light", wide, ask_live(server)),
             ("maps", "maps", "light", wide, None),
             ("plan", f"maps/{MAP}/plan?place=monday-012", "light", wide, ask_live(server)),
             ("places", f"maps/{MAP}/places", "dark", wide, None),
             ("try", f"maps/{MAP}/try", "light", wide, try_one(folder)),
             ("live", f"maps/{MAP}/live", "dark", wide, show_live(server)),
+            ("answers", f"maps/{MAP}/answers", "light", wide, replay),
             ("traverses", f"maps/{MAP}/traverses", "light", wide, None),
             ("calibration", f"maps/{MAP}/calibration", "light", wide, None),
             ("review", f"maps/{MAP}/review", "dark", wide, None),

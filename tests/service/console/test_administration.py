@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from contextlib import suppress
@@ -25,7 +26,10 @@ def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed
     page.get_by_role("button", name="Create a key").click()
     dialog = page.get_by_role("dialog")
     dialog.get_by_label("Name").fill("fleet-7")
+    learns = dialog.get_by_label("Maps that learn may learn from its runs")
+    expect(learns).to_have_count(0)  # an option of one role only
     dialog.get_by_label("Role").select_option("enrol")
+    learns.check()
     dialog.get_by_role("button", name="Create").click()
     shown = page.get_by_label("The key", exact=True)
     expect(shown).to_have_text(re.compile(r"^placerec_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"))
@@ -39,7 +43,18 @@ def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed
     def may_list(method: str, path: str) -> int:
         return keyed.client.request(method, path, headers={"Authorization": f"Bearer {secret}"}).status_code
 
+    def teaches() -> bool:
+        items = keyed.client.get("/v1/keys", params={"limit": 500}).json()["items"]
+        return next(bool(one["learn"]) for one in items if one["name"] == "fleet-7" and one["state"] == "in force")
+
     assert may_list("GET", "/v1/maps") == 200 and may_list("DELETE", "/v1/maps/none/places/p") == 404
+    assert teaches()
+    expect(row).to_contain_text("teaches")
+    row.get_by_role("button", name="Narrow fleet-7").click()
+    learns.uncheck()
+    dialog.get_by_role("button", name="Narrow").click()
+    dialog.wait_for(state="detached")
+    assert not teaches()
     row.get_by_role("button", name="Narrow fleet-7").click()
     dialog.get_by_label("Role").select_option("query")
     dialog.get_by_label("only these").check()
@@ -154,6 +169,7 @@ def test_a_mistyped_key_leaves_the_present_one(admin: Operator) -> None:
     page.get_by_role("heading", name="Jobs").wait_for()
 
 
+@pytest.mark.thorough
 def test_a_second_tab_has_the_key_until_it_is_forgotten(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
     operator = visit(None)
     operator.foresee("401")
@@ -338,3 +354,76 @@ def test_no_key_and_no_secret_is_in_the_logs(
         json.loads(line).get("path", "") for line in keyed.log_file.read_text().splitlines() if line.startswith("{")
     }
     assert not [path for path in paths if "placerec_" in path]
+
+
+def test_a_key_is_rotated(admin: Operator, keyed: Server) -> None:
+    order = {"name": "fleet-9", "role": "query", "maps": [LAB]}
+    old = keyed.client.post("/v1/keys", json=order).json()
+
+    def status(secret: str) -> int:
+        headers = {"Authorization": f"Bearer {secret}"}
+        return keyed.client.get(f"/v1/maps/{LAB}", headers=headers).status_code
+
+    page = admin.go("keys")
+    page.get_by_role("button", name="Rotate fleet-9", exact=True).click()
+    page.get_by_role("dialog").get_by_label("The old one ends").select_option("in an hour")
+    page.get_by_role("button", name="Make the new key").click()
+    secret = page.get_by_label("The key", exact=True).inner_text()
+    assert secret != old["key"] and status(secret) == status(old["key"]) == 200
+    page.get_by_role("button", name="Done").click()
+    keys = {one["id"]: one for one in keyed.client.get("/v1/keys", params={"limit": 1000}).json()["items"]}
+    (new,) = (one for one in keys.values() if one["name"] == "fleet-9.2")
+    assert (new["role"], new["maps"], new["expires_at"]) == ("query", [LAB], None)
+    assert keys[old["id"]]["expires_at"] is not None
+    row = page.get_by_role("row").filter(has_text=new["id"])
+    row.get_by_role("button", name="Rotate fleet-9.2").click()
+    expect(page.get_by_role("dialog").get_by_label("Name of the new key")).to_have_value("fleet-9.3")
+    page.get_by_role("dialog").get_by_label("The old one ends").select_option("at once")
+    page.get_by_role("button", name="Make the new key").click()
+    latest = page.get_by_label("The key", exact=True).inner_text()
+    page.get_by_role("button", name="Done").click()
+    assert (status(latest), status(secret)) == (200, 401)
+    for key in keyed.client.get("/v1/keys", params={"limit": 1000}).json()["items"]:
+        if key["name"].startswith("fleet-9") and key["state"] == "in force":
+            keyed.client.delete(f"/v1/keys/{key['id']}")
+
+
+def test_the_load_is_plotted_over_time_and_saved(admin: Operator, keyed: Server) -> None:
+    for _ in range(2):
+        keyed.query(LAB, frame(1))
+    page = admin.go("service")
+    history = page.get_by_role("region", name="Over time")
+    told = keyed.client.get("/v1/service/history", params={"hours": 6}).json()
+    history.get_by_role(
+        "img", name=re.compile(rf"Answers a minute by verdict: {sum(told['recognized'])} rec")
+    ).wait_for()
+    for name in ("Latency of answers", "Memory; now .* MiB", "Free on the disk; now"):
+        plot = history.get_by_role("img", name=re.compile(name))
+        assert plot.locator("canvas").evaluate(
+            "(one) => one.getContext('2d').getImageData(0, 0, one.width, one.height).data.some(Boolean)"
+        )
+    history.get_by_role("button", name="7 days").click()
+    expect(history.get_by_role("button", name="7 days")).to_have_attribute("aria-pressed", "true")
+    admin.settle()
+    with page.expect_download() as saved:
+        history.get_by_role("button", name="Save as CSV").click()
+    rows = list(csv.DictReader(saved.value.path().read_text().splitlines()))
+    assert sum(int(row["recognized"]) for row in rows) >= sum(told["recognized"]) > 0
+
+
+def test_the_audit_trail_and_places_are_saved_as_csv_without_formulas(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("sheet")
+    assert keyed.enrol("sheet", "p0", frame(0), x=-1, y=2, sequence="=1+1", metadata={"a": 1}).status_code == 201
+    page = admin.go("maps/sheet/places")
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save as CSV").click()
+    (row,) = csv.DictReader(saved.value.path().read_text().splitlines())
+    assert (row["id"], row["sequence"], row["x"], row["metadata"]) == ("p0", "'=1+1", "-1", '{"a":1}')
+    page = admin.go("audit?map=sheet")
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save as CSV").click()
+    lines = list(csv.DictReader(saved.value.path().read_text().splitlines()))
+    assert {line["operation"] for line in lines} >= {"create_map", "enrol_place"}
+    assert {line["principal"] for line in lines} == {"admin-key"}
+    admin.leave()
+    keyed.client.delete("/v1/maps/sheet")

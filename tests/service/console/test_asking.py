@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 import cv2
@@ -49,6 +50,67 @@ def test_a_picture_is_queried_and_the_answer_explained(visit: Visit, pictures: P
     answer.get_by_text("rank 5").wait_for()
     page.get_by_role("img", name=re.compile("Shares of the words")).wait_for()
     expect(page.locator(".stages")).to_contain_text("total")
+
+
+SENTENCE = """async (answer) => {
+  const folder = document.querySelector("link[href$='shared/api.js']").href.replace("api.js", "answer.js");
+  return (await import(folder)).sentenceOf(answer);
+}"""
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        (
+            {"margin": 0.023, "inliers": 139},
+            "0.084 is above 0.061; the next place is 0.023 behind; geometry agrees on 139 points.",
+        ),
+        ({"margin": 0.023}, "0.084 is above 0.061; the next place is 0.023 behind."),
+        ({"decision": 0.0611}, "0.0611 is above 0.0610; no other place comes into question."),
+        ({"decision": 0.061}, "0.061000 is at 0.061000; no other place comes into question."),
+        (
+            {"decision": 0.02, "margin": -0.01, "verdict": "unknown"},
+            "0.020 is below 0.061; another place is 0.010 ahead.",
+        ),
+        (
+            {"decision": 0.02, "margin": 0.01, "inliers": 88},
+            "0.020 is below 0.061; the next place is 0.010 behind; geometry agrees on 88 points, "
+            "which makes it 97\u00a0% probable.",
+        ),
+    ],
+)
+def test_an_answer_is_one_sentence(admin: Operator, fields: dict[str, Any], told: str) -> None:
+    answer = {"verdict": "recognized", "decision": 0.084, "threshold": 0.061, "margin": None, "probability": 0.97}
+    answer |= {"matches": [{"parts": {"inliers": fields.get("inliers")}}]}
+    page = admin.go("jobs")
+    assert (
+        page.evaluate(SENTENCE, answer | {k: v for k, v in fields.items() if k != "inliers"}).replace("−", "-") == told
+    )
+
+
+@pytest.mark.thorough
+def test_an_answer_begins_with_why_and_where_and_of_the_unknown_shows_the_strongest_lines(
+    visit: Visit, keyed: Server, pictures: Path
+) -> None:
+    page = visit("query").go(f"maps/{LAB}/try")
+    page.get_by_label("Verify").select_option("never")
+    page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
+    answer = page.get_by_role("region", name="Answer")
+    expect(answer).to_contain_text(re.compile(r"0\.\d+ is above 0\.\d+; the next place is 0\.\d+ behind\."))
+    page.get_by_role("img", name=re.compile("The place, (mon|tues)day-03, on the plan of lab")).wait_for()
+    page.get_by_label("Among").select_option("monday")
+    told = keyed.client.post(
+        f"/v1/maps/{LAB}/query",
+        params={"verify": "never", "sequences": "monday"},
+        content=foreign_frame(),
+        headers={"Content-Type": "image/jpeg"},
+    ).json()
+    assert told["verdict"] == "unknown"
+    page.get_by_label("Pictures").set_input_files(pictures / "foreign.jpg")
+    expect(answer).to_contain_text(f"{told['decision']:.3f} is below {told['threshold']:.3f}".replace("-", "−"))
+    expect(answer.locator("svg.cells line")).to_have_count(15)
+    answer.get_by_label("the 15 strongest only").uncheck()
+    answer.locator("svg.cells line").nth(15).wait_for(state="attached")
 
 
 @pytest.mark.thorough
@@ -160,6 +222,7 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
 
 
+@pytest.mark.thorough
 def test_a_question_is_asked_again_with_its_filters(admin: Operator, keyed: Server) -> None:
     page = admin.go(f"maps/{LAB}/live")
     page.get_by_label("frames as thumbnails").check()
@@ -258,4 +321,5 @@ def test_a_robot_that_is_silent_is_not_shown_as_recognized(visit: Visit, keyed: 
     operator.go("jobs")
     operator.go(f"maps/{LAB}/plan")  # it is silent for who comes later, too
     expect(silent).to_contain_text(re.compile("admin-key.*seen 9 min ago"))
+    operator.foresee(f"sessions/{session}")  # the page may be reading it
     keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")

@@ -85,6 +85,7 @@ def test_a_map_that_is_gone_is_no_longer_chosen(admin: Operator, keyed: Server) 
     expect(page.get_by_role("link", name="Places", exact=True)).to_have_count(0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", ["phone", "laptop"])
 def test_a_long_description_leaves_the_actions_in_view(visit: Visit, keyed: Server, size: str) -> None:
     name = f"described-{size}"
@@ -98,6 +99,7 @@ def test_a_long_description_leaves_the_actions_in_view(visit: Visit, keyed: Serv
     expect(page.get_by_role("button", name=f"Delete {name}")).to_be_in_viewport(ratio=0.95)
     page.get_by_role("button", name=f"Delete {name}").click()
     page.get_by_role("dialog", name=f"Delete {name}").wait_for()
+    operator.leave()
     keyed.client.delete(f"/v1/maps/{name}")
 
 
@@ -304,7 +306,7 @@ def test_traverses_are_drawn_in_their_colours_and_can_be_left_out(admin: Operato
     }"""
 
     def painted() -> int:
-        found: int = page.locator(".plan-canvas canvas").first.evaluate(count)
+        found: int = page.locator(".plan-canvas canvas.places").evaluate(count)
         return found
 
     assert eventually(lambda: painted() > 100)

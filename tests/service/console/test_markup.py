@@ -65,7 +65,7 @@ def test_names_and_values_of_metadata(admin: Operator, hostile: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("view", ["plan", "places", "traverses", "try", "calibration", "health"])
+@pytest.mark.parametrize("view", ["plan", "places", "traverses", "try", "calibration", "health", "enrol", "learning"])
 def test_names_of_traverses(admin: Operator, hostile: str, view: str) -> None:
     admin.go(f"maps/{hostile}/{view}")
     if view in ("plan", "places", "traverses"):
@@ -271,6 +271,21 @@ def test_addresses_of_pictures_of_live_answers(admin: Operator) -> None:
 
 
 @pytest.mark.thorough
+def test_texts_of_robots(admin: Operator) -> None:
+    names = ("name", "session", "camera", "place", "map")
+    known: dict[str, Any] = {"verdict": "unknown", "pose": None, "recognized_at": None, "last_at": AT, "lost_since": AT}
+    known |= {"verdicts": [], "answers": 1} | dict.fromkeys(names) | {"map": LAB}
+    robots = [known | {name: MARKUP} for name in names]
+    told = {"at": "2026-11-20T10:01:00Z", "maps": [], "robots": robots, "alarms": []}
+    admin.page.route("**/v1/fleet", lambda route: route.fulfill(json=told))
+    for view in ("robots", "home"):
+        page = admin.go(view)
+        rows = page.get_by_role("region", name="Robots").get_by_role("row")
+        expect(rows).to_have_count(1 + len(names))
+        check_plain(admin)
+
+
+@pytest.mark.thorough
 def test_names_of_maps(admin: Operator, keyed: Server) -> None:
     admin.foresee("404", "422")
     known = keyed.client.get("/v1/maps").json()
@@ -309,4 +324,5 @@ def test_texts_turn_nothing_around(admin: Operator, keyed: Server, tmp_path: Pat
     page.get_by_role("button", name="Edit").click()
     written = page.get_by_role("dialog").get_by_label("Metadata")
     expect(written).to_have_value(re.compile("\u2066b"))  # what is edited stays what it is
+    admin.leave()
     keyed.client.delete("/v1/maps/turned")

@@ -11,6 +11,8 @@ from playwright.sync_api import expect
 
 from tests.service.console import world
 from tests.service.console.conftest import OUT_OF_PANEL, Operator, Visit
+from tests.service.learning.test_lessons import CORRIDOR, lessons
+from tests.service.learning.test_new_ground import drive, gapped, waiting
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server
 from tests.service.wire import eventually
@@ -91,6 +93,7 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     assert sum(one["place"] is None for one in again) == 1
 
 
+@pytest.mark.thorough
 def test_frames_that_come_wait_until_they_are_wanted(admin: Operator, keyed: Server, doubtful: str) -> None:
     page = admin.go(f"maps/{doubtful}/review")
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
@@ -154,6 +157,7 @@ def test_a_second_click_does_not_label_the_next_frame(admin: Operator, keyed: Se
     assert len(keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"]) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", ["phone", "laptop"])
 def test_long_ids_show_their_ends_and_stay_in_their_cards(visit: Visit, keyed: Server, size: str) -> None:
     name = f"long-{size}"
@@ -291,6 +295,19 @@ def test_a_frame_becomes_a_look_and_is_taken_back(admin: Operator, keyed: Server
     assert left == []
 
 
+def test_a_label_that_is_taken_back_leaves_the_list_of_labels(admin: Operator, keyed: Server, doubtful: str) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    panel.get_by_role("button", name="A further look of").click()
+    undo = page.get_by_role("button", name="Undo")
+    undo.wait_for()
+    page.get_by_role("button", name="Labelled", exact=True).click()
+    expect(panel).to_contain_text("Added to the looks of")
+    undo.click()
+    expect(panel).not_to_contain_text("Added to the looks of")
+    assert keyed.client.get(f"/v1/maps/{doubtful}/looks").json()["items"] == []
+
+
 def test_an_admin_says_what_runs_teach(admin: Operator, keyed: Server) -> None:
     keyed.create_map("teaching")
     page = admin.go("maps/teaching/review")
@@ -301,3 +318,48 @@ def test_an_admin_says_what_runs_teach(admin: Operator, keyed: Server) -> None:
     page.get_by_text("This map stores no frames for review now.").wait_for(state="detached")
     read = keyed.client.get("/v1/maps/teaching").json()
     assert read["learning"]["mode"] == "propose" and read["review"] is None
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not CORRIDOR.is_dir(), reason="needs the data set eval/corridor")
+def test_new_ground_is_accepted_undone_and_rejected_as_one_thing(admin: Operator, keyed: Server) -> None:
+    gapped(keyed, "new-ground")
+    drive(keyed, "new-ground", 1)
+    lessons(keyed, "new-ground")
+    (stretch,) = waiting(keyed, "new-ground")
+    before = keyed.places("new-ground").keys()
+    page = admin.go("maps/new-ground/review")
+    page.get_by_text("It is of new ground").wait_for()
+    page.get_by_role("button", name="New ground (1)").click()
+    title = f"From {stretch['leaves']} to {stretch['returns']}"
+    panel = page.get_by_role("region", name=title)
+    panel.get_by_text(stretch["why"]).wait_for()
+    panel.get_by_role("img", name=f"{title}, on the plan of new-ground.").wait_for()
+    first = stretch["frames"][0]
+    expect(panel.get_by_role("list", name=f"Frames {title}")).to_contain_text(f"± {first['spread']:.2f} m")
+    panel.get_by_role("img", name=f"Frame {first['frame']}", exact=True).wait_for()
+    panel.get_by_role("button", name=f"Accept: {len(stretch['frames'])} new places").click()
+    accepted = page.get_by_role("region", name="Accepted")
+    accepted.get_by_text(f"{len(stretch['frames'])} places in the traverse").wait_for()
+    assert keyed.places("new-ground").keys() - before == {one["place"] for one in stretch["frames"]}
+    page.get_by_role("button", name="New ground", exact=True).wait_for()
+    accepted.get_by_role("button", name="Undo").click()
+    page.get_by_text("The places are deleted, and the stretch waits again.").wait_for()
+    assert keyed.places("new-ground").keys() == before
+    assert [one["id"] for one in waiting(keyed, "new-ground")] == [stretch["id"]]
+    panel.get_by_text(stretch["why"]).wait_for()
+    page.get_by_role("button", name="Reject …").click()
+    page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+    assert len(waiting(keyed, "new-ground")) == 1, "it asks first"
+    page.get_by_role("button", name="Reject …").click()
+    page.get_by_role("dialog").get_by_role("button", name="Reject", exact=True).click()
+    page.get_by_text("No new ground waits").wait_for()
+    assert waiting(keyed, "new-ground") == []
+    learning = "/v1/maps/new-ground"
+    assert len(keyed.client.get(learning).json()["learning"]["rejected_ground"]) == 1
+    page.get_by_role("button", name=f"Forget that {stretch['id']} was rejected").click()
+    page.get_by_text("A run may propose this ground again.").wait_for()
+    page.get_by_role("region", name="Rejected ground").wait_for(state="detached")
+    assert keyed.client.get(learning).json()["learning"]["rejected_ground"] == []
+    admin.leave()
+    keyed.client.delete("/v1/maps/new-ground")

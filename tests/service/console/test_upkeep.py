@@ -10,6 +10,7 @@ from playwright.sync_api import expect
 
 from tests.service.console import world
 from tests.service.console.conftest import OUT_OF_PANEL, Operator, Visit
+from tests.service.map_jobs import wait_until
 from tests.service.server import Server
 
 
@@ -17,6 +18,7 @@ from tests.service.server import Server
 def yard(keyed: Server) -> Iterator[str]:
     """Another map of the drawn world, which these tests calibrate and align."""
     world.copy(keyed, "yard")
+    keyed.client.patch("/v1/maps/yard", json={"verification": False}).raise_for_status()  # thresholds alone decide
     yield "yard"
     keyed.client.delete("/v1/maps/yard")
 
@@ -63,6 +65,7 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
 
 
+@pytest.mark.thorough
 def test_a_dry_run_says_what_it_would_store_and_is_stored_by_a_button(admin: Operator, keyed: Server) -> None:
     world.copy(keyed, "dry")
     path = "/v1/maps/dry"
@@ -162,6 +165,7 @@ def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yar
     assert box is not None
     cell = box["width"] / 12
     matrix.click(position={"x": 9.5 * cell, "y": 2.5 * cell})
+    page.get_by_text("frame 3 of tuesday against 10 of monday: 0.").wait_for()
     pair = page.get_by_role("region", name="Pair")
     pair.get_by_role("link", name="tuesday-02").wait_for()
     pair.get_by_role("link", name="monday-09").wait_for()
@@ -281,6 +285,7 @@ def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -
     assert keyed.places("target").keys() == {"target-0", "target-1", "source-2", "source-3"}
 
 
+@pytest.mark.thorough
 def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin: Operator, keyed: Server) -> None:
     for name, pose in (("metric", {"x": 1, "y": 2}), ("geographic", {"latitude": 48.1, "longitude": 11.5})):
         keyed.create_map(name)
@@ -293,3 +298,37 @@ def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin
     merge.get_by_text(warning).wait_for()
     merge.get_by_role("button", name="Copy 1 places").click()
     page.get_by_role("dialog").get_by_text(warning).wait_for()
+
+
+@pytest.mark.thorough
+def test_backups_are_scheduled_made_and_missed(admin: Operator, keyed: Server) -> None:
+    page = admin.go("backups")
+    page.get_by_role("button", name="Change the schedule").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("All maps are saved").select_option("only by request")
+    dialog.get_by_label("Kept").fill("0")
+    dialog.get_by_role("button", name="Save").click()
+    expect(dialog.get_by_label("Kept")).to_be_focused()  # by the browser, which says what is wrong
+    dialog.get_by_label("Kept").fill("2")
+    dialog.get_by_role("button", name="Save").click()
+    schedule = page.get_by_role("region", name="Schedule")
+    expect(schedule).to_contain_text(re.compile("only by request.*the latest 2"))
+    wait_until(lambda: keyed.client.get("/v1/backups").json()["running"] is None)  # the first one, of the start
+    admin.go("home")
+    admin.go("backups")
+    page.get_by_role("button", name="Back up now").click()
+    schedule.get_by_text("succeeded").wait_for()
+    made = keyed.client.get("/v1/backups").json()["items"]
+    table = page.get_by_role("region", name="Backups")
+    expect(table.get_by_role("row").nth(1)).to_contain_text(made[0]["id"])
+    expect(table.get_by_role("row").nth(1)).to_contain_text(f"{made[0]['maps']}")
+
+    told = keyed.client.get("/v1/backups").json() | {"problem": "1 of 4 maps could not be saved. hall: it is damaged"}
+    page.route("**/v1/backups", lambda route: route.fulfill(json=told))
+    alarms = admin.go("home").get_by_role("region", name="Alarms")
+    expect(alarms).to_contain_text("The latest backup failed 1 of 4 maps could not be saved.")
+    alarms.get_by_role("link", name="The latest backup failed").click()
+    page.get_by_role("region", name="The latest backup failed").get_by_text("hall: it is damaged").wait_for()
+    told |= {"problem": None, "next_at": "2026-11-20T10:00:00Z"}
+    admin.go("home")
+    expect(alarms).to_contain_text("A backup is overdue")

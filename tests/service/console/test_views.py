@@ -19,16 +19,24 @@ OF_MAP = {
     "plan": (LAB, "query"),
     "places": ("Places", "query"),
     "places/monday-03": ("monday-03", "query"),
+    "enrol": ("Enrol", "enrol"),
     "try": ("Try", "query"),
     "live": ("Live", "query"),
+    "answers": ("Answers", "query"),
     "traverses": ("Traverses", "query"),
     "calibration": ("Calibration", "query"),
     "review": ("Review", "enrol"),
+    "learning": ("Learning", "query"),
     "health": ("Health", "enrol"),
+    "cameras": ("Cameras", "query"),
+    "upkeep": ("Upkeep", "admin"),
 }
 OF_SERVICE = {
+    "home": ("Home", "query"),
+    "robots": ("Robots", "query"),
     "maps": ("Maps", "query"),
     "jobs": ("Jobs", "query"),
+    "backups": ("Backups", "admin"),
     "keys": ("Keys", "admin"),
     "audit": ("Audit", "admin"),
     "service": ("Service", "query"),
@@ -208,3 +216,65 @@ def test_a_view_that_is_not_there_says_so(admin: Operator) -> None:
     page.goto(f"{admin.root}/console#/maps/gone/plan")
     page.get_by_role("alert").get_by_text("There is no map 'gone'.").wait_for()
     expect(page.get_by_role("alert")).to_contain_text(re.compile(r"Request [0-9a-f]{32}"))
+
+
+REDRAW = """async () => {
+  dispatchEvent(new Event("hashchange"));
+  await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+}"""
+"""Draw the view again, as whatever comes from the service does."""
+
+TYPED = "main input:visible, main textarea:visible, dialog input:visible, dialog textarea:visible"
+
+DIALOGS = {
+    "maps": ["Create a map"],
+    "keys": ["Create a key"],
+    "backups": ["Change the schedule"],
+    f"maps/{LAB}/review": ["Stored frames"],
+    f"maps/{LAB}/cameras": ["Add a camera"],
+    f"maps/{LAB}/places/monday-03": ["Edit"],
+    f"maps/{LAB}/calibration": [],
+    f"maps/{LAB}/upkeep": [],
+}
+
+
+def type_into(page: Page, where: str) -> int:
+    """Type into every field that is shown, and draw the view again after each letter; how many fields there are."""
+    fields = page.locator(TYPED)
+    count = 0
+    for number in range(fields.count()):
+        field = fields.nth(number)
+        kind = field.get_attribute("type") or "text"
+        if kind not in ("text", "number", "datetime-local") or not field.is_enabled():
+            continue
+        count += 1
+        label = f"{where}: {field.evaluate('one => one.labels[0]?.textContent || one.ariaLabel || one.outerHTML')}"
+        field.focus()
+        if kind == "datetime-local":  # half a date has no value yet
+            page.keyboard.type("11")
+            page.evaluate(REDRAW)
+            assert field.evaluate("one => one.validity.badInput"), label
+            continue
+        words = "ab1" if kind == "text" else "0.25" if field.get_attribute("step") == "any" else "12"
+        page.keyboard.press("ControlOrMeta+a")
+        for letter in words:
+            page.keyboard.type(letter)
+            page.evaluate(REDRAW)
+        expect(field, label).to_have_value(words)
+    return count
+
+
+@pytest.mark.thorough
+def test_what_is_typed_stays_while_the_view_is_drawn_again(admin: Operator) -> None:
+    found = {}
+    for view in VIEWS:
+        page = admin.go(view)
+        found[view] = type_into(page, view)
+        for button in DIALOGS.get(view, ()):
+            admin.page.goto(f"{admin.root}/console#/{view}")
+            admin.settle(view)
+            page.get_by_role("button", name=button, exact=True).click()
+            page.locator("dialog, form.panel").wait_for()
+            found[f"{view}, {button}"] = type_into(page, f"{view}, {button}")
+            page.keyboard.press("Escape")
+    assert found["audit"] == 5 and found["jobs"] == 1 and found["maps, Create a map"] > 3, found

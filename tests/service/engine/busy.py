@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 import time
 
-import torch
-
 from core.method.encoder import Encoder
+from core.threads import allowed_threads
 from service.engine.encoders import Encoded, Encoders, QueuedFrame
 from tests.service.scenes import jpeg
 
@@ -22,7 +21,7 @@ def keep_busy(encoders: Encoders, encoder: Encoder) -> tuple[list[QueuedFrame], 
 
     frames = [
         QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=wait)
-        for _ in range(torch.get_num_threads())
+        for _ in range(allowed_threads())
     ]
     encoders.put(frames)
     for _ in frames:

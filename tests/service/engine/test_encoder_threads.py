@@ -14,7 +14,6 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-import torch
 
 from core.errors import InvalidImage, NotAnImage, TruncatedImage
 from core.frames.images import Limits, decode
@@ -22,7 +21,7 @@ from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
-from core.threads import cores
+from core.threads import allowed_threads, cores
 from service.engine import encoder_threads
 from service.engine.encoder_threads import MOST_PIXELS, EncoderThreads
 from service.engine.encoders import BULK_SHARE, Encoded, QueuedFrame, WaitingFrames
@@ -123,13 +122,13 @@ def test_a_frame_alone_has_all_cores_and_several_frames_have_one_each(watched: W
     used: list[int] = []
 
     def note(_: Encoded) -> None:
-        used.append(torch.get_num_threads())
+        used.append(allowed_threads())
 
     for seed in range(3):
         watched.wait_until_idle()
         watched.threads.put([alone := watched.frame(seed, after_encoding=note)])
         answers([alone])
-    assert used == [torch.get_num_threads()] * 3
+    assert used == [allowed_threads()] * 3
     watched.wait_until_idle()
     together = [watched.frame(seed, after_encoding=note) for seed in range(8)]
     watched.put_together(together)
@@ -206,8 +205,9 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
     assert [frame for frame in watched.taken if frame.bulk] == bulk
 
 
+@pytest.mark.thorough
 def test_the_pixels_decoded_at_one_time_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    if torch.get_num_threads() == 1:
+    if allowed_threads() == 1:
         pytest.skip("one thread never has two frames")
     lock, at_once, most = threading.Lock(), 0, 0
     encode = watched.threads._encode
@@ -299,6 +299,7 @@ def test_one_callers_frames_delay_another_by_no_more_than_one(watched: Watched) 
     assert [frame for frame in watched.taken if frame is not robot] == greedy, "those of one caller stay in order"
 
 
+@pytest.mark.thorough
 def test_large_frames_are_more_turns_than_small_ones(watched: Watched) -> None:
     """What frames are expected to take counts as soon as they are taken, so this is the same at any speed."""
     frames = WaitingFrames()
@@ -315,6 +316,7 @@ def test_large_frames_are_more_turns_than_small_ones(watched: Watched) -> None:
     assert first == 0 and 6 <= second <= 8, "140 ms are expected for twelve million pixels, and 21 for a small frame"
 
 
+@pytest.mark.thorough
 @pytest.mark.anyio
 async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
     frames = [jpeg(index % 6) for index in range(queue.encoders.ahead + 10)]

@@ -42,6 +42,24 @@ def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: 
         server.kill()
 
 
+@pytest.mark.thorough
+@pytest.mark.timeout(600)
+def test_a_service_without_torch_enrols_and_recognizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the image ``slim``: nothing loads torch that does not need it."""
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    server = Server(tmp_path, {"rehearsal": True}, forked=False)
+    try:
+        server.wait(seconds=500)
+        enrol(server.client)
+        for name, prepare in kinds(server.client).items():
+            prepare()(0)
+            assert "Traceback" not in server.log_file.read_text(), name
+        assert server.client.get("/readyz").json()["status"] == "ready"
+    finally:
+        server.kill()
+
+
 def prepared(work: Callable[[httpx.Client], None], client: httpx.Client) -> Callable[[], Request]:
     """Something that needs no preparation, as a kind of request."""
     return lambda: lambda _: work(client)

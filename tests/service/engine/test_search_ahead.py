@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 
 from core.frames.images import Limits, decode
 from core.frames.preprocessing import Pixels
@@ -17,6 +16,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.question import Question
 from core.storage import Map
+from core.threads import allowed_threads
 from service.engine import searches
 from service.engine.encoder_threads import EncoderThreads
 from service.engine.encoders import AfterEncoding, Encoded, QueuedFrame
@@ -95,7 +95,7 @@ def test_after_encoding_runs_in_the_encoders_threads(threads: EncoderThreads, en
         return threading.current_thread().name, encoded.encoding.descriptor.sum()
 
     found: list[Any] = search_results(threads, encoder, 4, callback)
-    assert {name for name, _ in found} <= {f"encoder-{number}" for number in range(torch.get_num_threads())}
+    assert {name for name, _ in found} <= {f"encoder-{number}" for number in range(allowed_threads())}
     alone = [encoder.encode(decode(jpeg(seed))).descriptor.sum() for seed in range(4)]
     assert [total for _, total in found] == pytest.approx(alone, rel=1e-4)
 

@@ -37,6 +37,7 @@ def without_umask() -> Iterator[None]:
     os.umask(before)
 
 
+@pytest.mark.thorough
 def test_nobody_else_reads_a_data_directory(tmp_path: Path) -> None:
     """While the service runs, with a map, its frames for review, an export and jobs; and when it has stopped."""
     audit = tmp_path / "audit.jsonl"

@@ -16,7 +16,7 @@ from service.errors.problems import BY_STATUS, KINDS, TYPE_PREFIX, kind_of, prob
 from service.settings import Settings
 from tests.service.server import assert_problem
 
-CONTRACT = {400, 401, 403, 404, 405, 408, 409, 410, 412, 413, 414, 415, 416, 422, 429, 431, 500, 501, 503, 507}
+CONTRACT = {400, 401, 403, 404, 405, 406, 408, 409, 410, 412, 413, 414, 415, 416, 422, 429, 431, 500, 501, 503, 507}
 OURS = [
     cls
     for module in (errors, faults)

@@ -141,7 +141,7 @@ def test_enrolments_have_an_event_for_each_commit(quick: Server, lab: str) -> No
         closed = quick.client.post(
             f"/v1/maps/{lab}/query:enrol?id=new", content=jpeg(77), headers=typed(jpeg(77))
         ).json()
-        assert closed["change"] == "created", closed
+        assert closed["enrolment"] == "created", closed
         order = {"ids": ["b0", "b1"], "dry_run": False}
         assert quick.client.post(f"/v1/maps/{lab}/places:delete", json=order).json()["places"] == 2
         assert quick.client.delete(f"/v1/maps/{lab}/places/b2").is_success

@@ -126,6 +126,7 @@ async def test_a_picture_is_made_where_the_frame_is_for_listeners_elsewhere(
             assert event.picture is not None and event.verdict == "unknown" and event.maps == {"lab"}
 
 
+@pytest.mark.thorough
 async def test_events_are_received_although_the_service_hears_of_them_late(
     database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,6 +147,7 @@ async def test_events_are_received_although_the_service_hears_of_them_late(
         assert revisions(await some(listener, 1)) == [1]
 
 
+@pytest.mark.thorough
 async def test_services_stop_sending_a_while_after_the_last_listener_has_left(
     database: SharedDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

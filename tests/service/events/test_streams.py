@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import pytest
 
 from core.maps import MapSettings
 from service.access.roles import OWNER
+from service.errors.faults import KeyRefused
 from service.events.feed import MOST_EVENTS
 from service.events.schemas import MapEvent
+from service.http.event_stream import set_or_refused
 from service.maps.event_routes import EventParameters, MapStream
 from tests.service.engines import ENCODER, runtime_at
 from tests.service.events.listening import events_of
@@ -49,3 +52,19 @@ async def test_every_event_is_one_line_of_json_whatever_it_says(tmp_path: Path) 
     assert [line.partition(":")[0] for line in text.split("\n")] == ["id", "event", "data", "", ""]
     (event,) = events_of(text.splitlines())
     assert event.data["fields"] == [strange]
+
+
+async def test_the_key_of_who_waits_is_looked_at_long_before_anything_happens() -> None:
+    looks: list[None] = []
+
+    def check() -> None:
+        looks.append(None)
+        if len(looks) == 2:
+            raise KeyRefused("It was revoked.")
+
+    with pytest.raises(KeyRefused):
+        await set_or_refused(asyncio.Event(), 3600.0, check)
+    changed = asyncio.Event()
+    changed.set()
+    assert await set_or_refused(changed, 3600.0, check) and not changed.is_set()
+    assert not await set_or_refused(changed, 0.0, check)

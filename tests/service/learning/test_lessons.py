@@ -152,26 +152,36 @@ def test_a_run_through_another_building_teaches_nothing(running: Server) -> None
 def test_a_map_that_is_off_takes_no_notes(running: Server) -> None:
     count = len(lessons(running, "hall"))
     edited = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "off"}}).json()
-    assert edited["learning"] == {"mode": "off", "least_probability": 0.95, "most_looks": 3}
+    plain: dict[str, Any] = {
+        "most_looks": 3,
+        "most_places": None,
+        "new_ground": False,
+        "calibration": "propose",
+        "rejected_ground": [],
+    }
+    assert edited["learning"] == {"mode": "off", "least_probability": 0.95} | plain
     drive(running, "hall")
     assert len(lessons(running, "hall")) == count
     restored = running.client.patch("/v1/maps/hall", json={"learning": {"mode": "propose", "least_probability": 0.99}})
-    assert restored.json()["learning"] == {"mode": "propose", "least_probability": 0.99, "most_looks": 3}
+    assert restored.json()["learning"] == {"mode": "propose", "least_probability": 0.99} | plain
     back = running.client.patch("/v1/maps/hall", json={"learning": {"least_probability": None}}).json()
-    assert back["learning"] == {"mode": "propose", "least_probability": 0.95, "most_looks": 3}
+    assert back["learning"] == {"mode": "propose", "least_probability": 0.95} | plain
 
 
-def test_a_robot_that_may_only_query_teaches_nothing(tmp_path: Path) -> None:
+def test_only_robots_whose_keys_say_so_teach(tmp_path: Path) -> None:
     server = Server(tmp_path, {}).wait()
     taught(server, "hall", "propose")
     keys = Keys.of(server.data_dir)
     _, admin = keys.create("admin", "admin")
     _, query = keys.create("robot", "query")
     _, enrol = keys.create("mapper", "enrol")
+    _, teacher = keys.create("teacher", "enrol", learn=True)
     server.client.headers["Authorization"] = f"Bearer {admin}"
-    drive(server, "hall", key=query)
-    assert lessons(server, "hall") == []
-    drive(server, "hall", key=enrol)
+    few = frames_of("query")[:10]
+    for key in (query, enrol):
+        drive(server, "hall", key=key, frames=few)
+        assert lessons(server, "hall") == []
+    drive(server, "hall", key=teacher, frames=few)
     assert len(lessons(server, "hall")) == 1
     assert server.stop() == 0
 
@@ -222,4 +232,20 @@ def test_a_map_takes_by_itself_what_keypoints_agree_on(running: Server) -> None:
     lessons(running, "self-taught")
     after = running.client.get("/v1/maps/self-taught/looks", params={"limit": 100}).json()["items"]
     assert sum(look["right"] for look in after) > 0 and not any(look["wrong"] for look in after)
+    # A person says that one of them is no place of the map: the look that it became is gone.
+    review = "/v1/maps/self-taught/review"
+    labelled_frames = running.client.get(review, params={"limit": 100, "labelled": "true"}).json()["items"]
+    label = labelled_frames[0]["label"]
+    path = f"/v1/maps/self-taught/places/{label['place']}/looks"
+
+    def names() -> set[str]:
+        return {look["name"] for look in running.client.get(path).json()["items"]}
+
+    agreed = running.client.post(f"{review}/{labelled_frames[0]['id']}", json={"place": label["place"]})
+    assert agreed.status_code == 200 and label["look"] in names(), "a person who says the same takes nothing away"
+    label = labelled_frames[1]["label"]
+    path = f"/v1/maps/self-taught/places/{label['place']}/looks"
+    assert label["look"] in names()
+    assert running.client.post(f"{review}/{labelled_frames[1]['id']}", json={"stranger": True}).status_code == 200
+    assert label["look"] not in names()
     running.client.delete("/v1/maps/self-taught")

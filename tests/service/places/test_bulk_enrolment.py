@@ -143,6 +143,7 @@ def test_a_cancelled_job_keeps_what_is_enrolled_and_the_next_job_runs(server: Se
     wait_until(lambda: staged(server) == [])
 
 
+@pytest.mark.thorough
 def test_a_map_that_is_deleted_and_created_again_is_another_map(server: Server) -> None:
     for name in ("before", "again"):
         server.create_map(name, encoder=COARSE)

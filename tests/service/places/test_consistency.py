@@ -163,6 +163,7 @@ def test_writers_merges_and_prunes_of_one_map(busy: Server) -> None:
             ]
 
 
+@pytest.mark.thorough
 def test_maps_that_are_deleted_and_created_again(busy: Server) -> None:
     """What was meant for a map that is gone never comes into the one that has its id now."""
     seed = 4711

@@ -191,6 +191,7 @@ def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path: Path) -> 
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
 def test_a_full_file_system_is_reported_and_nothing_is_half_written(tmp_path: Path, small_disk: Path) -> None:
     server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait()
     kept = check_full_disk(server)
@@ -202,6 +203,33 @@ def test_a_full_file_system_is_reported_and_nothing_is_half_written(tmp_path: Pa
     assert set(server.places("lab")) <= set(kept)
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     server.kill()
+
+
+@pytest.mark.thorough
+def test_what_is_deleted_on_a_full_file_system_makes_room(tmp_path: Path, small_disk: Path) -> None:
+    """Not a byte is free, but for what the service holds back."""
+    install_coarse_encoder(tmp_path / "models")
+    settings = {"data_dir": small_disk / "data", "models_dir": tmp_path / "models", "encoder": COARSE}
+    server = Server(tmp_path, settings | {"disk_reserve_bytes": 1 << 19}).wait()
+    server.create_map("lab", keep="image")
+    session = server.client.post("/v1/maps/lab/sessions", json={}).json()["id"]
+    (small_disk / "other").write_bytes(bytes(1 << 20))
+    kept = list(fill(server))
+    found = os.statvfs(small_disk)
+    (small_disk / "ballast").write_bytes(bytes(found.f_bavail * found.f_frsize))
+    assert os.statvfs(small_disk).f_bavail == 0
+    assert server.enrol("lab", "refused", jpeg(11)).status_code == 507
+    assert server.client.delete(f"/v1/maps/lab/sessions/{session}").status_code == 204
+    for name in kept[:3]:
+        response = server.client.delete(f"/v1/maps/lab/places/{name}")
+        assert response.status_code == 204, response.text
+    order = {"ids": kept[3:5], "dry_run": False}
+    assert server.client.post("/v1/maps/lab/places:delete", json=order).json()["places"] == 2
+    assert set(server.places("lab")) == set(kept[5:])
+    (small_disk / "other").unlink()
+    assert server.enrol("lab", "taken", jpeg(11)).status_code == 201
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    assert server.stop() == 0
 
 
 @pytest.mark.thorough

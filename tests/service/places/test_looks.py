@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
+from fastapi.testclient import TestClient
 
+from core.frames.images import decode
+from core.judgement.trials import StagedTrials, Trial, gathered
+from core.judgement.verdict import Judgement
+from core.learning import Witness
+from core.maps import Enrolment, Map
 from core.maps.records import MOST_LOOKS
+from core.places import PlaceFields, look_address
+from service.app.application import create_app
+from service.places import looks
+from service.places.enrolment import enrol_look
+from service.queries.histories.run_trials import RunTrials
+from service.queries.statistics import map_key
+from service.settings import Settings
 from tests.service.map_jobs import asked, finished
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
+
+CORRIDOR = Path(__file__).parents[4] / "shared/datasets/eval/corridor"
 
 
 def add_look(server: Server, map_id: str, place: str, picture: bytes, **fields: Any) -> httpx.Response:
@@ -55,6 +73,32 @@ def test_a_place_is_found_by_any_of_its_looks(server: Server, hall: str) -> None
         assert answer["rivals"] == []
     place = server.client.get(f"/v1/maps/{hall}/places/p1").json()
     assert place["looks"] == 1 and answer["place"]["looks"] == 1
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not CORRIDOR.is_dir(), reason="the corridor images are not on this machine")
+def test_looks_by_night_make_no_frame_by_night_unknown(server: Server) -> None:
+    """Not fewer frames by night are recognized rightly in a map of which all places have looks by night."""
+
+    def by_night(path: Path) -> bytes:
+        dark = decode(path.read_bytes()).astype(np.float32) * 0.25
+        noise = np.random.default_rng(int(path.stem)).normal(0, 4, dark.shape)
+        return encoded(np.asarray(np.clip(dark + noise, 0, 255), np.uint8))
+
+    reference, asked = (sorted((CORRIDOR / folder).glob("*.jpg"))[:40] for folder in ("ref", "query"))
+    recognized = {}
+    for name in ("night-without-looks", "night-with-looks"):
+        server.create_map(name)
+        for number, path in enumerate(reference):
+            assert server.enrol(name, str(number), path.read_bytes(), sequence="day").status_code == 201
+            if name == "night-with-looks":
+                assert add_look(server, name, str(number), by_night(path)).status_code == 201
+        answers = [server.query(name, by_night(path)) for path in asked]
+        recognized[name] = sum(
+            answer["verdict"] == "recognized" and abs(int(answer["matches"][0]["place"]["id"]) - number) <= 2
+            for number, answer in enumerate(answers)
+        )
+    assert recognized["night-with-looks"] >= recognized["night-without-looks"], recognized
 
 
 def test_looks_are_one_place_in_every_count(server: Server, hall: str) -> None:
@@ -143,6 +187,63 @@ def test_what_cannot_be_a_look_is_refused(server: Server, hall: str) -> None:
     assert_problem(server.client.get(f"/v1/maps/{hall}/places/none/looks"), 404, "unknown-place")
     listed = server.client.get(f"/v1/maps/{hall}/places/p1/looks").json()["items"]
     assert len(listed) == 1, "a refused look left something"
+
+
+@pytest.mark.thorough
+def test_a_look_that_is_removed_in_the_same_moment_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def added_and_removed(engine: Any, map_: Map, place_id: str, *rest: Any) -> Any:
+        stored = await enrol_look(engine, map_, place_id, *rest)
+        map_.forget_look(place_id, stored.name)
+        return stored
+
+    monkeypatch.setattr(looks, "enrol_look", added_and_removed)
+    with TestClient(create_app(Settings(data_dir=tmp_path), as_owner=True), raise_server_exceptions=False) as client:
+        client.post("/v1/maps", json={"id": "hall"})
+        sent = {"content": jpeg(0), "headers": {"Content-Type": "image/jpeg"}}
+        assert client.put("/v1/maps/hall/places/p", **sent).status_code == 201
+        answer = client.post("/v1/maps/hall/places/p/looks", **{**sent, "content": jpeg(71)})
+        assert answer.status_code == 404 and answer.json()["type"].endswith("unknown-look"), answer.text
+        assert client.get("/v1/maps/hall/looks").json()["items"] == []
+
+
+def test_learnt_looks_go_by_run_and_by_time(tmp_path: Path) -> None:
+    with TestClient(create_app(Settings(data_dir=tmp_path), as_owner=True)) as client:
+        client.post("/v1/maps", json={"id": "hall"})
+        sent = {"content": jpeg(0), "headers": {"Content-Type": "image/jpeg"}}
+        assert client.put("/v1/maps/hall/places/p", **sent).status_code == 201
+        assert client.post("/v1/maps/hall/places/p/looks", **{**sent, "content": jpeg(70)}).status_code == 201
+        map_ = client.app.state.engine.maps.get("hall")  # type: ignore[attr-defined]
+        moments = []
+        for number, run in enumerate(("s-1", "s-1", "s-2")):
+            digest = bytes([number]) * 32
+            vector = np.ones(map_.record.dimension, np.float32)
+            local = np.ones(map_.record.local_shape, np.int8)
+            name = look_address("p", digest.hex()[:16])
+            map_.enrol([Enrolment(name, PlaceFields(), vector, 1, digest, local, run=run)])
+            moments.append(client.get("/v1/maps/hall/places/p/looks").json()["items"][-1]["created_at"])
+        path, statistics = "/v1/maps/hall/looks", client.app.state.statistics  # type: ignore[attr-defined]
+        trials = StagedTrials.of(gathered([Trial(Judgement("unknown", 0.1, 0.02, None, None), True, True, 0)]))
+        for run in ("s-1", "s-2"):
+            statistics.keep_run_trials(map_key(map_), RunTrials(run, Witness("robot", datetime.now(UTC)), trials))
+
+        def left() -> list[str | None]:
+            return [look["run"] for look in client.get(path).json()["items"]]
+
+        assert client.delete(path).status_code == 422 and left() == [None, "s-1", "s-1", "s-2"], "all at once"
+        assert client.delete(path, params={"since": "yesterday"}).status_code == 422
+        answer = client.delete(path, params={"run": "s-1", "since": moments[1]})
+        assert answer.status_code == 200, answer.text
+        gone = answer.json()
+        assert (gone["looks"], gone["run"], gone["since"], gone["until"]) == (1, "s-1", moments[1], None)
+        assert left() == [None, "s-1", "s-2"]
+        assert client.delete(path, params={"until": moments[0]}).json()["looks"] == 0
+        assert client.delete(path, params={"until": moments[2]}).json()["looks"] == 1
+        assert left() == [None, "s-2"]
+        assert client.delete(path, params={"since": moments[0]}).json()["looks"] == 1
+        assert left() == [None], "what a person added stays"
+        assert [one.run for one in statistics.run_trials(map_key(map_))] == ["s-1", "s-2"], "no run went as a whole"
+        assert client.delete(path, params={"run": "s-1"}).json()["looks"] == 0
+        assert [one.run for one in statistics.run_trials(map_key(map_))] == ["s-2"]
 
 
 @pytest.mark.thorough

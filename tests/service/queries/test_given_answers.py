@@ -198,3 +198,18 @@ def test_answers_wait_in_memory_while_the_ledger_refuses(open_ledger: OpenLedger
 COUNT = Statement(select(func.count()).select_from(TABLES.metadata.tables["answers"]))
 REMOVE = Statement(text("ALTER TABLE answers RENAME TO away"))
 RESTORE = Statement(text("ALTER TABLE away RENAME TO answers"))
+
+
+def test_answers_are_dropped_by_what_they_are_about_and_by_age(open_ledger: OpenLedger) -> None:
+    for stored in (RecentAnswers(), RecentAnswers(open_ledger(TABLES))):
+        key = ("lab", "2026")
+        for number in range(6):
+            stored.add(key, GivenAnswer.of(ANSWER, QueriedFrame(session=f"s-{number % 2}", number=number)))
+        stored.add(("hall", "2026"), GivenAnswer.of(ANSWER, QueriedFrame(session="s-1")))
+        assert stored.forget(key, lambda one: one.frame.session == "s-1") == 3
+        left = stored.of_map(key)
+        assert [one.frame.number for one in left] == [4, 2, 0] and len(stored.of_map(("hall", "2026"))) == 1
+        stored.forget_before(left[0].at)
+        assert [one.frame.number for one in stored.of_map(key)] == [4]
+        stored.add(key, left[1])
+        assert len(stored.of_map(key)) == 2

@@ -37,7 +37,7 @@ def test_an_unknown_frame_becomes_a_place(server: Server, map_id: str) -> None:
     )  # fmt: skip
     assert response.status_code == 201, response.text
     answer = response.json()
-    assert (answer["verdict"], answer["reason"], answer["place"], answer["change"]) == (
+    assert (answer["verdict"], answer["reason"], answer["place"], answer["enrolment"]) == (
         "unknown", "empty-map", None, "created",
     )  # fmt: skip
     stored = server.client.get(f"/v1/maps/{map_id}/places/p1").json()
@@ -54,7 +54,7 @@ def test_a_known_frame_does_not_become_a_place(server: Server, map_id: str) -> N
     response = close(server, map_id, "p2", encoded(seen_again(scene(1))))
     answer = response.json()
     assert response.status_code == 200 and answer["verdict"] == "recognized" and answer["place"]["id"] == "p1"
-    assert (answer["change"], answer["enrolled"]) == (None, None)
+    assert (answer["enrolment"], answer["enrolled"]) == (None, None)
     assert count(server, map_id) == before
     assert server.client.get(f"/v1/maps/{map_id}/places/p2").status_code == 404
 
@@ -65,7 +65,7 @@ def test_the_very_picture_of_a_place_does_not_become_another(server: Server, map
     response = close(server, map_id, "again", jpeg(37))
     answer = response.json()
     assert response.status_code == 200 and answer["verdict"] == "recognized" and answer["place"]["id"] == "p37", answer
-    assert answer["change"] is None and count(server, map_id) == 1
+    assert answer["enrolment"] is None and count(server, map_id) == 1
 
 
 @pytest.mark.thorough
@@ -74,7 +74,7 @@ def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
     first = close(server, map_id, "p1", jpeg(1), x=0, y=0)
     again = close(server, map_id, "p1", jpeg(1), x=0, y=0)
     assert (first.status_code, again.status_code) == (201, 200)
-    assert (again.json()["verdict"], again.json()["change"]) == ("unknown", "unchanged")
+    assert (again.json()["verdict"], again.json()["enrolment"]) == ("unknown", "unchanged")
     assert again.json()["enrolled"] == first.json()["enrolled"]
     assert again.json()["score"] == first.json()["score"], "it does not find itself"
     assert_problem(close(server, map_id, "p1", jpeg(2)), 409, "place-taken")
@@ -88,10 +88,10 @@ def test_of_eight_robots_at_one_new_place_one_enrols_it(server: Server, map_id: 
     with ThreadPoolExecutor(8) as pool:
         responses = list(pool.map(lambda i: close(server, map_id, f"robot-{i}", looks[i], x=0, y=0), range(8)))
     answers = [response.json() for response in responses]
-    created = [answer["enrolled"]["id"] for answer in answers if answer["change"] == "created"]
+    created = [answer["enrolled"]["id"] for answer in answers if answer["enrolment"] == "created"]
     assert len(created) == 1, answers
     assert sorted(response.status_code for response in responses) == [200] * 7 + [201]
-    others = [answer for answer in answers if answer["change"] is None]
+    others = [answer for answer in answers if answer["enrolment"] is None]
     assert [answer["verdict"] for answer in others] == ["recognized"] * 7
     assert {answer["place"]["id"] for answer in others} == set(created)
     assert count(server, map_id) == len(BACKGROUND) + 1
@@ -104,19 +104,19 @@ def test_a_robot_does_not_find_its_own_last_frames(server: Server, map_id: str) 
     for second, look in enumerate(looks[:2]):
         parameters = {"sequence": "run", "timestamp": f"2026-11-20T10:00:0{second}Z", "exclude_seconds": 30}
         answer = close(server, map_id, f"r{second}", look, **parameters).json()
-        assert (answer["verdict"], answer["change"]) == ("unknown", "created"), "it stands still"
+        assert (answer["verdict"], answer["enrolment"]) == ("unknown", "created"), "it stands still"
     later = {"sequence": "run", "timestamp": "2026-11-20T10:09:00Z", "exclude_seconds": 30}
     answer = close(server, map_id, "r2", looks[2], **later).json()
-    assert answer["matches"][0]["place"]["id"] in {"r0", "r1"} and answer["change"] is None, "the loop is closed"
+    assert answer["matches"][0]["place"]["id"] in {"r0", "r1"} and answer["enrolment"] is None, "the loop is closed"
     behind = close(server, map_id, "r3", looks[2], sequence="run", exclude_frames=2).json()
-    assert (behind["verdict"], behind["change"]) == ("unknown", "created")
+    assert (behind["verdict"], behind["enrolment"]) == ("unknown", "created")
 
 
 def test_a_blank_frame_is_no_place(server: Server, map_id: str) -> None:
     response = close(server, map_id, "p1", encoded(blank()))
     answer = response.json()
     assert response.status_code == 200
-    assert (answer["verdict"], answer["reason"], answer["change"], answer["enrolled"]) == (
+    assert (answer["verdict"], answer["reason"], answer["enrolment"], answer["enrolled"]) == (
         "unknown", "no-regions", None, None,
     )  # fmt: skip
     assert count(server, map_id) == 0
@@ -132,7 +132,7 @@ def test_what_a_covered_camera_shows_is_no_place(server: Server, map_id: str, le
         response = close(server, map_id, f"p{number}", encoded(look), x=0, y=0)
         answer = response.json()
         assert response.status_code == 200, answer
-        assert (answer["verdict"], answer["change"], answer["enrolled"]) == ("unknown", None, None)
+        assert (answer["verdict"], answer["enrolment"], answer["enrolled"]) == ("unknown", None, None)
     assert count(server, map_id) == len(BACKGROUND)
 
 
@@ -159,7 +159,7 @@ def test_a_place_that_the_map_has_twice_is_not_enrolled_a_third_time(server: Ser
             server.enrol(map_id, f"{sequence}-{number}", jpeg(number), sequence=sequence)
     before = count(server, map_id)
     answer = close(server, map_id, "again", encoded(seen_again(scene(1)))).json()
-    assert (answer["verdict"], answer["place"], answer["change"]) == ("ambiguous", None, None)
+    assert (answer["verdict"], answer["place"], answer["enrolment"]) == ("ambiguous", None, None)
     (group,) = answer["rivals"]
     counterpart = "tuesday-1" if answer["matches"][0]["place"]["id"] == "monday-1" else "monday-1"
     assert group["places"] == [counterpart] and group["same_place"] is True

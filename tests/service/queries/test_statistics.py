@@ -259,12 +259,13 @@ def test_statistics_of_an_older_version_are_put_aside_whole(
     counted.close()
     (aside,) = tmp_path.glob("*damaged*")
     assert aside.read_bytes() == before
-    assert "before the first release of placerec (schema 1, this one knows 3)" in caplog.text
+    assert f"before the first release of placerec (schema 1, this one knows {TABLES.version})" in caplog.text
 
 
 # Services that share a ledger
 
 
+@pytest.mark.thorough
 @pytest.mark.postgres
 def test_services_add_their_counts_to_the_same_rows(postgres: Postgres, maps: Maps) -> None:
     postgres.empty()

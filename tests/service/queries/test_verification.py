@@ -178,9 +178,9 @@ def test_a_loop_closure_is_verified_and_enrols_keypoints(server: Server, map_id:
         found: dict[str, Any] = answer.json()
         return found
 
-    assert ask(1, "first")["change"] == "created"
+    assert ask(1, "first")["enrolment"] == "created"
     again = ask(1, "again")
-    assert again["change"] is None and again["verification"]["state"] == "verified"
+    assert again["enrolment"] is None and again["verification"]["state"] == "verified"
     assert again["place"]["id"] == "first"
 
 

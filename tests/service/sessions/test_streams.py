@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 from tests.service.sessions.test_sessions import again, begin, post, send
+from tests.service.wire import ended, get, opened
 
 
 @contextmanager
@@ -134,6 +136,25 @@ def test_a_session_has_at_most_one_stream(server: Server, traverse: str) -> None
         assert ask(connection, again(0))["frames"] == 1
     with stream(server, traverse, session) as connection:
         assert ask(connection, again(1))["frames"] == 2
+
+
+def test_a_robot_that_lost_its_connection_silently_takes_its_session_over(server: Server, traverse: str) -> None:
+    """The former connection is open, and nobody is there to answer a ping."""
+    session = begin(server, traverse)
+    lost = opened(server)
+    key = base64.b64encode(bytes(16)).decode()
+    upgrade = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {key}")
+    lost.sendall(get(f"/v1/maps/{traverse}/sessions/{session}/stream", *upgrade))
+    assert lost.recv(65536).startswith(b"HTTP/1.1 101 ")
+    before = ended(server, "lost")
+    with stream(server, traverse, session) as connection:
+        assert ask(connection, again(0))["frames"] == 1
+        assert ended(server, "lost") == before + 1
+        with pytest.raises(InvalidStatus) as refused, stream(server, traverse, session):
+            pass
+        assert refused.value.response.status_code == 409, "this one answers pings"
+        assert ask(connection, again(1))["frames"] == 2
+    lost.close()
 
 
 def test_a_session_deleted_during_a_stream(server: Server, traverse: str) -> None:

@@ -36,6 +36,7 @@ def beliefs(answer: dict[str, Any]) -> dict[str, float]:
     return {one["place"]["id"]: one["probability"] for one in answer["candidates"]}
 
 
+@pytest.mark.thorough
 def test_services_go_on_with_one_session(services: tuple[Server, Server]) -> None:
     one, other = services
     alone, shared = begin(one, MAP), begin(one, MAP)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.ledger.maps.counterparts import Counterparts
 from core.maps import Enrolment, Map, MapSettings
+from core.maps.records import LearningSetting
 from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
@@ -26,6 +27,8 @@ from tests.service.server import Server, assert_problem
 
 DIMENSION = 64
 FRAMES = 40
+SILENT = LearningSetting(calibration="off")
+"""No encoder is loaded, so nothing is asked (``tests/service/learning/test_self_calibration.py``)."""
 Vectors = NDArray[np.float32]
 
 
@@ -61,7 +64,7 @@ def runtime(tmp_path: Path) -> Iterator[Runtime]:
 
 def two_traverses(runtime: Runtime) -> Map:
     """A map of two traverses of one way, of which the second begins at the sixth place."""
-    lab = runtime.engine.maps.create("lab", ENCODER, DIMENSION, MapSettings(keep="none"))
+    lab = runtime.engine.maps.create("lab", ENCODER, DIMENSION, MapSettings(keep="none", learning=SILENT))
     visit(lab, "a", walk(), posed=True)
     visit(lab, "b", walk()[5:], seed=2)
     return lab

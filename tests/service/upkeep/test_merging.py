@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,8 @@ import pytest
 from core.errors import StorageFull
 from core.ledger.maps.transfer import Transfer
 from core.maps import Enrolment, MapSettings
-from core.places import PlaceFields
+from core.maps.records import MOST_LOOKS
+from core.places import PlaceFields, look_address
 from core.storage import Atlas
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
@@ -200,12 +203,12 @@ def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], 
     """Let something happen in the middle of the merge, or after another number of commits, once."""
     copy, calls = merging._copy, 0
 
-    def counted(context: Any, *arguments: Any) -> None:
+    def counted(context: Any, *arguments: Any) -> list[str]:
         nonlocal calls
         calls += 1
         if calls == commits + 1:
             happens(context)
-        copy(context, *arguments)
+        return copy(context, *arguments)
 
     monkeypatch.setattr(merging, "_copy", counted)
 
@@ -238,6 +241,7 @@ def test_all_places_are_copied(folder: Path) -> None:
         check_merged(runtime.engine, before, theirs)
 
 
+@pytest.mark.thorough
 def test_a_stop_in_the_middle_and_a_start_copy_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
         before, theirs = state_of(runtime.engine, "lab"), state_of(runtime.engine, "hall")
@@ -321,6 +325,7 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
         assert state_of(runtime.engine, "lab") == before
 
 
+@pytest.mark.thorough
 def test_the_map_itself_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
         after_two_commits(monkeypatch, lambda _: runtime.engine.maps.delete("lab"))
@@ -348,6 +353,42 @@ def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then
         assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
         assert runtime.engine.maps.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
+
+
+def look_of(place_id: str, number: int) -> Enrolment:
+    (made,) = enrolments(number, 1, "look", "monday")
+    digest = hashlib.sha256(made.digest).digest()
+    return replace(made, id=look_address(place_id, digest.hex()[:16]), digest=digest)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("meanwhile", ["nothing", "deleted", "another frame", "full"])
+def test_looks_come_only_to_the_places_that_they_are_of(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, meanwhile: str
+) -> None:
+    with runtime_at(folder) as runtime:
+        lab, hall = runtime.engine.maps.get("lab"), runtime.engine.maps.get("hall")
+        (shared,) = enrolments(8000, 1, "both", "sunday")
+        for map_ in (lab, hall):
+            map_.enrol([replace(shared, fields=PlaceFields())])
+        hall.enrol([look_of("both8000", 8001)])
+
+        def change(_: Any) -> None:
+            if meanwhile == "deleted":
+                lab.forget("both8000")
+            elif meanwhile == "another frame":
+                lab.enrol([replace(enrolments(8002, 1, "x", "sunday")[0], id="both8000")])
+            elif meanwhile == "full":
+                lab.enrol([look_of("both8000", 8100 + number) for number in range(MOST_LOOKS)])
+
+        after_two_commits(monkeypatch, change)
+        done = merged(runtime)
+        assert done.state == "succeeded" and done.result is not None, done
+        comes = meanwhile == "nothing"
+        assert (done.result["coming"], done.result["looks"]) == (COUNT + 1, int(comes))
+        looks = [] if meanwhile == "deleted" else [look.name for look in lab.looks("both8000")]
+        assert (look_of("both8000", 8001).id.rpartition("/")[2] in looks) == comes
+        assert runtime.engine.maps.verify("lab").ok
 
 
 @pytest.mark.thorough

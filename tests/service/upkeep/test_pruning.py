@@ -89,6 +89,7 @@ def test_of_a_stop_further_looks_go_and_the_first_stays(server: Server) -> None:
     assert not {f"p{n}" for n in range(13, 52)} & set(left)
 
 
+@pytest.mark.thorough
 def test_pruning_what_cannot_be_pruned(server: Server) -> None:
     server.create_map("sparse", encoder=COARSE, same_place_radius=0.5)
     enrol_frames(server, "sparse", [jpeg(n) for n in range(3)], sequence="monday")

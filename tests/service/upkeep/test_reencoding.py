@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
+from core.frames.images import decode
+from core.maps import Enrolment, MapSettings
+from core.places import PlaceFields, look_address
+from service.engine.engine import Engine
+from service.jobs.context import JobContext
+from service.upkeep import reencoding
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder, install_two_stage_encoder
+from tests.service.engines import ENCODER, end_of, runtime_at
 from tests.service.map_jobs import asked, enrol_many, finished, places, reaching
-from tests.service.scenes import encoded, jpeg, scene, seen_again
-from tests.service.server import Server, assert_problem, text
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem, text, typed
 
 PLACES = 6
 
@@ -110,6 +121,73 @@ def test_frames_in_which_the_new_encoder_finds_nothing_are_listed(server: Server
     assert server.enrol("dim", "clear", jpeg(1)).status_code == 201
     empty = finished(server, start(server, "dim", "dim-2", COARSE))
     assert empty["result"]["places"] + empty["result"]["left_out"]["count"] == 1
+
+
+def hidden() -> bytes:
+    """A frame that shows something in one spot alone."""
+    frame = blank(320, 240)
+    frame[100:120, 150:170] = 190
+    return encoded(frame, ".png")
+
+
+def test_a_place_that_is_left_out_takes_its_looks_along(server: Server) -> None:
+    server.create_map("spotted", encoder="m-region-vlad-thesis", keep="image")
+    server.client.put("/v1/maps/spotted/cameras/front", json={})
+    for number in range(3):
+        assert server.enrol("spotted", f"p{number}", jpeg(number)).status_code == 201
+    assert server.enrol("spotted", "spot", hidden(), camera="front").status_code == 201
+    for place, seed in (("spot", 71), ("p1", 72)):
+        path = f"/v1/maps/spotted/places/{place}/looks"
+        assert server.client.post(path, content=jpeg(seed), headers=typed(jpeg(seed))).status_code == 201
+    mask = {"polygons": [[[0.3, 0.3], [0.7, 0.3], [0.7, 0.7], [0.3, 0.7]]]}  # from now on the spot is hidden
+    assert server.client.put("/v1/maps/spotted/cameras/front", json={"mask": mask}).status_code == 200
+    done = finished(server, start(server, "spotted", "spotted-2", COARSE))
+    assert done["state"] == "succeeded", done
+    assert done["result"]["places"] == 3
+    assert [place["id"] for place in done["result"]["left_out"]["places"]] == ["spot"]
+    assert [look["place"] for look in server.client.get("/v1/maps/spotted-2/looks").json()["items"]] == ["p1"]
+
+
+def test_looks_follow_a_place_that_changes_while_its_map_is_re_encoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new frame of a place makes the job encode it again, and its looks with it, in the same round."""
+    frames = {"first": jpeg(1), "second": jpeg(2), "empty": encoded(blank()), "look": jpeg(71)}
+
+    def stored(place_id: str, shown: str) -> Enrolment:
+        digest = hashlib.sha256(frames[shown]).digest()
+        name = look_address(place_id, digest.hex()[:16]) if shown == "look" else place_id
+        return Enrolment(name, PlaceFields(), np.ones(8, np.float32), 1, digest, image=frames[shown])
+
+    def encode(engine: Engine, _context: Any, identity: str, files: Sequence[bytes], _masks: Any) -> list[Any]:
+        encoder = engine.catalogue.get(identity)
+        return [SimpleNamespace(encoding=encoder.encode(decode(data))) for data in files]
+
+    monkeypatch.setattr(reencoding, "encode_after_requests", encode)  # without the queue of an event loop
+    with runtime_at(tmp_path) as runtime:
+        source = runtime.engine.maps.create("old", ENCODER, 8, MapSettings(keep="image"))
+        source.enrol([stored("p", "first"), stored("p", "look")])
+        identity = runtime.engine.catalogue.resolve("m-region-vlad-thesis")
+
+        def work(context: JobContext) -> dict[str, Any]:
+            job = reencoding._Reencoding(runtime.engine, context, "new", identity)
+            found = []
+            for shown in ("first", "second", "empty", "first"):
+                source.enrol([stored("p", shown)])
+                job._catch_up()
+                made = [one.digest.hex() for one in job.made.transfer.outline(looks=True)]
+                found.append([job._is_up_to_date(), made, list(job.left_out)])
+            return {"found": found}
+
+        done = end_of(runtime, runtime.jobs.submit("test", "old", work))
+        first, second, look = (hashlib.sha256(frames[name]).hexdigest() for name in ("first", "second", "look"))
+        assert done.result is not None, done
+        assert done.result["found"] == [
+            [True, [first, look], []],
+            [True, [second, look], []],
+            [True, [], ["p"]],
+            [True, [first, look], []],
+        ]
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, Unpack
 from placerec_client import models, parameters
 from placerec_client._async.concurrency import sleep
 from placerec_client._async.connection import AsyncConnection
-from placerec_client._async.jobs import AsyncJobs
+from placerec_client._async.jobs import AsyncJob, AsyncJobs
 from placerec_client._async.keys import AsyncKeys
 from placerec_client._async.maps import AsyncMaps
 from placerec_client._http import httpx
@@ -60,6 +60,7 @@ class AsyncClient:
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
         encoders: its encoders; iterated, their definitions.
         keys: its keys.
+        backups: of all its maps, which it makes by itself.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class AsyncClient:
         self.jobs = AsyncJobs(connection)
         self.encoders = AsyncEncoders(connection)
         self.keys = AsyncKeys(connection)
+        self.backups = AsyncBackups(connection)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.connection.state}>"
@@ -129,7 +131,7 @@ class AsyncClient:
             models.SeveralAnswer,
             "POST",
             "/v1/query",
-            params=options,
+            params={**options, "format": None},
             content=content,
             media_type=kind,
             deadline=deadline,
@@ -250,6 +252,14 @@ class AsyncClient:
         """Return what the service is doing: its queue, latencies, memory, disk and limits, and what this key may do."""
         return await self.connection.ask(models.ServiceState, "GET", "/v1/service")
 
+    async def history(self, hours: float = 24.0) -> models.LoadView:
+        """Return the answers, latencies, memory and disk of the service in each of the last minutes, in columns."""
+        return await self.connection.ask(models.LoadView, "GET", "/v1/service/history", params={"hours": hours})
+
+    async def fleet(self) -> models.FleetState:
+        """Return where the robots of all maps are, how long they have been lost, and the answers of each hour."""
+        return await self.connection.ask(models.FleetState, "GET", "/v1/fleet")
+
     async def own_key(self) -> models.OwnKey:
         """Return what the key of this client may do."""
         return await self.connection.ask(models.OwnKey, "GET", "/v1/key")
@@ -271,6 +281,26 @@ class AsyncClient:
         return await self.connection.ask(
             model, "POST", path, params=options, content=data, media_type=media_type(data), deadline=deadline
         )
+
+
+class AsyncBackups:
+    """The backups of all maps that a service makes by itself. They need the role admin."""
+
+    def __init__(self, connection: AsyncConnection) -> None:
+        self._connection, self._path = connection, "/v1/backups"
+
+    async def list(self) -> models.BackupList:
+        """Return the backups that there are, their schedule, and when the next one is made."""
+        return await self._connection.ask(models.BackupList, "GET", self._path)
+
+    async def schedule(self, hours: float | None, keep: int = 7) -> models.BackupList:
+        """Say how often all maps are saved (None: only by request), and how many backups are kept."""
+        order = {"hours": hours, "keep": keep}
+        return await self._connection.ask(models.BackupList, "PUT", self._path + "/schedule", json=order)
+
+    async def create(self) -> AsyncJob:
+        """Save all maps now; the job does it."""
+        return await AsyncJob.submit(self._connection, self._path)
 
 
 class AsyncEncoders:

@@ -6,10 +6,10 @@ import asyncio
 import socket
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from concurrent.futures import Future
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias, TypeVar
 
 from placerec_client._http import httpx
 
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
 
 Result = TypeVar("Result")
+
+PathWithin: TypeAlias = Callable[[float | None], Awaitable[str]]
+"""Finds a path within seconds; None is any time."""
 
 
 async def sleep(seconds: float) -> None:
@@ -95,6 +98,16 @@ async def _addresses(host: str, port: int, timeout: float | None) -> list[str]:
         raise httpx.ConnectTimeout(f"The name {host} was not looked up in time.") from error
     except OSError as error:
         raise httpx.ConnectError(str(error)) from error
+
+
+class Begun:
+    """Begins when it is awaited, once, and is the result."""
+
+    async def _begun(self) -> Self:
+        raise NotImplementedError
+
+    def __await__(self) -> Generator[Any, None, Self]:
+        return self._begun().__await__()
 
 
 class Task(Generic[Result]):

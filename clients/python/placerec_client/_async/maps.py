@@ -13,7 +13,7 @@ from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.enrolment import AsyncEnrolment, enrol_by_job
 from placerec_client._async.following import follow
 from placerec_client._async.jobs import AsyncJob
-from placerec_client._async.places import AsyncPlaces
+from placerec_client._async.places import AsyncPlaces, AsyncRecordings
 from placerec_client._async.review import AsyncReview
 from placerec_client._async.sessions import AsyncSessions
 from placerec_client._async.transfers import Progress, export, upload
@@ -87,6 +87,9 @@ class AsyncMaps(Subscripted):
             id: of the new map; the file's own if left out.
             encoder: name or identity that the map must have.
             progress: is called with the bytes sent and their number, and may be called again from the beginning.
+
+        Raises:
+            MapExists: there is a map of this id; nothing was sent, unless somebody made it meanwhile.
         """
         return await upload(self._connection.lasting(TRANSFER_PATIENCE), path, id, encoder, progress)
 
@@ -102,6 +105,7 @@ class AsyncMap:
         cameras: its cameras.
         sessions: its sessions.
         review: frames of queries that it keeps for review.
+        recordings: bags that are uploaded to be enrolled.
     """
 
     def __init__(self, connection: AsyncConnection, map_id: str) -> None:
@@ -114,6 +118,7 @@ class AsyncMap:
         self.cameras = AsyncCameras(connection, self.path)
         self.sessions = AsyncSessions(connection, self.path)
         self.review = AsyncReview(connection, self.path)
+        self.recordings = AsyncRecordings(connection, self.path)
         self._query = self.path + "/query"
 
     def __repr__(self) -> str:
@@ -171,6 +176,18 @@ class AsyncMap:
         """Return where all places are, column by column: made for maps of many places."""
         return await self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
 
+    async def coverage(self, **options: Unpack[parameters.CheckCoverage]) -> models.CoverageView:
+        """Return whether a pose is in the map, and how well: the places, traverses and looks around it.
+
+        ::
+
+            assert (await lab.coverage(x=4.0, y=1.5, heading=90)).state == "covered"
+
+        Args:
+            options: ``x`` and ``y``, or ``latitude`` and ``longitude``; ``heading``; ``k``, how many places to list.
+        """
+        return await self.connection.ask(models.CoverageView, "GET", self.path + "/coverage", params=options)
+
     async def compare(self, query: str, reference: str) -> models.SimilarityView:
         """Compare two traverses by frames: the shared stretches, and the size and scale of their matrix of scores."""
         params = {"query": query, "reference": reference}
@@ -210,13 +227,44 @@ class AsyncMap:
         response = await self.connection.request(
             "POST",
             self._query,
-            params=options,
+            params={**options, "format": None},
             content=data,
             media_type=media_type(data),
             deadline=deadline,
             request_id=request_id,
         )
         return parsed(models.QueryAnswer, response.content)
+
+    async def geopose(
+        self,
+        frame: Frame,
+        *,
+        angles: bool = False,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.Query],
+    ) -> models.GeoPose:
+        """Ask where a frame was taken, and return the answer as an OGC GeoPose.
+
+        Args:
+            frame, deadline, request_id, options: as of ``query``.
+            angles: yaw, pitch and roll instead of a quaternion.
+
+        Raises:
+            NotLocalized: the frame was not recognized.
+            NoGeopose: the map is in metres, or its places have no headings.
+        """
+        data = frame_bytes(frame)
+        return await self.connection.ask(
+            models.GeoPose,
+            "POST",
+            self._query,
+            params={**options, "format": "geopose-ypr" if angles else "geopose"},
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
 
     async def query_batch(
         self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]
@@ -437,6 +485,14 @@ class AsyncMap:
     async def rebuild(self) -> AsyncJob:
         """Rebuild the search index of the map, by a job."""
         return await self._job(self.path + "/rebuild")
+
+    async def erase(self, **options: Unpack[parameters.Erasing]) -> AsyncJob:
+        """Erase frames for good, by a job: places and looks by ``ids`` or ``filter``, or what a ``session`` has sent.
+
+        Their pictures, descriptors and keypoints are overwritten, and frames for review and answers about them go.
+        Without options it erases what places that were deleted before have left.
+        """
+        return await self._job(self.path + "/erase", json=fields(options))
 
     async def keypoints(self) -> AsyncJob:
         """Find the keypoints of places that have none, by a job."""

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from operator import index
 
 from placerec_client import models, parameters, problems
-from placerec_client._async.concurrency import Lock, acquire
+from placerec_client._async.concurrency import Lock, PathWithin, acquire
 from placerec_client._async.connection import AsyncConnection
 from placerec_client.answers import OVERLOADED
 from placerec_client.errors import DeadlineExceeded, InvalidParameter, Problem
@@ -20,13 +20,17 @@ class AsyncNumbering:
 
     Args:
         connection: to the service.
-        path: of the session.
+        begun: returns the path of the session within the seconds that it gets, having begun the session if need be.
         first: the next number; None for a session that was begun elsewhere, whose last number is requested.
     """
 
-    def __init__(self, connection: AsyncConnection, path: str, first: int | None) -> None:
-        self._connection, self._path, self._next = connection, path, first
+    def __init__(self, connection: AsyncConnection, begun: PathWithin, first: int | None) -> None:
+        self._connection, self._begun, self._next = connection, begun, first
         self._lock = Lock()
+
+    def restart(self) -> None:
+        """Count from 0 again, for another session has begun."""
+        self._next = 0
 
     @asynccontextmanager
     async def turn(self, deadline: float | None) -> AsyncIterator[Callable[[], float | None]]:
@@ -59,7 +63,7 @@ class AsyncNumbering:
         finally:
             self._lock.release()
 
-    async def number(self, options: parameters.SendFrame, left: float | None) -> parameters.SendFrame:
+    async def number(self, options: parameters.SendFrame, left: Callable[[], float | None]) -> parameters.SendFrame:
         """Return the options of a frame with its number: the caller's own, or the next one.
 
         Raises:
@@ -67,9 +71,10 @@ class AsyncNumbering:
             DeadlineExceeded: the service did not send its last number within the seconds that were left.
         """
         given = options.get("frame")
+        path = await self._begun(left())
         if given is None:
             if self._next is None:
-                report = await self._connection.ask(models.SessionReport, "GET", self._path, deadline=left)
+                report = await self._connection.ask(models.SessionReport, "GET", path, deadline=left())
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import os
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Unpack
 
 from placerec_client import models, parameters, problems
+from placerec_client._async.concurrency import in_thread
 from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.jobs import AsyncJob
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.renamed import OldNames
 from placerec_client.requests import fields, path_of
@@ -155,9 +159,94 @@ class AsyncPlaces(OldNames, forget="delete", forget_many="delete_many"):
             if not problem.after_loss:
                 raise
 
-    async def delete_learnt_looks(self, run: str) -> models.RemovedLooks:
-        """Remove all looks that were learnt from one run."""
-        return await self._connection.ask(models.RemovedLooks, "DELETE", self._looks, params={"run": run})
+    async def delete_learnt_looks(self, **options: Unpack[parameters.DeleteLearntLooks]) -> models.RemovedLooks:
+        """Remove the looks that were learnt from one run, or in a period, or both; those that people added stay.
+
+        With a run and no period all else that the map has learnt from it goes, too: its places of new ground, and its
+        answers by which the map calibrates itself.
+
+        Args:
+            options: ``run``, from which they were learnt; ``since`` and ``until``, when they were added.
+        """
+        return await self._connection.ask(models.RemovedLooks, "DELETE", self._looks, params=dict(options))
 
     def _of(self, place_id: str) -> str:
         return path_of(place_id, below=self._path)
+
+
+PIECE_BYTES = 16 << 20
+"""Bytes of one request of an upload: they are in memory at one time, and sent again if the connection breaks."""
+
+
+class AsyncRecordings:
+    """Bags that are uploaded into a map, a file each, and enrolled by a job."""
+
+    def __init__(self, connection: AsyncConnection, path: str) -> None:
+        self._connection, self._path = connection, path
+
+    def _of(self, name: str) -> str:
+        return path_of("recordings", name, below=self._path)
+
+    async def size(self, name: str) -> int:
+        """Return how many bytes of a bag have arrived."""
+        return (await self._connection.ask(models.RecordingView, "GET", self._of(name))).bytes
+
+    async def upload(
+        self,
+        file: str | os.PathLike[str],
+        name: str | None = None,
+        *,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> str:
+        """Upload a bag, from where an upload before this one has ended; return its name.
+
+        Args:
+            file: a file of a rosbag2 (``.mcap``, ``.db3``) or a ROS 1 ``.bag``.
+            name: under which it is uploaded; that of the file if left out.
+            progress: is called with the bytes that are through, and their number.
+
+        Raises:
+            RecordingOffset: another upload of this name is under way.
+            OSError: the file cannot be read.
+        """
+        path = Path(file)
+        name, total = path.name if name is None else name, (await in_thread(path.stat)).st_size
+        at = await self.size(name)
+        while at < total:
+            piece = await in_thread(_piece, path, at)
+            try:
+                view = await self._connection.ask(
+                    models.RecordingView,
+                    "PUT",
+                    self._of(name),
+                    params={"offset": at},
+                    content=piece,
+                    media_type="application/octet-stream",
+                )
+                at = view.bytes
+            except problems.RecordingOffset:
+                here = await self.size(name)
+                if here <= at:
+                    raise
+                at = here  # it had arrived, and its answer was lost
+            if progress is not None:
+                progress(at, total)
+        return name
+
+    async def enrol(self, name: str, **options: Unpack[parameters.RecordingOrder]) -> AsyncJob:
+        """Enrol the frames of a bag that has arrived; it is removed when the job has succeeded.
+
+        Args:
+            options: such as ``sequence``, ``topic``, ``pose_topic``, ``every_metres``, ``keep_standing``.
+        """
+        return await AsyncJob.submit(self._connection, self._of(name), json=dict(options))
+
+    async def delete(self, name: str) -> None:
+        """Remove what has arrived of a bag."""
+        await self._connection.request("DELETE", self._of(name))
+
+
+def _piece(path: Path, at: int) -> bytes:
+    with path.open("rb") as opened:
+        opened.seek(at)
+        return opened.read(PIECE_BYTES)

@@ -7,6 +7,7 @@ from typing import Unpack
 
 from placerec_client import models, parameters
 from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.jobs import AsyncJob
 from placerec_client.requests import path_of
 
 
@@ -33,6 +34,18 @@ class AsyncReview:
         """Return the file of a frame."""
         path = path_of(frame, "picture", below=self._path)
         return (await self._connection.request("GET", path)).content
+
+    async def stretches(self) -> Sequence[models.GroundStretchView]:
+        """Return the stretches of new ground that wait for review."""
+        return (await self._connection.ask(models.GroundStretchList, "GET", self._path + "/stretches")).items
+
+    async def accept_stretch(self, stretch: str) -> AsyncJob:
+        """Accept a stretch; the job makes its frames places of the map."""
+        return await AsyncJob.submit(self._connection, path_of("stretches", stretch, below=self._path))
+
+    async def reject_stretch(self, stretch: str) -> None:
+        """Reject a stretch: its frames are thrown away."""
+        await self._connection.request("DELETE", path_of("stretches", stretch, below=self._path))
 
     async def label(
         self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]

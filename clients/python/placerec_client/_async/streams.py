@@ -40,7 +40,11 @@ class AsyncStream:
     """
 
     def __init__(
-        self, connection: AsyncConnection, path: str, numbering: AsyncNumbering, closed: Callable[[float], object]
+        self,
+        connection: AsyncConnection,
+        path: Callable[[], str],
+        numbering: AsyncNumbering,
+        closed: Callable[[float], object],
     ) -> None:
         self._connection, self._path, self._numbering, self._closed = connection, path, numbering, closed
         self._socket: ClientConnection | None = None
@@ -88,7 +92,7 @@ class AsyncStream:
         moved = with_motion(options, odometry)
         data = frame_bytes(image)
         async with self._numbering.turn(deadline) as left:
-            numbered = await self._numbering.number(moved, left())
+            numbered = await self._numbering.number(moved, left)
             head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
             return await self._answer(head, data, Clock(left(), self._connection.retry))
 
@@ -135,7 +139,7 @@ class AsyncStream:
     async def _connected(self, limit: float) -> ClientConnection:
         headers = [(name.decode(), value.decode()) for name, value in self._connection.headers if name != b"Host"]
         headers.append(("X-Request-Id", uuid.uuid4().hex))
-        address = "ws" + self._connection.url.removeprefix("http") + self._path
+        address = "ws" + self._connection.url.removeprefix("http") + self._path()
         try:
             opening = connect(
                 address,

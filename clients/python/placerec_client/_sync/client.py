@@ -11,7 +11,7 @@ from placerec_client import models, parameters
 from placerec_client._http import httpx
 from placerec_client._sync.concurrency import sleep
 from placerec_client._sync.connection import Connection
-from placerec_client._sync.jobs import Jobs
+from placerec_client._sync.jobs import Job, Jobs
 from placerec_client._sync.keys import Keys
 from placerec_client._sync.maps import Maps
 from placerec_client.answers import OVERLOADED
@@ -61,6 +61,7 @@ class Client:
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
         encoders: its encoders; iterated, their definitions.
         keys: its keys.
+        backups: of all its maps, which it makes by itself.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Client:
         self.jobs = Jobs(connection)
         self.encoders = Encoders(connection)
         self.keys = Keys(connection)
+        self.backups = Backups(connection)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.connection.state}>"
@@ -130,7 +132,7 @@ class Client:
             models.SeveralAnswer,
             "POST",
             "/v1/query",
-            params=options,
+            params={**options, "format": None},
             content=content,
             media_type=kind,
             deadline=deadline,
@@ -251,6 +253,14 @@ class Client:
         """Return what the service is doing: its queue, latencies, memory, disk and limits, and what this key may do."""
         return self.connection.ask(models.ServiceState, "GET", "/v1/service")
 
+    def history(self, hours: float = 24.0) -> models.LoadView:
+        """Return the answers, latencies, memory and disk of the service in each of the last minutes, in columns."""
+        return self.connection.ask(models.LoadView, "GET", "/v1/service/history", params={"hours": hours})
+
+    def fleet(self) -> models.FleetState:
+        """Return where the robots of all maps are, how long they have been lost, and the answers of each hour."""
+        return self.connection.ask(models.FleetState, "GET", "/v1/fleet")
+
     def own_key(self) -> models.OwnKey:
         """Return what the key of this client may do."""
         return self.connection.ask(models.OwnKey, "GET", "/v1/key")
@@ -272,6 +282,26 @@ class Client:
         return self.connection.ask(
             model, "POST", path, params=options, content=data, media_type=media_type(data), deadline=deadline
         )
+
+
+class Backups:
+    """The backups of all maps that a service makes by itself. They need the role admin."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._path = connection, "/v1/backups"
+
+    def list(self) -> models.BackupList:
+        """Return the backups that there are, their schedule, and when the next one is made."""
+        return self._connection.ask(models.BackupList, "GET", self._path)
+
+    def schedule(self, hours: float | None, keep: int = 7) -> models.BackupList:
+        """Say how often all maps are saved (None: only by request), and how many backups are kept."""
+        order = {"hours": hours, "keep": keep}
+        return self._connection.ask(models.BackupList, "PUT", self._path + "/schedule", json=order)
+
+    def create(self) -> Job:
+        """Save all maps now; the job does it."""
+        return Job.submit(self._connection, self._path)
 
 
 class Encoders:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from placerec_client._http import httpx
 
 Result = TypeVar("Result")
+
+PathWithin: TypeAlias = Callable[[float | None], str]
+"""Finds a path within seconds; None is any time."""
 
 END_SECONDS = 10.0
 """How long work that is broken off is waited for: a thread cannot be stopped, but its request has an end."""
@@ -41,6 +44,10 @@ def within(seconds: float, work: Callable[[], Result]) -> Result:
 def interruptible(transport: httpx.HTTPTransport) -> httpx.HTTPTransport:
     """A transport as it is: here ``within`` does not wait for it."""
     return transport
+
+
+class Begun:
+    """Nothing here: what the asynchronous half awaits to begin it begins at its first call."""
 
 
 class Task(Generic[Result]):

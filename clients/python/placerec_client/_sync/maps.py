@@ -14,7 +14,7 @@ from placerec_client._sync.connection import Connection
 from placerec_client._sync.enrolment import Enrolment, enrol_by_job
 from placerec_client._sync.following import follow
 from placerec_client._sync.jobs import Job
-from placerec_client._sync.places import Places
+from placerec_client._sync.places import Places, Recordings
 from placerec_client._sync.review import Review
 from placerec_client._sync.sessions import Sessions
 from placerec_client._sync.transfers import Progress, export, upload
@@ -88,6 +88,9 @@ class Maps(Subscripted):
             id: of the new map; the file's own if left out.
             encoder: name or identity that the map must have.
             progress: is called with the bytes sent and their number, and may be called again from the beginning.
+
+        Raises:
+            MapExists: there is a map of this id; nothing was sent, unless somebody made it meanwhile.
         """
         return upload(self._connection.lasting(TRANSFER_PATIENCE), path, id, encoder, progress)
 
@@ -103,6 +106,7 @@ class Map:
         cameras: its cameras.
         sessions: its sessions.
         review: frames of queries that it keeps for review.
+        recordings: bags that are uploaded to be enrolled.
     """
 
     def __init__(self, connection: Connection, map_id: str) -> None:
@@ -115,6 +119,7 @@ class Map:
         self.cameras = Cameras(connection, self.path)
         self.sessions = Sessions(connection, self.path)
         self.review = Review(connection, self.path)
+        self.recordings = Recordings(connection, self.path)
         self._query = self.path + "/query"
 
     def __repr__(self) -> str:
@@ -172,6 +177,18 @@ class Map:
         """Return where all places are, column by column: made for maps of many places."""
         return self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
 
+    def coverage(self, **options: Unpack[parameters.CheckCoverage]) -> models.CoverageView:
+        """Return whether a pose is in the map, and how well: the places, traverses and looks around it.
+
+        ::
+
+            assert (lab.coverage(x=4.0, y=1.5, heading=90)).state == "covered"
+
+        Args:
+            options: ``x`` and ``y``, or ``latitude`` and ``longitude``; ``heading``; ``k``, how many places to list.
+        """
+        return self.connection.ask(models.CoverageView, "GET", self.path + "/coverage", params=options)
+
     def compare(self, query: str, reference: str) -> models.SimilarityView:
         """Compare two traverses by frames: the shared stretches, and the size and scale of their matrix of scores."""
         params = {"query": query, "reference": reference}
@@ -211,13 +228,44 @@ class Map:
         response = self.connection.request(
             "POST",
             self._query,
-            params=options,
+            params={**options, "format": None},
             content=data,
             media_type=media_type(data),
             deadline=deadline,
             request_id=request_id,
         )
         return parsed(models.QueryAnswer, response.content)
+
+    def geopose(
+        self,
+        frame: Frame,
+        *,
+        angles: bool = False,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.Query],
+    ) -> models.GeoPose:
+        """Ask where a frame was taken, and return the answer as an OGC GeoPose.
+
+        Args:
+            frame, deadline, request_id, options: as of ``query``.
+            angles: yaw, pitch and roll instead of a quaternion.
+
+        Raises:
+            NotLocalized: the frame was not recognized.
+            NoGeopose: the map is in metres, or its places have no headings.
+        """
+        data = frame_bytes(frame)
+        return self.connection.ask(
+            models.GeoPose,
+            "POST",
+            self._query,
+            params={**options, "format": "geopose-ypr" if angles else "geopose"},
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
 
     def query_batch(self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]) -> Generator[Located]:
         """Ask where many frames were taken; yield the answers in their order.
@@ -432,6 +480,14 @@ class Map:
     def rebuild(self) -> Job:
         """Rebuild the search index of the map, by a job."""
         return self._job(self.path + "/rebuild")
+
+    def erase(self, **options: Unpack[parameters.Erasing]) -> Job:
+        """Erase frames for good, by a job: places and looks by ``ids`` or ``filter``, or what a ``session`` has sent.
+
+        Their pictures, descriptors and keypoints are overwritten, and frames for review and answers about them go.
+        Without options it erases what places that were deleted before have left.
+        """
+        return self._job(self.path + "/erase", json=fields(options))
 
     def keypoints(self) -> Job:
         """Find the keypoints of places that have none, by a job."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from operator import index
 
 from placerec_client import models, parameters, problems
-from placerec_client._sync.concurrency import Lock, acquire
+from placerec_client._sync.concurrency import Lock, PathWithin, acquire
 from placerec_client._sync.connection import Connection
 from placerec_client.answers import OVERLOADED
 from placerec_client.errors import DeadlineExceeded, InvalidParameter, Problem
@@ -21,13 +21,17 @@ class Numbering:
 
     Args:
         connection: to the service.
-        path: of the session.
+        begun: returns the path of the session within the seconds that it gets, having begun the session if need be.
         first: the next number; None for a session that was begun elsewhere, whose last number is requested.
     """
 
-    def __init__(self, connection: Connection, path: str, first: int | None) -> None:
-        self._connection, self._path, self._next = connection, path, first
+    def __init__(self, connection: Connection, begun: PathWithin, first: int | None) -> None:
+        self._connection, self._begun, self._next = connection, begun, first
         self._lock = Lock()
+
+    def restart(self) -> None:
+        """Count from 0 again, for another session has begun."""
+        self._next = 0
 
     @contextmanager
     def turn(self, deadline: float | None) -> Iterator[Callable[[], float | None]]:
@@ -60,7 +64,7 @@ class Numbering:
         finally:
             self._lock.release()
 
-    def number(self, options: parameters.SendFrame, left: float | None) -> parameters.SendFrame:
+    def number(self, options: parameters.SendFrame, left: Callable[[], float | None]) -> parameters.SendFrame:
         """Return the options of a frame with its number: the caller's own, or the next one.
 
         Raises:
@@ -68,9 +72,10 @@ class Numbering:
             DeadlineExceeded: the service did not send its last number within the seconds that were left.
         """
         given = options.get("frame")
+        path = self._begun(left())
         if given is None:
             if self._next is None:
-                report = self._connection.ask(models.SessionReport, "GET", self._path, deadline=left)
+                report = self._connection.ask(models.SessionReport, "GET", path, deadline=left())
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
             given = self._next

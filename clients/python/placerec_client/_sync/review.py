@@ -8,6 +8,7 @@ from typing import Unpack
 
 from placerec_client import models, parameters
 from placerec_client._sync.connection import Connection
+from placerec_client._sync.jobs import Job
 from placerec_client.requests import path_of
 
 
@@ -34,6 +35,18 @@ class Review:
         """Return the file of a frame."""
         path = path_of(frame, "picture", below=self._path)
         return (self._connection.request("GET", path)).content
+
+    def stretches(self) -> Sequence[models.GroundStretchView]:
+        """Return the stretches of new ground that wait for review."""
+        return (self._connection.ask(models.GroundStretchList, "GET", self._path + "/stretches")).items
+
+    def accept_stretch(self, stretch: str) -> Job:
+        """Accept a stretch; the job makes its frames places of the map."""
+        return Job.submit(self._connection, path_of("stretches", stretch, below=self._path))
+
+    def reject_stretch(self, stretch: str) -> None:
+        """Reject a stretch: its frames are thrown away."""
+        self._connection.request("DELETE", path_of("stretches", stretch, below=self._path))
 
     def label(
         self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]

@@ -10,10 +10,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self, Unpack
 
 from placerec_client import models, parameters, problems
-from placerec_client._sync.concurrency import within
+from placerec_client._sync.concurrency import Begun, within
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.numbering import Numbering
-from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.odometry import Odometry, with_motion
 from placerec_client.renamed import OldNames, Subscripted
@@ -46,16 +45,20 @@ class Sessions(Subscripted):
                 yield item
 
     def begin(self, **options: Unpack[parameters.NewSession]) -> Session:
-        """Return a session that begins when it is entered, and ends when it is left.
+        """Return a session that begins when it is entered, or at its first call, and ends when it is left.
 
         Entered once more, it is another one. Leaving takes a second at most, together with a stream in it, and raises
         nothing: of a session that the service did not end in that time the log ``placerec_client`` has a warning, and
-        it ends by itself after ``expires_after``.
+        it ends by itself after ``expires_after``. One that is not entered is ended by its ``delete``.
 
         ::
 
             with lab.sessions.begin() as session:
                 answer = session.send(frame)
+
+            session = lab.sessions.begin()
+            answer = session.send(frame)
+            session.delete()
 
         Args:
             options: such as ``advance``, ``lag``, ``camera``, ``verify``, ``expires_after``.
@@ -63,8 +66,9 @@ class Sessions(Subscripted):
         return Session(self._connection, self._path, options)
 
 
-class Session(OldNames, end="delete"):
-    """One session of one robot. Its frames are sent one after the other, also by ``asyncio.gather`` or several threads.
+class Session(OldNames, Begun, end="delete"):
+    """One session of one robot. It begins once, and its frames are sent one after the other, also by
+    ``asyncio.gather`` or several threads.
 
     Attributes:
         id: of the session; empty before it has begun.
@@ -81,18 +85,24 @@ class Session(OldNames, end="delete"):
         self._connection, self._sessions, self._options = connection, path, options
         self.id = session_id or ""
         self.view: models.SessionView | None = None
-        self._numbering = None
         self._is_over = False
         self._closing = 0.0  # seconds that closing its last stream took
         if session_id is not None:
-            self._numbering = Numbering(connection, path_of(session_id, below=path), None)
+            path_of(session_id)  # which refuses what is no name
+        self._numbering = Numbering(connection, self._begun_path, 0 if session_id is None else None)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.id!r})"
+        return f"{type(self).__name__}({self.id!r})" if self.id else f"<{type(self).__name__}, not begun>"
 
     def __enter__(self) -> Self:
-        if self._options is not None and (self._numbering is None or self._is_over):
-            self.begin()
+        if self._options is not None and self._is_over:
+            return self.begin()
+        return self._begun()
+
+    def _begun(self) -> Self:
+        if not self.id:
+            with self._numbering.turn(None):
+                self._begun_path(None)
         return self
 
     def __exit__(
@@ -117,20 +127,36 @@ class Session(OldNames, end="delete"):
 
         If the answer to an attempt is lost, the next one gets the session that it has begun.
         """
-        self.view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options or {})
-        self.id = self.view.id
-        self._numbering = Numbering(self._connection, path_of(self.id, below=self._sessions), 0)
-        self._is_over = False
+        with self._numbering.turn(None):
+            self._begin(None)
+            self._numbering.restart()
         return self
 
+    def _begin(self, left: float | None) -> None:
+        """Begin the session, within these seconds; it has to be the turn of who calls it."""
+        self.view = self._connection.ask(
+            models.SessionView, "POST", self._sessions, json=self._options or {}, deadline=left
+        )
+        self.id = self.view.id
+        self._is_over = False
+
+    def _begun_path(self, left: float | None) -> str:
+        """The path of the session, which begins now if it has not begun; it has to be the turn of who calls it."""
+        if not self.id:
+            self._begin(left)
+        return self.path
+
     def delete(self) -> None:
-        """Delete the session, for the run is over; one that is gone already is no error."""
+        """Delete the session, for the run is over; one that is gone already, or never began, is no error."""
+        if not self.id:
+            return
         with suppress(problems.UnknownSession, problems.SessionExpired):
             self._connection.request("DELETE", self.path)
         self._is_over = True
 
     def read(self) -> models.SessionReport:
         """Return the session and the present belief about where its robot is."""
+        self._begun()
         return self._connection.ask(models.SessionReport, "GET", self.path)
 
     def send(
@@ -160,9 +186,8 @@ class Session(OldNames, end="delete"):
         """
         moved = with_motion(options, odometry)
         data = frame_bytes(image)
-        numbering = self._numbers()
-        with numbering.turn(deadline) as left:
-            numbered = numbering.number(moved, left())
+        with self._numbering.turn(deadline) as left:
+            numbered = self._numbering.number(moved, left)
             return self._connection.ask(
                 models.SessionAnswer,
                 "POST",
@@ -186,21 +211,12 @@ class Session(OldNames, end="delete"):
         """
         from placerec_client._sync.streams import Stream
 
-        return Stream(self._connection, self.path + "/stream", self._numbers(), self._stream_closed)
+        return Stream(self._connection, lambda: self.path + "/stream", self._numbering, self._stream_closed)
 
     def _stream_closed(self, seconds: float) -> None:
         self._closing = seconds
 
-    def _numbers(self) -> Numbering:
-        if self._numbering is None:
-            raise PlacerecError(
-                "The session has not begun: sessions.begin() only describes it. It begins when it is entered, as in "
-                "`with lab.sessions.begin() as session:`, or by session.begin()."
-            )
-        return self._numbering
-
     @property
     def path(self) -> str:
-        """The path of the session at the service."""
-        self._numbers()
+        """The path of the session at the service; it has to have begun."""
         return path_of(self.id, below=self._sessions)

@@ -41,7 +41,11 @@ class Stream:
     """
 
     def __init__(
-        self, connection: Connection, path: str, numbering: Numbering, closed: Callable[[float], object]
+        self,
+        connection: Connection,
+        path: Callable[[], str],
+        numbering: Numbering,
+        closed: Callable[[float], object],
     ) -> None:
         self._connection, self._path, self._numbering, self._closed = connection, path, numbering, closed
         self._socket: ClientConnection | None = None
@@ -89,7 +93,7 @@ class Stream:
         moved = with_motion(options, odometry)
         data = frame_bytes(image)
         with self._numbering.turn(deadline) as left:
-            numbered = self._numbering.number(moved, left())
+            numbered = self._numbering.number(moved, left)
             head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
             return self._answer(head, data, Clock(left(), self._connection.retry))
 
@@ -136,7 +140,7 @@ class Stream:
     def _connected(self, limit: float) -> ClientConnection:
         headers = [(name.decode(), value.decode()) for name, value in self._connection.headers if name != b"Host"]
         headers.append(("X-Request-Id", uuid.uuid4().hex))
-        address = "ws" + self._connection.url.removeprefix("http") + self._path
+        address = "ws" + self._connection.url.removeprefix("http") + self._path()
         try:
             opening = connect(
                 address,

@@ -13,9 +13,9 @@ from placerec_client._http import httpx
 from placerec_client._sync.concurrency import in_thread
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.jobs import Job
-from placerec_client.archives import check_archive, digest_of, partial_tag
+from placerec_client.archives import check_archive, digest_of, map_id_of, partial_tag
 from placerec_client.errors import TransferFailed
-from placerec_client.requests import query_string
+from placerec_client.requests import path_of, query_string
 
 PIECE_BYTES = 16 << 20
 """Bytes of one request of a download: they are in memory at one time, and lost if the connection breaks."""
@@ -130,6 +130,7 @@ def upload(
 ) -> Job:
     """Upload the file of a map; see ``Maps.import_``."""
     file = _file(path)
+    _check_free(connection, map_id or in_thread(map_id_of, file))
     try:
         size = file.stat().st_size
         digest = in_thread(digest_of, file)
@@ -154,6 +155,24 @@ def upload(
         media_type="application/x-tar",
         headers=headers,
     )
+
+
+def _check_free(connection: Connection, map_id: str | None) -> None:
+    """Ask whether there is a map of this id, before the file of one is sent in vain.
+
+    Raises:
+        MapExists: there is one.
+    """
+    if map_id is None:
+        return
+    try:
+        connection.request("GET", path_of("maps", map_id))
+    except problems.UnknownMap:
+        return
+    except problems.MapQuarantined:
+        pass
+    kind = {"type": "urn:placerec:problem:map-exists", "title": "A map of this id already exists"}
+    raise problems.MapExists({**kind, "status": 409, "detail": f"There is a map {map_id!r} already."}, 409)
 
 
 def settle(partial: Path, path: Path) -> None:

@@ -13,13 +13,14 @@ import pytest
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
 from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive
+from core.places import look_address
 from core.storage import Atlas
 from core.storage.archives import unpacking
 from core.storage.archives.building import build
 from core.storage.archives.unpacking import layout_of
 from core.storage.files import segment_files as descriptors
 from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
-from tests.core.storage.frames import DIMENSION, ENCODER, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, digest_of, frame
 
 Made = Callable[[bytes], bytes]
 PLACES, FRAMES, PICTURES = "places-000001.jsonl", "descriptors-000001.bin", "pictures-000001.bin"
@@ -125,6 +126,10 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "keypoints of no frame": (raw(KEYPOINTS, lambda d: bytes(4) + d[4:]), "keypoints of place 'p0' cannot be taken"),
     "keypoints without descriptors": (raw(KEYPOINTS, lambda d: d[:12] + bytes(len(d) - 12)), "lacks a descriptor"),
     "endless keypoints": (raw(KEYPOINTS, lambda d: d + bytes(400_000)), "more bytes than the keypoints of 9 places"),
+    "a look that is its place": (
+        place(id=look_address("p0", digest_of("p0").hex()[:16]), digest=digest_of("p0").hex()),
+        "with which its place was enrolled",
+    ),
     "a track not listed": (place(track="sunday", station=1), "does not list"),
     "a track without a station": (place(track="monday"), "needs a station"),
     "a station without a track": (place(station=1), "needs a station"),

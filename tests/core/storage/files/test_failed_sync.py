@@ -88,6 +88,7 @@ def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Pa
     atlas.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("call", "before"), [("4", ["0"]), ("5", ["0", "1"])], ids=["deletion", "patch"])
 def test_a_change_that_was_refused_does_not_come_true_with_a_crash(
     directory: Path, call: str, before: list[str]

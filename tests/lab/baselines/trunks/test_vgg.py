@@ -39,6 +39,7 @@ def test_conv5_3_before_and_after_its_rectifier(rectified: bool) -> None:
     assert wanted.min() < -10
 
 
+@pytest.mark.thorough
 def test_it_is_the_network_of_the_paper() -> None:
     torch.manual_seed(0)
     widths = (4, 5, 6, 7, 8)

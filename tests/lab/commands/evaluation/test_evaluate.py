@@ -212,6 +212,7 @@ def test_a_cache_that_cannot_be_written_is_reported(
     assert "Nothing was cached" in placerec("evaluate", *words, "--cache", tmp_path / "file").stderr
 
 
+@pytest.mark.thorough
 def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
     words = ("--tolerance", 0, "--encoder", "fabmap")
     own, _ = evaluated(placerec, traverses, tmp_path, *words)

@@ -57,6 +57,7 @@ def test_traverses_come_in_natural_order_with_their_tolerance(tmp_path: Path) ->
     assert f"(188 queries and 188 references are missing in {tmp_path})" in pair.notes[0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "retained", "answerable"),
     [("gardens-point", 150, 153), ("synthesized-nordland", 1217, 1221)],

@@ -66,6 +66,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path, old: bool) -> None:
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.thorough
 def test_any_damage_is_a_clear_error(tmp_path: Path) -> None:
     """Cut anywhere, or with any byte changed, a file gives lists or is refused, and nothing else."""
     path, random = tmp_path / "t.npy", np.random.default_rng(5)
@@ -127,6 +128,7 @@ def test_a_table_says_its_line(tmp_path: Path) -> None:
             truths(read_table(0, 2, 1), path)
 
 
+@pytest.mark.thorough
 def test_a_file_of_matlab(tmp_path: Path) -> None:
     """Each is read in a process of its own, which takes a second."""
     path, cell = tmp_path / "t.mat", np.empty((3, 1), object)

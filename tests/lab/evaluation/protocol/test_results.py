@@ -50,6 +50,7 @@ def test_scores_of_double_precision_are_written_whole(tmp_path: Path, score: flo
     assert results.scores.tolist() == [score]
 
 
+@pytest.mark.thorough
 @given(OUTCOMES)
 def test_what_is_written_is_read_back(outcomes: list[Outcome]) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -60,6 +61,7 @@ def test_what_is_written_is_read_back(outcomes: list[Outcome]) -> None:
     assert results.scores.astype(np.float32).tolist() == [np.float32(outcome.score) for outcome in outcomes]
 
 
+@pytest.mark.thorough
 @given(OUTCOMES, st.booleans())
 def test_the_figures_are_those_of_the_outcomes(outcomes: list[Outcome], header: bool) -> None:
     """Random data, ties and one class, with and without a header."""

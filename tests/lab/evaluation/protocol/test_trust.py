@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.evaluation.protocol.outcomes import Outcome, judge
-from lab.evaluation.protocol.trust import NO_ORDER, TOO_FEW, decisions, trust, trust_figures
+from lab.evaluation.protocol.trust import NO_ORDER, TOO_FEW, decisions, doubt, trust, trust_figures
 
 N = 200
 
@@ -40,6 +40,22 @@ def test_probabilities_of_a_query_come_from_other_blocks() -> None:
     honest, betrayed = trust(*(run(0.8)[0], np.arange(N), outcomes))[0], trust(scores, np.arange(N), turned)[0]
     assert honest is not None and betrayed is not None
     assert betrayed.reliability.brier > honest.reliability.brier + 0.05
+
+
+def test_measures_of_doubt_by_hand() -> None:
+    scores = np.full((4, 8), 0.2, np.float32)
+    for query, (top, second, beside) in enumerate(
+        [(0.9, 0.3, True), (0.8, 0.4, True), (0.7, 0.65, False), (0.6, 0.59, False)]
+    ):
+        scores[query, 0], scores[query, 7] = top, second
+        scores[query, 1:4] = 0.58 if beside else 0.2
+    right = np.array([True, True, False, False])
+    found = doubt(scores, np.arange(8), right, decisions(scores, np.arange(8)))
+    assert (found.decision, found.score, found.ratio, found.spread) == (1.0, 1.0, 1.0, 1.0)
+    worst = doubt(scores[:2], np.arange(8), np.array([False, True]), np.array([2.0, 1.0]))
+    assert (worst.decision, worst.score, worst.ratio) == (0.25, 0.25, 0.25), "the surer one is wrong"
+    alone = doubt(scores[:2, :3], np.arange(3), np.array([True, False]), np.array([1.0, 2.0]))
+    assert alone.ratio > 0, "without another place there is nothing to compare with"
 
 
 def test_the_decision_value_by_hand() -> None:

@@ -7,6 +7,7 @@ import pytest
 from tests.lab.evaluation.report.comparisons import Written, make_comparison, written_page
 
 
+@pytest.mark.thorough
 def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, retained=range(6), noise=4.0)
     page = written_page(tmp_path / "report", comparison)

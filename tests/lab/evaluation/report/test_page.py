@@ -247,6 +247,7 @@ def test_same_comparison_same_bytes(tmp_path: Path, written: Written) -> None:
     assert first == second
 
 
+@pytest.mark.thorough
 def test_failure_while_it_is_made_writes_nothing(tmp_path: Path) -> None:
     def regions(path: Path) -> None:
         raise RuntimeError(path.name)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lab.evaluation.protocol.thresholds import Counts, thresholdings
 from lab.evaluation.report.threshold_effects import fate, fate_before, plot_fates, scores_by_fate
@@ -50,6 +51,7 @@ def test_plots_count_as_the_evaluation_does() -> None:
             )
 
 
+@pytest.mark.thorough
 def test_texts_give_the_counts() -> None:
     before, after = plot_fates("x", "HOG", OUTCOMES, 0.4)
     assert (before.name, after.name) == ("scores-before-x", "scores-after-x")
@@ -57,6 +59,7 @@ def test_texts_give_the_counts() -> None:
     assert after.alt == "After the threshold, scores of HOG: 2 TP, 2 FP, 1 TN and 2 FN."
 
 
+@pytest.mark.thorough
 def test_equal_scores_can_be_drawn() -> None:
     assert len(plot_fates("x", "HOG", [outcome(0.0, matched=True)] * 3, None)) == 1
     assert len(plot_fates("x", "HOG", [outcome(-2.0)], -2.0)) == 2

@@ -29,6 +29,7 @@ def test_cost_needs_two_systems(tmp_path: Path) -> None:
         assert f"{mark.label} {run.evaluation.auc_pr:.3f} at 4.8 ms" in plot.alt
 
 
+@pytest.mark.thorough
 def test_scalability_sorts_its_points(tmp_path: Path) -> None:
     cast = Cast(make_comparison(tmp_path, systems=2).runs)
     points = [
@@ -63,6 +64,7 @@ def test_sizes_without_strangers_have_no_error(tmp_path: Path) -> None:
     assert "from 0.750 at 1 to 0.750 at 10" in plots["verified-known"]
 
 
+@pytest.mark.thorough
 def test_two_plots_for_each_disturbance(tmp_path: Path) -> None:
     cast = Cast(make_comparison(tmp_path, systems=2).runs)
     curves = [

@@ -167,6 +167,12 @@ def test_backup_and_restore(
 
 def test_what_is_no_backup(placerec: Placerec, tmp_path: Path) -> None:
     assert "cannot be read" in placerec("backup", "verify", tmp_path / "none", status=1).stderr
+    for name in ("2026-11-26T021500Z", "2026-11-27T021500Z"):  # as a service keeps them
+        (tmp_path / "kept" / name).mkdir(parents=True)
+        (tmp_path / "kept" / name / "index.json").write_text('{"format": "placerec backup", "version": 1, "maps": []}')
+    for command in ("verify", "restore"):
+        told = placerec("backup", command, tmp_path / "kept", status=1).stderr
+        assert "holds 2 backups" in told and f"the latest is {tmp_path / 'kept' / '2026-11-27T021500Z'}" in told
     (tmp_path / "index.json").write_text('{"format": "placerec backup", "version": 2, "maps": []}')
     assert "later version" in placerec("backup", "verify", tmp_path, status=1).stderr
     entry = '{"id": "a", "file": "../../etc/passwd", "manifest_sha256": "00", "bytes": 1, "places": 1}'
@@ -174,6 +180,7 @@ def test_what_is_no_backup(placerec: Placerec, tmp_path: Path) -> None:
     assert "damaged" in placerec("backup", "verify", tmp_path, status=1).stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "..", "a/b", "lab\n", "LAB", "", 7])
 def test_a_service_chooses_no_file(placerec: Placerec, tmp_path: Path, name: object) -> None:
     """A backup of a service whose maps have names that lead out of the folder."""

@@ -113,6 +113,7 @@ def test_without_a_service_jobs_are_waited_for(placerec: Placerec) -> None:
     assert "--url" in placerec("maps", "prune", "lab", "--no-wait", status=1).stderr
 
 
+@pytest.mark.thorough
 def test_rebuilding_all_maps(placerec: Placerec, tmp_path: Path) -> None:
     """One map that cannot be read keeps no other one from being rebuilt."""
     install_coarse_encoder(tmp_path / "models")

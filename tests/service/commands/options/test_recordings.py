@@ -31,6 +31,8 @@ from tests.core.recordings.bags import (
     write_mcap,
     write_ros1,
 )
+from tests.core.recordings.test_transforms import said as transformed
+from tests.core.recordings.test_transforms import transform
 from tests.core.recordings.test_video import write_video
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene, seen_again
@@ -143,6 +145,7 @@ def test_a_video_is_enrolled_by_its_keyframes(placerec: Placerec, tmp_path: Path
     assert "4 unchanged" in again.stdout and "0 sent" in again.stdout
 
 
+@pytest.mark.thorough
 def test_of_a_video_the_frames_of_a_stop_are_left_out_unless_wanted(placerec: Placerec, tmp_path: Path) -> None:
     write_video(tmp_path / "walk.mp4")
     moved = placerec("enrol", tmp_path / "walk.mp4", "--map", "moved", "--create")
@@ -214,7 +217,9 @@ def test_poses_come_from_satellites_and_files(placerec: Placerec, tmp_path: Path
     bag = write_mcap(tmp_path / "walk.mcap", [*seen, *told])
     placerec("enrol", bag, "--map", "earth", "--create", "--pose-topic", "/fix")
     places = json.loads(placerec("maps", "places", "list", "earth", "--json").stdout)
-    assert [place["pose"] for place in places] == [{"latitude": 48.0 + index, "longitude": 2.0} for index in range(3)]
+    assert [place["pose"] for place in places] == [
+        {"latitude": 48.0 + index, "longitude": 2.0, "z": 30.0} for index in range(3)
+    ]
 
     file = tmp_path / "path.tum"
     file.write_text("1700000000 0 0 0 0 0 0 1\n1700000001 1 0 0 0 0 0 1\n")
@@ -375,6 +380,37 @@ def test_recordings_are_evaluated_as_their_frames_are(placerec: Placerec, tmp_pa
     assert mixed["recall_at"] == of_folders["recall_at"]
     wrong = ("evaluate", "--reference", bag, "--query", other, "--tolerance", 0, "--query-topic", "/rear")
     assert "again.bag has no topic '/rear'" in placerec(*wrong, status=1).stderr
+
+
+@pytest.mark.thorough
+def test_recordings_are_evaluated_by_transforms(placerec: Placerec, tmp_path: Path) -> None:
+    """The camera of one robot is half a metre ahead of its base; the other one's bag has also another robot's base."""
+    bags = []
+    for name, ahead, base in (("walk", 0.5, "base_link"), ("again", 0.0, "rover")):
+        messages = [transformed("/tf_static", START, transform(base, "camera", 0, (ahead, 0, 0)))]
+        for number in range(6):
+            at = START + number * SECOND
+            messages.append(compressed(at, encoded(seen_again(scene(number), number))))
+            messages.append(transformed("/tf", at, transform("map", "odom", at, (0, 100, 0))))
+            messages.append(transformed("/tf", at, transform("odom", base, at, (number, 0, 0))))
+        bags.append(write_mcap(tmp_path / f"{name}.mcap", messages))
+    known, asked = bags
+    words: tuple[object, ...] = ("--reference", known, "--query", asked, "--poses", "--metres", 0.2)
+    words += ("--encoder", "hog", "--pose-topic", "/tf", "--query-pose-topic", "/tf")
+
+    def recall(*more: object) -> float:
+        placerec("evaluate", *words, *more, "--json", tmp_path / "out.json")
+        return float(json.loads((tmp_path / "out.json").read_text())["recall_at"]["1"])
+
+    def refused(*more: object) -> str:
+        return placerec("evaluate", *words, *more, status=1).stderr
+
+    assert recall("--moving-frame", "base_link") == 1.0
+    assert recall("--moving-frame", "base_link", "--fixed-frame", "odom", "--query-fixed-frame", "odom") == 1.0
+    assert recall("--query-moving-frame", "rover", "--moving-frame", "base_link") == 1.0
+    assert "the nearest 0.5 m off" in refused(), "the pictures name their camera, not the base"
+    assert "the nearest 100.0 m off" in refused("--moving-frame", "base_link", "--query-fixed-frame", "odom")
+    assert "no transform of a frame 'base_link'" in refused("--query-moving-frame", "base_link")
 
 
 @pytest.mark.thorough

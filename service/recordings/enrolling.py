@@ -1,0 +1,247 @@
+"""The job that enrols the frames of a bag, as ``placerec enrol`` does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from core.belief.view import STILL, View, view_of
+from core.errors import InvalidImage, InvalidRecording
+from core.frames.images import decode
+from core.frames.masks import Mask
+from core.maps import Map
+from core.places import Camera, PlaceFields
+from core.places import Sequence as TraverseName
+from core.recordings import RecordedFrame, Recording
+from core.recordings.keyframes import Left, Spacing, keyframes, moving
+from core.recordings.recording import LARGEST_GAP
+from service.engine.engine import Engine
+from service.http.multipart import FormPart
+from service.http.uploads import check_part
+from service.jobs.context import JobContext, JobGivesWay, yield_to_requests
+from service.places.bulk_enrolment import Align, EnrolmentInCommits
+from service.places.enrolment import FrameToEnrol
+from service.places.map_events import tell_map
+from service.recordings.reader import Order
+from service.recordings.readers import Readers, Turns
+from service.recordings.uploads import KIND, Recordings
+from service.settings import Settings
+
+__all__ = ["KIND", "RecordingOrder", "enrol_recording"]
+
+Metres = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
+Topic = Field(default=None, min_length=1, max_length=256)
+
+
+class RecordingOrder(BaseModel):
+    """Which frames of a bag are enrolled, and how; as the options of ``placerec enrol``."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"sequence": "monday", "pose_topic": "/odom", "every_metres": 1}]},
+    )
+
+    sequence: TraverseName | None = Field(default=None, description="The traverse; null: as the file is called.")
+    id_prefix: str = Field(default="", max_length=64, description="Before the ids, which are made of topic and stamp.")
+    camera: Camera | None = Field(default=None, description="Of the map; its mask is applied.")
+    topic: str | None = Topic
+    pose_topic: str | None = Topic
+    fixed_frame: str | None = Topic
+    moving_frame: str | None = Topic
+    largest_gap: float = Field(
+        default=LARGEST_GAP, gt=0, le=3600, allow_inf_nan=False, description="Seconds between poses that are bridged."
+    )
+    every_metres: float | None = Metres
+    every_degrees: float | None = Metres
+    every_seconds: float | None = Metres
+    keep_standing: bool = Field(
+        default=False, strict=True, description="Also enrol frames in which nothing changes, as where the robot stood."
+    )
+    align: bool = Field(
+        default=False, strict=True, description="Then find which frames show places that the map had already."
+    )
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> RecordingOrder:
+        if self.pose_topic is None and (self.fixed_frame is not None or self.moving_frame is not None):
+            raise ValueError("fixed_frame and moving_frame go with a pose_topic of transforms, such as /tf")
+        return self
+
+
+def enrol_recording(
+    engine: Engine, recordings: Recordings, readers: Readers, align: Align, context: JobContext
+) -> Mapping[str, Any]:
+    """Choose frames of a bag and enrol them, some with each commit; an attempt after a restart goes on behind them.
+
+    Returns:
+        As of a job that enrols a form; with ``frames``, how many the bag has, ``posed``, how many of the chosen ones
+        have a pose, and ``remarks`` on the bag.
+
+    Raises:
+        InvalidRecording, UnknownTopic, InvalidTrajectory, MissingExtra: the bag cannot be used so.
+        UnknownMap, UnknownCamera, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was stored
+            before stays.
+        JobCancelled, JobInterrupted, JobGivesWay.
+    """
+    map_, name = context.map(engine.maps), str(context.arguments["recording"])
+    order = RecordingOrder.model_validate(context.arguments["order"])
+    context.progress(0, None, "reading the recording")
+    mask = map_.cameras.mask(order.camera)
+    wanted = Order(
+        path=recordings.find(str(context.map_id), name),
+        topic=order.topic,
+        pose_topic=order.pose_topic,
+        fixed=order.fixed_frame,
+        moving=order.moving_frame,
+        largest_gap=order.largest_gap,
+        prefix=order.id_prefix,
+        most=engine.settings.max_image_bytes + 1,  # so that more is noticed
+    )
+    with readers.reading(context, wanted) as (reader, turns):
+        recording = reader.recording()
+        sequence = order.sequence or recording.name
+        if "chosen" in context.notes:  # by an attempt before this one
+            chosen, remarks = [recording.frames[number] for number in context.notes["chosen"]], context.notes["remarks"]
+        else:
+            chosen, remarks = _choose(engine, context, turns, recording, order, mask)
+            _check_ids(map_, chosen, sequence)
+            remarks += _take_intrinsics(engine, map_, order.camera, recording)
+            numbers = {frame.id: number for number, frame in enumerate(recording.frames)}
+            context.remember(chosen=[numbers[frame.id] for frame in chosen], remarks=remarks, looks=None)
+
+        def frame(position: int) -> FrameToEnrol:
+            turns.begin_step()
+            try:
+                return _to_enrol(chosen[position], sequence, order.camera, mask, engine.settings)
+            finally:
+                turns.end_step()
+
+        entries = [{"id": one.id} for one in chosen]
+        result = EnrolmentInCommits(engine, context, entries, frame, gives_way=False).run()
+        posed = sum(one.pose is not None for one in chosen)
+        facts = {"sequence": sequence, "frames": len(recording.frames), "chosen": len(chosen), "posed": posed}
+    told = {**result, **facts, "remarks": remarks}
+    return {**told, "aligned": align(engine, context, [sequence])} if order.align else told
+
+
+def _choose(
+    engine: Engine, context: JobContext, turns: Turns, recording: Recording, order: RecordingOrder, mask: Mask | None
+) -> tuple[list[RecordedFrame], list[str]]:
+    """The frames to enrol, and remarks.
+
+    Raises:
+        InvalidRecording: no frame can be judged by the measures.
+        JobCancelled, JobInterrupted, JobGivesWay.
+    """
+    frames, remarks = recording.frames, list(recording.remarks)
+    spacing = Spacing(order.every_metres, order.every_degrees, order.every_seconds)
+    if spacing:
+        left = Left()
+        frames = list(keyframes(frames, spacing, None, left))
+        if not frames:
+            raise InvalidRecording("No frame has the pose or the time by which keyframes are to be chosen.")
+        if left.unjudged:
+            remarks.append(f"{left.unjudged} frames lack the pose or the time that is needed, and are left out.")
+    if not order.keep_standing:
+        before = len(frames)
+        frames = _moving(engine, context, turns, frames, mask)
+        if len(frames) < before:
+            remarks.append(f"{before - len(frames)} of {before} frames show the same as the one before them.")
+    return frames, remarks
+
+
+def _moving(
+    engine: Engine, context: JobContext, turns: Turns, frames: list[RecordedFrame], mask: Mask | None
+) -> list[RecordedFrame]:
+    """The frames in which something changes; those that were looked at are noted when the job gives way.
+
+    Raises:
+        JobCancelled, JobInterrupted, JobGivesWay.
+    """
+    begin, numbers = context.notes.get("looks") or (0, [])
+    found = [frames[number] for number in numbers]
+    looked = begin
+
+    def look(frame: RecordedFrame) -> View | None:
+        nonlocal looked
+        again = bool(numbers) and frame is frames[numbers[-1]]  # the last one of the attempt before this one
+        if not again:
+            turns.begin_step()
+        yield_to_requests(engine, context)
+        context.progress(looked, len(frames), "looking for stops")
+        shown = _view(frame, mask)
+        if not again:
+            looked += 1
+            turns.end_step()
+        return shown
+
+    last = found[-1] if found else None
+    try:
+        # What was found before the job gives way stays in the list.
+        found.extend(moving(frames, look, lambda one, other: one.change(other) < STILL, begin, last))
+    except JobGivesWay:
+        place = {frame.id: number for number, frame in enumerate(frames)}
+        context.remember(looks=(looked, [place[frame.id] for frame in found]))
+        raise
+    return found
+
+
+def _view(frame: RecordedFrame, mask: Mask | None) -> View | None:
+    try:
+        return view_of(decode(frame.load()), mask)
+    except (InvalidImage, InvalidRecording, OSError):
+        return None  # what is wrong with it is said where it is enrolled
+
+
+def _take_intrinsics(engine: Engine, map_: Map, camera: str | None, recording: Recording) -> list[str]:
+    """Give a camera of the map that has no intrinsics those of the bag; what is to be said of it.
+
+    Raises:
+        UnknownCamera, StorageFull, StorageFailure.
+    """
+    if recording.intrinsics is None:
+        return []
+    if camera is None:
+        return ["It has the intrinsics of its camera, which a camera of the map gets if one is named."]
+    known = map_.cameras.find(camera)
+    if known.intrinsics is not None:
+        return []
+    map_.cameras.put(camera, known.mask, recording.intrinsics)
+    tell_map(engine, map_, "cameras")
+    return [f"The camera {camera} had no intrinsics, and has those of the bag now."]
+
+
+def _check_ids(map_: Map, frames: Sequence[RecordedFrame], sequence: str) -> None:
+    """Refuse ids that belong to places of another traverse, which would be overwritten.
+
+    Raises:
+        InvalidRecording: the text names the first one.
+    """
+    map_.open()
+    rows = [row for row in map_.rows_of([frame.id for frame in frames]) if row is not None]
+    taken = [place for place in map_.places_at(rows) if place is not None and place.sequence != sequence]
+    if taken:
+        raise InvalidRecording(
+            f"{len(taken)} ids of these frames belong to places of another traverse, such as {taken[0].id!r}: give "
+            "id_prefix, or the right sequence."
+        )
+
+
+def _to_enrol(
+    frame: RecordedFrame, sequence: str, camera: str | None, mask: Mask | None, settings: Settings
+) -> FrameToEnrol:
+    """A frame as it is enrolled.
+
+    Raises:
+        InvalidImage, UnsupportedMediaType, ImageTooLarge: it cannot be.
+    """
+    try:
+        data = frame.load()
+    except (InvalidRecording, OSError) as error:
+        raise InvalidImage(str(error)) from error
+    oversized = len(data) > settings.max_image_bytes
+    check_part(FormPart(frame.name, None, None, b"" if oversized else data, oversized), settings)
+    fields = PlaceFields(pose=frame.pose, timestamp=frame.timestamp, sequence=sequence, camera=camera)
+    return FrameToEnrol(frame.id, fields, data, mask)

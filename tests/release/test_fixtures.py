@@ -1,0 +1,199 @@
+"""A data directory, an export and a client of every release go on to work, and an older version refuses newer data."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import lzma
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.storage.atlas import FORMAT
+from placerec_client import Client
+from tests.release import furnishing
+from tests.release.conversation import Replay, read
+from tests.release.furnishing import (
+    ABOUT,
+    ARCHIVE,
+    CONVERSATION,
+    DATA,
+    FIXTURES,
+    INTERFACE,
+    SURFACE,
+    again,
+    forms,
+    serving,
+    unpacked,
+)  # fmt: skip
+from tests.release.surface import broken, interface, missing, surface
+from tests.service.server import Server
+
+RELEASES = sorted(path for path in FIXTURES.iterdir() if path.is_dir())
+
+
+def about(release: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((release / ABOUT).read_text())
+    return found
+
+
+@pytest.fixture(params=RELEASES, ids=lambda path: path.name)
+def release(request: pytest.FixtureRequest) -> Path:
+    found: Path = request.param
+    return found
+
+
+@pytest.fixture
+def running(release: Path, tmp_path: Path) -> Iterator[Server]:
+    """Today's service on the data directory of a release."""
+    with serving(unpacked(release, tmp_path), tmp_path / "service", about(release)["key"]) as found:
+        yield found
+
+
+def test_there_are_fixtures_and_they_are_whole() -> None:
+    assert RELEASES
+    for release in RELEASES:
+        digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in release.iterdir()}
+        del digests[ABOUT]
+        assert about(release)["sha256"] == digests and about(release)["version"] == release.name
+        assert sum(path.stat().st_size for path in release.iterdir()) < 3e6
+
+
+@pytest.mark.thorough
+def test_the_data_opens_and_the_client_s_requests_are_answered_as_they_were(running: Server, release: Path) -> None:
+    exchanges = read((release / CONVERSATION).read_text())
+    assert len(exchanges) > 30
+    running.client.headers.pop("Authorization")  # the key is among what was recorded
+    assert list(Replay(running.client).differences(exchanges)) == []
+    assert running.lines(level="error") == [], "something of the data was put aside"
+
+
+@pytest.mark.thorough
+def test_an_export_is_imported_and_answers_as_its_map_did(release: Path, tmp_path: Path) -> None:
+    service = Server(tmp_path / "new").wait()
+    with Client(str(service.client.base_url)) as client:
+        assert client.maps.import_(release / ARCHIVE, id="copy").wait().state == "succeeded"
+        copy = client.maps["copy"]
+        assert copy.verify().ok and copy.read().description == "a hall"
+        assert [one.id for one in copy.places.list()] == ["p0", "p1", "p2", "p3"] and list(copy.places.looks("p1"))
+        for number in range(4):
+            answer = copy.query(again(number))
+            assert (answer.verdict, answer.place and answer.place.id) == ("recognized", f"p{number}")
+    assert service.stop() == 0
+
+
+@pytest.mark.thorough
+def test_today_s_client_reads_the_data_of_a_release(running: Server, release: Path) -> None:
+    with Client(str(running.client.base_url), key=about(release)["key"]) as client:
+        furnishing.converse(client)
+
+
+def released_interface(release: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(lzma.decompress((release / INTERFACE).read_bytes()))
+    return found
+
+
+def test_nothing_of_an_earlier_interface_is_missing(release: Path) -> None:
+    """docs/reference/compatibility.md promises it."""
+    assert list(broken(released_interface(release), interface())) == []
+
+
+@pytest.mark.thorough
+def test_no_name_of_an_earlier_version_is_missing(running: Server, release: Path) -> None:
+    with Client(str(running.client.base_url), key=about(release)["key"]) as client:
+        furnishing.converse(client)
+        now = surface(client.metrics())
+    assert missing(json.loads((release / SURFACE).read_text()), now) == []
+    assert missing({"settings": ["host", "colour"]}, now) == ["settings: colour"]
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "sentence"),
+    [
+        (("paths",), "/v1/maps", "GET /v1/maps is gone"),
+        (("paths", "/v1/maps"), "post", "POST /v1/maps is gone"),
+        (("paths", "/v1/maps", "get", "responses"), "200", "GET /v1/maps: the status 200 is gone"),
+        (("components", "schemas", "MapView", "properties"), "keep", "MapView has no keep"),
+        (("components", "schemas", "MapView"), "required", "MapView may lack id"),
+    ],
+)
+def test_what_an_interface_takes_away_is_found(path: tuple[str, ...], key: str, sentence: str) -> None:
+    changed = copy.deepcopy(interface())
+    part = changed
+    for name in path:
+        part = part[name]
+    del part[key]
+    assert sentence in list(broken(interface(), changed))
+
+
+def test_what_an_interface_comes_to_demand_is_found() -> None:
+    changed = copy.deepcopy(interface())
+    parameter = {"in": "query", "name": "colour", "required": True}
+    changed["paths"]["/v1/maps"]["get"].setdefault("parameters", []).append(parameter)
+    changed["components"]["schemas"]["NewMap"]["required"].append("colour")
+    found = list(broken(interface(), changed))
+    assert "GET /v1/maps: the parameter colour must be given" in found and "NewMap must have colour" in found
+
+
+def test_a_changed_form_of_a_file_is_a_changed_form_of_the_directory() -> None:
+    """So that every older version refuses the whole of it at once, instead of putting files aside that it cannot read.
+
+    A version that changes the schema of a file gives the directory another FORMAT, which it writes when it has brought
+    all files up to date.
+    """
+    for release in RELEASES:
+        if about(release)["format"] == FORMAT:
+            assert forms() == about(release)["forms"], f"the data of {release.name} has another form"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refusal(data: Path, folder: Path, key: str) -> str:
+    """What a service says that does not start on a data directory."""
+    service = Server(folder, {**furnishing.FOREVER, "data_dir": data}, key=key)
+    assert service.process.wait(120) not in (0, None)
+    service.client.close()
+    service.reservation.close()
+    return service.log_file.read_text()
+
+
+@pytest.mark.thorough
+def test_the_data_of_a_later_version_is_refused_and_left_as_it_is(release: Path, tmp_path: Path) -> None:
+    data = unpacked(release, tmp_path)
+    (data / "FORMAT").write_text("placerec data 2\n")
+    before = contents(data)
+    said = refusal(data, tmp_path / "service", about(release)["key"])
+    assert "was written by a later version of placerec (placerec data 2)" in said and "Traceback" not in said
+    assert contents(data) == before
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("file", ["maps/hall/map.sqlite", "jobs.sqlite", "keys.sqlite"])
+def test_a_file_of_a_later_version_is_refused_and_left_as_it_is(file: str, tmp_path: Path) -> None:
+    release = RELEASES[-1]
+    data = unpacked(release, tmp_path)
+    with closing(sqlite3.connect(data / file)) as connection:
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        connection.execute(f"PRAGMA user_version = {version + 1}")
+        connection.execute("CREATE TABLE later (one INTEGER)")
+    kept = (data / file).read_bytes()
+    said = refusal(data, tmp_path / "service", about(release)["key"])
+    assert f"was written by a later version of placerec (schema {version + 1}, this one knows {version})" in said
+    assert (data / file).read_bytes() == kept and not list(data.rglob("*.damaged-*"))
+
+
+@pytest.mark.thorough
+def test_fixtures_are_made_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(furnishing, "FIXTURES", tmp_path)
+    made = furnishing.write("0.0.0")
+    assert {path.name for path in made.iterdir()} == {DATA, ARCHIVE, CONVERSATION, ABOUT, SURFACE, INTERFACE}
+    assert read((made / CONVERSATION).read_text())
+    shutil.rmtree(made)

@@ -1,0 +1,67 @@
+"""All packages have one version, which one command sets."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from scripts.versions import MADE, PLACES, SOURCE, found, put
+from tests.project.sources import ROOT
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """The files that have a version, without the rest."""
+    for path in {*(place.path for place in (*PLACES, *MADE)), "CHANGELOG.md"}:
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / path, tmp_path / path)
+    changes = tmp_path / "CHANGELOG.md"
+    changes.write_text(changes.read_text() + "\n## 7.8.9\n")
+    return tmp_path
+
+
+def test_every_package_has_the_same_version() -> None:
+    versions = found()
+    assert set(versions.values()) == {versions[SOURCE]}, "scripts/versions.py shows where which one stands"
+    assert json.loads((ROOT / "openapi.json").read_text())["info"]["version"] == versions[SOURCE]
+    assert importlib.metadata.version("placerec") == importlib.metadata.version("placerec-client") == versions[SOURCE]
+
+
+def test_it_stands_nowhere_else() -> None:
+    """A place that the command does not know would be forgotten."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True).stdout
+    known = {place.path for place in (*PLACES, *MADE)}
+    kinds = (".toml", ".py", ".xml", ".cfg", ".yaml", "Dockerfile")
+    version = re.compile(rf'version["\']?\s*[:=>]+\s*["\']?{re.escape(found()[SOURCE])}\b', re.IGNORECASE)
+    others = [path for path in listed.split("\0") if path.endswith(kinds) and path not in known]
+    assert [path for path in others if version.search((ROOT / path).read_text())] == []
+
+
+def test_one_command_sets_it_everywhere(checkout: Path) -> None:
+    put("7.8.9", checkout)
+    versions = found(checkout)
+    assert {versions[place] for place in PLACES} == {"7.8.9"}
+    for place in PLACES:
+        was, now = (root.joinpath(place.path).read_text().splitlines() for root in (ROOT, checkout))
+        changed = [line for line, other in zip(was, now, strict=True) if line != other]
+        assert len(changed) == sum(one.path == place.path for one in PLACES), "more than the version has changed"
+
+
+@pytest.mark.parametrize("version", ["1.0", "v1.0.0", "1.0.0rc1", "6.6.6"])
+def test_what_is_no_version_or_has_no_changes_is_refused(version: str, checkout: Path) -> None:
+    before = {path: path.read_bytes() for path in checkout.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=r"no version of three numbers|no section"):
+        put(version, checkout)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_place_without_a_version_is_reported(checkout: Path) -> None:
+    (checkout / "docker/chart/Chart.yaml").write_text("name: placerec\n")
+    with pytest.raises(ValueError, match=r"Chart\.yaml has 0 versions"):
+        put("7.8.9", checkout)

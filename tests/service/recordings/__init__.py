@@ -1,0 +1,1 @@
+"""Bags that are uploaded, and enrolled by a job."""
