@@ -141,11 +141,6 @@ class Settings(BaseSettings):
         le=1024,
         description="How many frames are encoded at a time, each in a thread; 0 is one for each core.",
     )
-    precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
-        default="auto",
-        description="Precision of the forward pass. auto: float32, and float16 on a GPU if the descriptors stay the "
-        "same, as measured at the start; bfloat16, float16: refuse to start if they do not.",
-    )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu",
         description="Device of the forward passes; those of frames that wait together share batches on cuda.",

@@ -30,7 +30,7 @@ from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
 from core.names import file_names
-from core.networks.backbone import Device, Precision
+from core.networks.backbone import Device
 from core.networks.files import open_network
 from core.networks.identity import canonical_json
 from core.networks.network import NAMES as NETWORK_NAMES
@@ -213,16 +213,15 @@ class EncoderCatalogue:
     Args:
         models_dir: the user's directory, which need not exist; an encoder in it that has the name of a packaged one is
             ignored.
-        precision, device: how forward passes are computed; see :meth:`core.method.encoder.Encoder.settle`.
+        device: of the forward passes.
     """
 
     def __init__(
         self,
         models_dir: Path | None = None,
-        precision: Precision | Literal["auto"] = "auto",
         device: Device = "cpu",
     ) -> None:
-        self._precision, self._device = precision, device
+        self._device = device
         self._folders = [PACKAGED] + ([models_dir] if models_dir is not None else [])
         self._loaded: dict[Path, Encoder] = {}
         self._lock = threading.Lock()
@@ -304,13 +303,12 @@ class EncoderCatalogue:
 
         Raises:
             UnknownEncoder: no encoder has this name or identity.
-            InvalidModel: its files are missing or damaged, or this machine lacks the requested precision or device.
-            GoldenMismatch: the requested precision changes its descriptors too much.
+            InvalidModel: its files are missing or damaged, or this machine lacks the device.
         """
         path = self._find(name_or_identity)
         with self._lock:
             if path not in self._loaded:
                 encoder = load_encoder(path, self.network_file(_read_header(path).network))
-                encoder.settle(self._precision, self._device)
+                encoder.use(self._device)
                 self._loaded[path] = encoder
             return self._loaded[path]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,14 @@ from core.method.regions import Regions
 from core.method.vlad import aggregate, are_normalized, scores
 from core.method.vocabulary import Vocabulary
 from core.method.whitening import Whitening
-from core.networks.backbone import Device, Precision
+from core.networks.backbone import Device
 from core.networks.identity import arrays_digest, json_digest
 from core.threads import allowed_threads, each
 
 Array = NDArray[np.float32]
 
 GOLDEN_COSINE = 0.999
-"""Least cosine of the descriptors of a machine, or of a lower precision, to the golden ones."""
-
-
-LOWER: dict[Device, Precision] = {"cpu": "float32", "cuda": "float16"}
-"""The precision that is worth a trial by itself.  On the processor no packaged encoder keeps its descriptors in
-bfloat16, and a trial would load torch for it at every start."""
+"""Least cosine of the descriptors of a machine to the golden ones."""
 
 
 class EncoderDefinition(FeatureDefinition):
@@ -256,40 +251,16 @@ class Encoder:
         """Rows and columns of the maps of each layer in use."""
         return self.extractor.layer_grids()
 
-    def settle(self, precision: Precision | Literal["auto"] = "auto", device: Device = "cpu") -> Precision:
-        """Choose how forward passes are computed, before the first frame is encoded.
+    def use(self, device: Device) -> None:
+        """Choose where forward passes are computed, in float32, before the first frame is encoded.
 
-        A lower precision is used only if it hardly changes descriptors: those of one encoder identity are compared
-        with each other, whichever machine made them.
-
-        Args:
-            precision: "auto" takes float16 on a GPU if the descriptors of a few frames have a cosine of at least
-                ``GOLDEN_COSINE`` to those of float32, and is float32 on the processor.
-            device: of the forward pass.
-
-        Returns:
-            The precision now in use.
+        In a lower precision descriptors differ too much from those that other machines made of the same frames
+        (``benchmarks.devices.precision``).
 
         Raises:
-            InvalidModel: this machine lacks the precision or the device.
-            GoldenMismatch: a lower precision was requested, and it changes the descriptors too much.
+            InvalidModel: this machine lacks the device.
         """
         self.extractor.compute("float32", device)
-        lower = LOWER[device] if precision == "auto" else precision
-        if lower == "float32":
-            return lower
-        frames = [canary_frame(), canary_frame()[:, ::-1].copy(), 255 - canary_frame()]
-        exact = [self.encode(frame) for frame in frames]
-        try:
-            self.extractor.compute(lower, device)
-            for frame, wanted in zip(frames, exact, strict=True):
-                self._hold_against(self.encode(frame), wanted.descriptor, wanted.local, "those of float32")
-        except (GoldenMismatch, InvalidModel):
-            self.extractor.compute("float32", device)
-            if precision != "auto":
-                raise
-            return "float32"
-        return lower
 
     def _hold_against(self, made: Encoding, descriptor: NDArray[Any], local: Cells, what: str) -> None:
         for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):

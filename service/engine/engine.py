@@ -108,9 +108,9 @@ class Engine:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.maps: Store = self._store.maps
-        self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
-        if make_encoders is not None:  # then an encoder compares descriptors here, and makes none
-            self.catalogue = EncoderCatalogue(settings.models_directory, "float32")
+        # Where others make the encodings, an encoder here compares descriptors and computes no forward pass.
+        device = settings.device if make_encoders is None else "cpu"
+        self.catalogue = EncoderCatalogue(settings.models_directory, device)
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
         self.queue = EncoderQueue(
             self.catalogue, limits, settings.queue_length, settings.threads, metrics, make_encoders

@@ -25,7 +25,6 @@ from service.settings import Settings
 
 COMMON = (
     "encoder",
-    "precision",
     "engine",
     "milvus_database",
     "rate_per_key",

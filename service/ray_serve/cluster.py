@@ -263,9 +263,7 @@ class Cluster:
     def _replica_settings(self) -> ReplicaSettings:
         chosen = self._settings
         threads = chosen.threads or max(1, math.ceil(chosen.ray_replica_cpus))
-        return ReplicaSettings(
-            chosen.models_directory.absolute(), chosen.encoder, chosen.precision, chosen.device, self._limits, threads
-        )
+        return ReplicaSettings(chosen.models_directory.absolute(), chosen.encoder, chosen.device, self._limits, threads)
 
     def _room(self) -> int:
         """How many replicas the cluster has processors, or GPUs, for."""

@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from core.errors import InvalidImage, PlacerecError
 from core.frames.images import Limits
@@ -16,7 +15,7 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
-from core.networks.backbone import Device, Precision
+from core.networks.backbone import Device
 from core.networks.xfeat import packaged_xfeat
 from core.threads import share_cores
 from service.engine.encoder_threads import EncoderThreads
@@ -35,7 +34,6 @@ class ReplicaSettings:
 
     models: Path
     encoder: str
-    precision: Precision | Literal["auto"]
     device: Device
     limits: Limits
     threads: int
@@ -78,7 +76,7 @@ class EncoderReplica:
     """
 
     def __init__(self, settings: ReplicaSettings) -> None:
-        self._catalogue = EncoderCatalogue(settings.models, settings.precision, settings.device)
+        self._catalogue = EncoderCatalogue(settings.models, settings.device)
         self._encoders: dict[str, Encoder] = {}
         self._loading = asyncio.Lock()
         share_cores(settings.threads)

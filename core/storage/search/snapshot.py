@@ -268,7 +268,7 @@ class Snapshot:
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         found = np.empty((len(rows), *self.local_shape), np.int8)
-        self._read(rows, found, lambda segment, offset: segment.local[offset], "locals")
+        self._read(rows, found, lambda segment: segment.local, "locals")
         return found
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -279,22 +279,28 @@ class Snapshot:
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         found = np.empty((len(rows), self.dimension), np.float32)
-        self._read(rows, found, lambda segment, offset: vectors(segment.index)[offset], "descriptors")
+        self._read(rows, found, lambda segment: vectors(segment.index), "descriptors")
         return found
 
     def _read(
         self,
         rows: NDArray[np.int64],
         found: NDArray[Any],
-        in_memory: Callable[[Segment, int], NDArray[Any]],
+        in_memory: Callable[[Segment], NDArray[Any]],
         on_disk: Literal["descriptors", "locals"],
     ) -> None:
-        """Fill ``found`` with the stored data of rows: a row of a segment, or rows on disk."""
+        """Fill ``found`` with the stored data of rows: those of a segment in memory at once, or rows on disk."""
         self._check_rows(rows)
         held = self._held[rows]
-        for position in np.flatnonzero(held).tolist():
-            number, offset = divmod(int(rows[position]), self.rows_per_segment)
-            found[position] = in_memory(self.segments[number], offset)
+        numbers, offsets = np.divmod(rows, self.rows_per_segment)
+        # One copy a segment: between copies of single rows, threads would wait for each other's turn to run Python.
+        for number in np.unique(numbers[held]).tolist():
+            there = np.flatnonzero(held & (numbers == number))
+            stored = in_memory(self.segments[number])
+            if len(there) == len(rows) and stored.dtype == found.dtype:
+                np.take(stored, offsets, axis=0, out=found, mode="clip")
+            else:
+                found[there] = np.take(stored, offsets[there], axis=0)
         if not held.all():
             assert self.row_reader is not None
             wanted = rows[~held]

@@ -73,9 +73,8 @@ async def main(address: str, folder: Path) -> None:
         ray_address=address,
         ray_replicas=1,
         ray_max_replicas=1,
-        precision="float32",
     )
-    catalogue = EncoderCatalogue(precision="float32")
+    catalogue = EncoderCatalogue()
     queue = EncoderQueue(catalogue, Limits(), 64, 0, Metrics(), encoders_for(settings))
     identity = catalogue.resolve(DEFAULT_ENCODER)
     while line := await asyncio.to_thread(sys.stdin.readline):

@@ -86,7 +86,7 @@ async def run(nodes: Nodes, chosen: argparse.Namespace) -> int:
         settings = Settings(
             data_dir=Path(folder) / "data", ray=True, ray_address=nodes.address, ray_replicas=2, ray_max_replicas=2
         )
-        catalogue = EncoderCatalogue(precision="float32")
+        catalogue = EncoderCatalogue()
         queue = EncoderQueue(catalogue, Limits(), 64, 0, Metrics(), encoders_for(settings))
         try:
             campaign = await asyncio.to_thread(Campaign, nodes, queue, random.Random(chosen.seed))

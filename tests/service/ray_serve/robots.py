@@ -33,7 +33,7 @@ class Robots:
     def __init__(self, queue: EncoderQueue) -> None:
         self.answered = self.refused = 0
         self._queue = queue
-        encoder = EncoderCatalogue(precision="float32").get(DEFAULT_ENCODER)
+        encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
         self._identity = encoder.identity
         self._wanted = [encoder.encode(decode(jpeg(number))).descriptor for number in range(ROBOTS)]
         self._served = [0] * ROBOTS

@@ -54,13 +54,12 @@ def settings(nodes: tuple[Nodes, list[Node]], tmp_path_factory: pytest.TempPathF
         ray_max_replicas=2,
         ray_batch=BATCH,
         ray_scale_seconds=0.5,
-        precision="float32",
     )
 
 
 @pytest.fixture(scope="module")
 def queue(settings: Settings) -> Iterator[EncoderQueue]:
-    made = EncoderQueue(EncoderCatalogue(precision="float32"), Limits(), 64, 0, Metrics(), encoders_for(settings))
+    made = EncoderQueue(EncoderCatalogue(), Limits(), 64, 0, Metrics(), encoders_for(settings))
     wait_for_replicas(made, 2)
     yield made
     made.close()
@@ -112,7 +111,7 @@ async def test_encoders_grow_with_the_queue_and_shrink_without(queue: EncoderQue
 
 
 async def test_a_front_serves_again_when_its_cluster_returns(tmp_path: Path) -> None:
-    wanted = EncoderCatalogue(precision="float32").get(DEFAULT_ENCODER).encode(decode(jpeg(1))).descriptor
+    wanted = EncoderCatalogue().get(DEFAULT_ENCODER).encode(decode(jpeg(1))).descriptor
     expected = hashlib.sha256(wanted.tobytes()).hexdigest()
 
     def served(front: Front, within: float) -> None:

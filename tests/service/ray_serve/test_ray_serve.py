@@ -54,7 +54,7 @@ def queue(metrics: Metrics, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         data_dir=tmp_path_factory.mktemp("ray") / "data", ray=True, ray_replicas=2, ray_max_replicas=2, ray_batch=BATCH
     )
 
-    made = EncoderQueue(EncoderCatalogue(precision="float32"), Limits(), 64, 0, metrics, encoders_for(settings))
+    made = EncoderQueue(EncoderCatalogue(), Limits(), 64, 0, metrics, encoders_for(settings))
     wait_for_replicas(made, 2)
     yield made
     made.close()
