@@ -125,6 +125,7 @@ class LivingMap:
             np.zeros(count, np.int32),
             place.astype(np.int64),
             np.degrees(self.headings[place]).astype(np.float32) % 360,
+            least=np.array(self.least, np.float32),
         )
 
     def graph(self) -> PlaceGraph:
@@ -145,9 +146,8 @@ class LivingMap:
         rows, listed = living[order], where.take(living[order])
         stage = second_stage(self.encoder, frame.local, lambda at: self._rows.local[rows[at]])
         found = examine(scores[order], listed, SAME_PLACE, *stage)
-        ranked = rows[found.order]
         candidates = Candidates(
-            ranked,
+            rows[found.order],
             found.scores,
             scores[order][found.order],
             listed.take(found.order),
@@ -155,7 +155,7 @@ class LivingMap:
             None,
             found.scores,
             len(living),
-        ).take(np.flatnonzero(found.scores >= np.array(self.least)[ranked]))
+        ).believable()
         calibration = self.encoder.calibration
 
         def judged(candidates: Candidates) -> Judgement:
