@@ -1,198 +1,189 @@
-"""How many machines a fleet needs, the cost of a query, and which part gives out first: a queueing model.
+"""How many services and cores a fleet needs over one PostgreSQL: a model of queues, held against what was measured.
 
-    python -m benchmarks.cluster.sizing [--rate 1] [--places-per-map 100000]
+    python -m benchmarks.cluster.sizing [--rate 1] [--wait 0.5]
 
-Robots ask at random moments, each ``--rate`` times a second.  A query passes the front (HTTP and everything but what
-follows), an encoder, Milvus and PostgreSQL; each of these is a queue with several servers (M/M/c), and has as many
-servers as keep its mean wait under ``--wait`` of its own service time.  A robot asks one map, so that Milvus's time
-grows with the places of a map and its memory with those of all maps; that it passes over the other maps of a partition
-is not counted.
-
-Service times come from ``measured.json`` beside this file, those of Milvus and PostgreSQL from what
-``benchmarks.cluster.search`` has left in ``benchmarks/results``, if it has; prices are assumptions, options of this
-command.  Milvus's is the processor time of exact search, by place.  Before it is used, the model foretells what was
-measured: the embedded service with robots that each ask again when they have their answer.
+Measured here are the processor time of a query in a service and in PostgreSQL, memory and disk of a place, and the
+answers a second of robots that ask again at once, by one service and by two.  From the times alone the model foretells
+these answers: a query holds the interpreter of its service, of which each service has one, for some of its time, and a
+core for the rest.  Then it sizes fleets whose robots ask at random moments, so that the mean wait for a core is at most
+``--wait`` of the time that a query takes there.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import tempfile
+import time
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import httpx
+import psycopg
 import typer
 
-from benchmarks.cluster.queues import closed, servers_for, waiting
-from benchmarks.report import RESULTS, report
+from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
+from benchmarks.cluster.queues import Station, closed, servers_for
+from benchmarks.frames import camera_frames
+from benchmarks.process import descendants, median, memory, processor_time
+from benchmarks.report import report, verdict
+from core.threads import cores
+from tests.servers.postgres import Postgres, running_postgres
 
-HERE = Path(__file__).parent
-FLEETS = ((10, 10**6), (1000, 10**6), (1000, 10**8), (100_000, 10**8), (100_000, 10**9))
-"""Robots, and places of all their maps."""
+INTERPRETER = 0.25
+"""The share of a query's time in a service for which it holds the interpreter: sixteen cores answer 140 queries of 28
+ms in a second, however many robots ask (``benchmarks.devices.served``)."""
 
-VALUES = 16_384
-SINGLE, HALF = 4 * VALUES, 2 * VALUES
-CODES = VALUES // 8
-IN_POSTGRES = HALF + 24_000
-"""Bytes of a place: its descriptor, local descriptors, thumbnail and fields."""
+CODES = 2_400
+"""Bytes of a place in the memory of each service that searches its map (``docs/explanation/index-and-tiers.md``)."""
 
-MACHINE_CORES, MACHINE_GB = 16, 128
-SMALLEST = {"front": 2, "encoder": 4, "milvus": 2, "postgres": 2}
-"""Cores of compose.cluster.yaml on a machine of its own each, for the part that is exhausted first."""
+MOST_APART = 0.2
+BUSY = 2 / 3
+"""Of the time of an interpreter that a fleet may take."""
+
+FLEETS = ((10, 10**4), (100, 10**5), (1_000, 10**5), (1_000, 10**6))
+"""Robots, and places of all their maps, which each service holds."""
+
+SETUPS = ((1, 1), (1, 4), (1, 16), (2, 4), (2, 16))
+"""Services and robots."""
+
+SETTLE = 0.3
+"""Seconds between two turns."""
 
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of a core for one query, by part, and the seconds of Milvus for one place searched."""
+    """Seconds of a core for one query."""
 
-    front: float
-    encoder: float
+    service: float
     postgres: float
-    per_place: float
 
-    def of(self, part: str, places: int) -> float:
-        """Seconds of a part, in a map with ``places`` places."""
-        return places * self.per_place if part == "milvus" else float(getattr(self, part))
+    def stations(self, services: int, processors: int) -> list[Station]:
+        """The interpreters of services, and processors that they share with PostgreSQL."""
+        held = INTERPRETER * self.service
+        return [Station(held, services), Station(self.service - held + self.postgres, processors)]
 
 
 @dataclass(frozen=True)
-class IndexCost:
-    """Milvus's memory of a place, in bytes, and the share of its exact time that a search takes."""
+class Measured:
+    """What was measured.
 
-    name: str
-    memory: int
-    share: float
+    times: of a query of one of four robots.
+    answers: a second, by services and robots.
+    base: MB of a service before it has a map.
+    disk: bytes of a place in PostgreSQL.
+    """
 
-
-INDEXES = (
-    IndexCost("exact", SINGLE, 1.0),
-    IndexCost("codes", CODES, 1 / 16),
-)
-"""FLAT of float32, as measured; IVF_RABITQ with halves on disk, not tried: its time is foretold by the bytes read."""
-
-
-def load_measured() -> dict[str, Any]:
-    """The measurements: the file beside this one, and newer results where they are."""
-    found: dict[str, Any] = json.loads((HERE / "measured.json").read_text())
-    search = RESULTS / "cluster_search.json"
-    if search.exists():
-        stored = json.loads(search.read_text())
-        row = stored["rows"][1]
-        if "milvus_milliseconds" in row:
-            found["stores"] = {"places": stored["places"], "milvus": row["milvus_milliseconds"]}
-            found["stores"] |= {"postgres": row["postgres_milliseconds"], "source": "benchmarks/results"}
-    return found
+    times: Times
+    answers: dict[tuple[int, int], float]
+    base: float
+    disk: float
 
 
-def times_of(measured: dict[str, Any]) -> Times:
-    """Seconds by part."""
-    core, stores = measured["core_milliseconds"], measured["stores"]
-    return Times(
-        front=(core["query"] - core["encode"]) / 1e3,
-        encoder=core["encode"] / 1e3,
-        postgres=stores["postgres"] / 1e3,
-        per_place=stores["milvus"] / stores["places"] / 1e3,
-    )
+def family_time(pid: int) -> float:
+    """The processor time of a process and of those that it started, in seconds; some may have ended since."""
+    return sum(map(processor_time, {pid, *descendants(pid)}))
 
 
-def foretold(measured: dict[str, Any]) -> list[list[object]]:
-    """Answers a second and milliseconds, foretold and measured, of robots that ask again when they have an answer."""
-    cost = measured["core_milliseconds"]["query"] / 1e3
-    rows: list[list[object]] = []
-    for robots, rate in measured["embedded"]["robots"].items():
-        predicted, seconds = closed(cost, 2, int(robots))
-        error = predicted / rate - 1
-        rows.append([f"{robots} robots", predicted, rate, 1e3 * seconds, 1e3 * int(robots) / rate, f"{error:+.0%}"])
-    return rows
+def stored_bytes(server: Postgres) -> int:
+    """The size of the database."""
+    with psycopg.connect(server.address) as connection:
+        row = connection.execute("SELECT pg_database_size(current_database())").fetchone()
+    assert row is not None
+    return int(row[0])
 
 
-def sized(
-    robots: int, places: int, rate: float, most: int, wait: float, times: Times, index: IndexCost
-) -> dict[str, Any]:
-    """Servers of each part, memory and disk, and what a query takes."""
-    arrivals, searched = robots * rate, min(places, most)
-    parts, seconds = {}, 0.0
-    for part in SMALLEST:
-        service = times.of(part, searched) * (index.share if part == "milvus" else 1.0)
-        servers = servers_for(arrivals, service, wait * service)
-        seconds += service + waiting(arrivals, service, servers)
-        parts[part] = servers
-    memory = places * index.memory / 1e9
-    needed = max(math.ceil(sum(parts.values()) / MACHINE_CORES), math.ceil(memory / (0.75 * MACHINE_GB)))
+def measured(places: int, rounds: int, seconds: float) -> Measured:
+    """Enrol a map in PostgreSQL and let robots ask one service, and two."""
+    frames, _ = camera_frames(48)
+    answers: dict[tuple[int, int], list[float]] = defaultdict(list)
+    times: list[Times] = []
+    with running_postgres() as server, ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        shown = folder / "frames"
+        shown.mkdir()
+        for index, frame in enumerate(frames):
+            (shown / f"{index:03d}.jpg").write_bytes(frame)
+        settings = {"PLACEREC_DATABASE": server.address}
+        services = [stack.enter_context(running(ROOT, folder / f"service-{n}", settings))[:2] for n in range(2)]
+        clients: list[httpx.Client] = [client for client, _ in services]
+        pids = [pid for _, pid in services]
+        postgres = server.server.process_id
+        base, before = memory(pids[0]), stored_bytes(server)
+        clients[0].post("/v1/maps", json={"id": "lab", "keep": "none"}).raise_for_status()
+        for first in range(0, places, BATCH):
+            enrol(clients[0], "lab", frames, first, min(BATCH, places - first))
+        disk = (stored_bytes(server) - before) / places
+        urls = [str(client.base_url) for client in clients]
+        for turn in range(rounds + 1):  # the first one warms up
+            for asked, robots in SETUPS:
+                time.sleep(SETTLE)
+                spent = family_time(pids[0]), family_time(postgres)
+                with ThreadPoolExecutor(asked) as pool:
+                    turns = pool.map(partial(load, frames=shown, robots=robots // asked, seconds=seconds), urls[:asked])
+                    seen = list(turns)
+                if turn:
+                    answers[asked, robots].append(sum(len(one["milliseconds"]) / one["seconds"] for one in seen))
+                if turn and (asked, robots) == (1, 4):
+                    count = len(seen[0]["milliseconds"])
+                    service, stored = family_time(pids[0]) - spent[0], family_time(postgres) - spent[1]
+                    times.append(Times(service / count, stored / count))
+    typical = Times(median([one.service for one in times]), median([one.postgres for one in times]))
+    return Measured(typical, {setup: median(values) for setup, values in answers.items()}, base, disk)
+
+
+def sized(robots: int, places: int, rate: float, wait: float, found: Measured) -> dict[str, Any]:
+    """Services, cores, memory and disk of a fleet."""
+    asked, times = robots * rate, found.times
     return {
         "robots": robots,
         "places": places,
-        "index": index.name,
-        "cores": parts,
-        "memory_gb": memory,
-        "postgres_gb": places * IN_POSTGRES / 1e9,
-        "machines": max(2, needed),
-        "milliseconds": 1e3 * seconds,
-        "bound_by": "memory" if memory / (0.75 * MACHINE_GB) > sum(parts.values()) / MACHINE_CORES else
-        max(parts, key=lambda part: parts[part]),
-    }  # fmt: skip
-
-
-def first_to_give_out(times: Times, places: int, share: float) -> list[tuple[float, str]]:
-    """Queries a second at which each part of the smallest cluster is full, the fewest first."""
-    limits = [
-        (cores / (times.of(part, places) * (share if part == "milvus" else 1.0)), part)
-        for part, cores in SMALLEST.items()
-        if times.of(part, places) > 0
-    ]
-    return sorted(limits)
+        "services": max(2, math.ceil(asked * INTERPRETER * times.service / BUSY)),
+        "service_cores": servers_for(asked, times.service, wait * times.service),
+        "postgres_cores": servers_for(asked, times.postgres, wait * times.postgres),
+        "gigabytes_of_a_service": found.base / 1e3 + CODES * places / 1e9,
+        "gigabytes_of_postgres": found.disk * places / 1e9,
+    }
 
 
 def main(
     rate: Annotated[float, typer.Option(help="Queries a second of a robot.")] = 1.0,
-    places_per_map: Annotated[int, typer.Option(help="The most places that a query searches.")] = 100_000,
-    wait: Annotated[float, typer.Option(help="Mean wait of a part, in its service times, at most.")] = 0.5,
-    machine: Annotated[float, typer.Option(help="Price of an hour of 16 cores and 128 GB, assumed.")] = 0.8,
-    gigabyte: Annotated[float, typer.Option(help="Price of a GB of disk a month, assumed.")] = 0.1,
+    wait: Annotated[float, typer.Option(help="Mean wait for a core, in the time of a query there, at most.")] = 0.5,
+    places: Annotated[int, typer.Option(min=100, help="Of the map that is asked.")] = 600,
+    rounds: Annotated[int, typer.Option(min=1, help="Turns of each number of robots.")] = 5,
+    seconds: Annotated[float, typer.Option(min=1, help="Of one turn.")] = 4.0,
 ) -> None:
-    """Compare the model with what was measured, and size the fleets."""
-    measured = load_measured()
-    times = times_of(measured)
-    checked = foretold(measured)
-    columns = ["embedded, two cores", "foretold, 1/s", "measured, 1/s", "foretold, ms", "measured, ms", "error"]
-    report("cluster_model", "the model against what was measured", columns, checked, {"rows": checked})
-    rows, stored = [], []
-    for robots, places in FLEETS:
-        for index in INDEXES:
-            found = sized(robots, places, rate, places_per_map, wait, times, index)
-            hours = 730.0
-            price = found["machines"] * machine + found["postgres_gb"] * gigabyte / hours
-            found["price_per_million_queries"] = price / (robots * rate * 3600) * 1e6
-            stored.append(found)
-            cores = "/".join(str(found["cores"][part]) for part in SMALLEST)
-            rows.append(
-                [f"{robots:,} robots, {places:.0e} places, {index.name}", cores, f"{found['memory_gb']:,.0f}",
-                 f"{found['postgres_gb']:,.0f}", found["machines"], f"{found['milliseconds']:.0f}",
-                 f"{found['price_per_million_queries']:.2f}", found["bound_by"]]
-            )  # fmt: skip
+    """Measure, compare the model with what was measured, and size fleets."""
+    found = measured(places, rounds, seconds)
+    times, rows, worst = found.times, [], 0.0
+    for (services, robots), rate_there in found.answers.items():
+        foretold, _ = closed(times.stations(services, cores()), robots)
+        error = foretold / rate_there - 1
+        worst = max(worst, abs(error))
+        rows.append([f"{services} services, {robots} robots", foretold, rate_there, f"{error:+.0%}"])
+    spent = {"service": 1e3 * times.service, "postgres": 1e3 * times.postgres}
+    title = f"answers a second on {cores()} cores; a query takes " + ", ".join(
+        f"{value:.1f} ms of {name}" for name, value in spent.items()
+    )
+    figures = {"milliseconds": spent, "base_megabytes": found.base, "bytes_of_a_place": found.disk, "rows": rows}
+    report("cluster_model", title, ["", "foretold", "measured", "error"], rows, figures)
+    print(f"largest error {worst:.2f}: {verdict(worst, MOST_APART)}")
+    fleets = [sized(*fleet, rate, wait, found) for fleet in FLEETS]
     columns = [
-        "fleet",
-        "/".join(SMALLEST),
-        "memory, GB",
-        "disk, GB",
-        "machines",
-        "ms",
-        "per 10⁶ queries",
-        "most is for",
+        "robots",
+        "places",
+        "services",
+        "their cores",
+        "PostgreSQL's cores",
+        "GB of a service",
+        "GB of PostgreSQL",
     ]
-    figures = {
-        "times": vars(times),
-        "rate": rate,
-        "places_per_map": places_per_map,
-        "fleets": stored,
-        "measured": measured,
-    }
-    report("cluster_sizing", f"cores, machines of {MACHINE_CORES} cores and {MACHINE_GB} GB", columns, rows, figures)
-    for index in INDEXES:
-        limits = first_to_give_out(times, places_per_map, index.share)
-        limited = ", ".join(f"{part} at {limit:.0f}/s" for limit, part in limits)
-        print(f"smallest cluster, {index.name}: first {limited}")
+    title = f"fleets, {rate:g} queries a second of a robot"
+    report("cluster_sizing", title, columns, [list(one.values()) for one in fleets], {"rate": rate, "fleets": fleets})
 
 
 if __name__ == "__main__":
