@@ -328,7 +328,8 @@ class CalibrationOrder(BaseModel):
         description="Which frames query the map. `frames`: the labelled frames of this form. `sequence`: one "
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
         "neighbours, which is the least reliable method. `labels`: the frames stored for review and labelled. "
-        "`runs`: the frames of robots' sessions whose place the whole run knew beyond doubt; the target is not used."
+        "`runs`: the frames of robots' sessions whose place the whole run knew beyond doubt; the target has to be a "
+        "precision."
     )
     target: Target = Field(default=Target(rule="precision", value=0.95), description="The target of the threshold.")
     dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")

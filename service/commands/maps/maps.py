@@ -100,8 +100,9 @@ def _proposal(found: dict[str, Any]) -> str | None:
     proposed = None if then is None else found["measured"]["report"]["calibration"]
     if now is None or proposed is None or proposed == found["calibration"]:
         return None
-    changes = (f"{name} {number(now[name]['value'])} → {number(then[name]['value'])}" for name in ("recall", "precision"))
-    return f"{proposed['source']}: {', '.join(changes)}"
+    pairs = ((name, number(now[name]["value"]), number(then[name]["value"])) for name in ("recall", "precision"))
+    changes = ", ".join(f"{name} {before} → {after}" for name, before, after in pairs)
+    return f"{proposed['source']}: {changes}"
 
 
 @maps.command("create")
