@@ -42,6 +42,9 @@ Corridor had a say in it as well: there it is the least of these with which no s
 GUARD_FACTOR = 3
 """Only places farther from the best match than this multiple of the same-place distance count as other places."""
 
+LOWEST_DECISION, HIGHEST_DECISION = -1.0, 1.0
+"""No score is over 1, so that every decision value is between these, except for rounding (``Background.decision``)."""
+
 
 class Environment(BaseModel):
     """The prior of the scores of other places of one environment, in units of the score (see the module).

@@ -334,10 +334,11 @@ def adjust_to_labels(
     return adjust_calibration(trials.answered(base), base, source)
 
 
-def calibration_warnings(found: FittedCalibration, method: str, aligned: int = 0) -> list[str]:
+def calibration_warnings(found: FittedCalibration, method: str, target: Target | None, aligned: int = 0) -> list[str]:
     """Sentences that the owner of a map should read about its calibration.
 
     Args:
+        target: of the threshold; None: it had none.
         aligned: as in :class:`LabelledQueries`.
     """
     warned = {"map": FROM_ITSELF, "labels": FROM_DOUBT, "runs": FROM_RUNS}
@@ -357,6 +358,13 @@ def calibration_warnings(found: FittedCalibration, method: str, aligned: int = 0
     elif held.recall.value is not None and held.recall.value < 0.25:
         warnings.append(
             f"Only {held.recall.value:.0%} of the frames whose place is known are recognized at this target."
+        )
+    wanted = target.value if target is not None and target.rule == "precision" else None
+    if wanted is not None and held.precision.value is not None and held.precision.high < wanted:
+        warnings.append(
+            f"Only {held.precision.value:.0%} of the answers that the cross-validation recognized are right, from "
+            f"{held.precision.low:.0%} to {held.precision.high:.0%} in the long run: less than the {wanted:.0%} of the "
+            "target."
         )
     return warnings
 

@@ -170,7 +170,7 @@ class Keys:
 
         Args:
             learn: whether maps may learn from the runs of its holder.
-            keep_admin: refuse a first key that cannot manage the service.
+            keep_admin: refuse a key after which none in force can manage the service.
 
         Raises:
             InvalidRequest: the name, the role or the expiry cannot be used.
@@ -308,7 +308,7 @@ def _check_admin(keys: Iterable[Key], now: datetime) -> None:
     if not any(is_admin(key) and in_force(key, now) for key in keys):
         raise LastAdminKey(
             "No key of the role admin for all maps would be in force, and only a command on the service's machine "
-            "could create one. Create such a key first, or send ?lock_out=true."
+            "could create one. Create such an admin key first, or send ?lock_out=true."
         )
 
 

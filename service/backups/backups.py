@@ -10,14 +10,14 @@ import logging
 import shutil
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from core.disk.files import FolderLock, disk_errors, sync_file
-from core.errors import PlacerecError, StorageFailure, StorageFull, UnknownMap
+from core.errors import MapQuarantined, PlacerecError, StorageFailure, StorageFull, UnknownMap
 from core.maps import Map
 from service.backups.index import BackupEntry, BackupIndex, InvalidIndex, file_name
 from service.backups.shelf import Backup, BackupSchedule, Shelf, name_of, take_over
@@ -34,8 +34,15 @@ KIND = "backup"
 CHECK_SECONDS = 20.0
 """Whether a backup is due is looked at this often."""
 
-CHECK_SECONDS_EMPTY = 1.0
-"""And this often while there is no map, so that the first one is saved soon."""
+CHECK_SECONDS_FIRST = 1.0
+"""And this often before the first one, so that it is made soon."""
+
+SETTLED = timedelta(seconds=5)
+"""The first backup is begun when no place was enrolled for this time: one made before would have a part of the first
+map, and the next one is due after the interval."""
+
+PATIENCE = timedelta(minutes=10)
+"""If places are enrolled all the time, the first backup is begun after this time."""
 
 AGAIN = timedelta(hours=1)
 """After a backup that has failed, the next one is begun after this time, or after the interval if that is shorter."""
@@ -56,6 +63,8 @@ class Backups:
         self._tags: weakref.WeakKeyDictionary[Map, tuple[object, str]] = weakref.WeakKeyDictionary()
         """The state of each map when it was last saved, and the tag of its file."""
         self._began = datetime.now(UTC)
+        self._enrolled: tuple[int, datetime, datetime] | None = None
+        """How many places there are before the first backup, since when, and when there were some at first."""
         self._submitting = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="backups", daemon=True)
@@ -102,17 +111,23 @@ class Backups:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no map, not even a damaged one.
+        """Whether no map has a place, and none is damaged.
 
         Raises:
             StorageFailure: the maps cannot be listed.
         """
-        return not self._engine.maps.quarantined() and not self._engine.maps.records(None, 1)[0]
+        return not self._engine.maps.quarantined() and not any(self._counts())
+
+    def _counts(self) -> Iterator[int]:
+        """The number of places of each map."""
+        for record in self._engine.all_records():
+            with suppress(UnknownMap, MapQuarantined):  # it was deleted or found to be damaged since it was listed
+                yield self._engine.maps.find(record.id).count_places()
 
     def next_at(self, schedule: BackupSchedule, backups: list[Backup], latest: Job | None) -> datetime | None:
         """When the next backup is begun: a moment that may be over; None: none is, by itself.
 
-        While there is no map none is: backups of nothing would take the places of those that have maps, as where a
+        While no map has a place none is: backups of nothing would take the places of those that have maps, as where a
         service was started on the wrong folder; one that somebody asked for postpones none.
 
         Args:
@@ -125,8 +140,8 @@ class Backups:
         if schedule.hours is None or self.empty:
             return None
         pace = timedelta(hours=schedule.hours)
-        saved = next((backup for backup in backups if backup.index.maps), None)
-        due = self._began if saved is None else saved.at + pace
+        saved = _latest_of_places(backups)
+        due = self._first_at() if saved is None else saved.at + pace
         if latest is None or latest.state not in ("failed", "cancelled") or latest.ended_at is None:
             return due
         left_one = latest.problem is not None and str(latest.problem["type"]).endswith(":backup-incomplete")
@@ -150,7 +165,7 @@ class Backups:
             seconds = CHECK_SECONDS
             try:
                 self.check(datetime.now(UTC))
-                seconds = CHECK_SECONDS_EMPTY if self.empty else CHECK_SECONDS
+                seconds = CHECK_SECONDS_FIRST if self.newest() is None and self.latest() is None else CHECK_SECONDS
             except (PlacerecError, OSError) as error:
                 log.warning("it cannot be said whether a backup is due: %s", error)
             except Exception:  # a defect, which must not end the thread
@@ -167,8 +182,19 @@ class Backups:
         shelf, latest = self.shelf(), self.latest()
         if latest is not None and not latest.ended:
             return None
-        due = self.next_at(shelf.schedule(), shelf.backups(), latest)
+        schedule, backups = shelf.schedule(), shelf.backups()
+        if schedule.hours is not None and _latest_of_places(backups) is None and (places := sum(self._counts())):
+            before, since, first = self._enrolled or (places, now, now)
+            self._enrolled = places, since if places == before else now, first
+        due = self.next_at(schedule, backups, latest)
         return self.submit() if due is not None and due <= now else None
+
+    def _first_at(self) -> datetime:
+        """When the first backup is begun."""
+        if self._enrolled is None:
+            return self._began
+        _, since, first = self._enrolled
+        return min(since + SETTLED, first + PATIENCE)
 
     # Making
 
@@ -295,3 +321,8 @@ class Backups:
         if known is not None:
             with suppress(FileNotFoundError):
                 self._take_over(known, begun, index, shelf, earlier)
+
+
+def _latest_of_places(backups: Sequence[Backup]) -> Backup | None:
+    """Of backups, the newest first, the newest that has places; None: none has."""
+    return next((backup for backup in backups if any(saved.places for saved in backup.index.maps)), None)

@@ -66,7 +66,7 @@ class BackupList(BaseModel):
     enabled: bool = Field(description="Whether the setting `backup_dir` names a folder for them.")
     schedule: BackupSchedule | None = Field(description="Null if there is no folder.")
     next_at: Timestamp | None = Field(
-        description="When the next one is due; null: only by request, as while there is no map."
+        description="When the next one is due; null: only by request, as while no map has a place."
     )
     running: str | None = Field(description="Id of the job that makes one now, or waits to.")
     problem: str | None = Field(description="Why the latest one has failed; null if it has not.")

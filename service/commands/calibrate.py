@@ -224,7 +224,7 @@ def _show(report: dict[str, Any]) -> None:
         f"The map {report['map']} {done} by {measured['frames']} frames: threshold {number(calibration['threshold'])}, "
         f"margin {number(calibration['margin'])}."
     )
-    figures = table("figure", "#value", "#from", "#to")
+    figures = table("figure", "#value", "#from", "#to", title="Verdicts on frames held out")
     for name in ("precision", "recall", "false_accept_rate"):
         share = held[name]
         figures.add_row(name.replace("_", " "), number(share["value"]), number(share["low"]), number(share["high"]))
@@ -236,8 +236,12 @@ def _show(report: dict[str, Any]) -> None:
     ):
         figures.add_row(name, number(value), "", "")
     show(figures)
-    points = table("#threshold", "#precision", "#recall", "#false accepts")
+    points = table("#threshold", "#precision", "#recall", "#false accepts", title="Thresholds alone, on all frames")
     shown = measured["points"]
     for point in shown[:: max(1, len(shown) // SHOWN_POINTS)]:
         points.add_row(*(number(point[name]) for name in ("threshold", "precision", "recall", "false_accept_rate")))
     show(points)
+    remark(
+        "The first table has what the map would answer, by threshold, margin and verification; the second what each "
+        "threshold alone lets through by two stages, so that its recall is another one."
+    )

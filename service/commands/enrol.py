@@ -18,7 +18,7 @@ from core.places import check_sequence
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, progress, remark, say
-from service.commands.jobs import show_outcome, submit
+from service.commands.jobs import offered_calibration, show_outcome, submit
 from service.commands.options.recordings import (
     PANEL,
     EveryChange,
@@ -181,6 +181,8 @@ def _show_aligned(job: dict[str, Any]) -> None:
         f"{f' ({paired})' if paired else ''}; "
         f"{found['poses_handed_over']} poses were handed over."
     )
+    if "calibration" in found:
+        say(f"Calibration: {offered_calibration(found['calibration']).rstrip('.')}.")
 
 
 async def _enrol(

@@ -18,7 +18,7 @@ from service.commands.connection.client import (
     path_of,
     run,
 )
-from service.commands.console import Commands, Failure, progress, remark, show, show_json, table, words
+from service.commands.console import Commands, Failure, number, progress, remark, show, show_json, table, words
 
 jobs = typer.Typer(
     cls=Commands, help="List, follow and cancel jobs, which do long work in the background.", no_args_is_help=True
@@ -149,13 +149,26 @@ def show_outcome(job: dict[str, Any], as_json: bool) -> None:
     result = dict(job["result"] or {})
     lists = {name: result.pop(name) for name, value in list(result.items()) if _is_table(value)}
     for name, value in result.items():
-        shown.add_row(name, words(value))
+        is_offer = name == "calibration" and "outcome" in (value or {})
+        shown.add_row(name, offered_calibration(value) if is_offer else words(value))
     show(shown)
     for name, rows in lists.items():
         shown = table(*rows[0], title=name)
         for row in rows:
             shown.add_row(*map(words, row.values()))
         show(shown)
+
+
+def offered_calibration(told: dict[str, Any]) -> str:
+    """A line on what a job says of the map's calibration: the outcome, and the figures before and after."""
+    changes = [
+        f"{name} {number(told[key][0])} → {number(told[key][1])}"
+        for name, key in (("recall", "recall"), ("precision", "precision"), ("calibration error", "error"))
+        if key in told
+    ]
+    of = f", by {told['frames']} frames" if "frames" in told else ""
+    figures = f": {', '.join(changes)}" if changes else ""
+    return f"{told['outcome']}{of}{figures or (': ' + told['detail'] if 'detail' in told else '')}"
 
 
 def _is_table(value: Any) -> bool:

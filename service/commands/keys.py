@@ -39,18 +39,30 @@ def create(
     expires: Annotated[
         str | None, typer.Option(help="When it expires: after 30m, 12h, 30d or 8w, or at a date (UTC).")
     ] = None,
+    lock_out: Annotated[
+        bool, typer.Option("--lock-out", help="Create it also if no key could manage the service then.")
+    ] = False,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Create a key and write it to standard output. It is shown only this once and stored nowhere.
 
     As soon as a data directory has its first key, every request needs one; a running service knows within a second.
-    That remains so even when all keys are revoked or have expired.
+    That remains so even when all keys are revoked or have expired. So the first key is one of the role admin for all
+    maps, unless --lock-out says that nobody is to manage the service.
     """
+    from service.errors.faults import LastAdminKey
+
     store = _store(data_dir)
     is_first = not store.exists()
     until = None if expires is None else moment(expires)
-    key, token = store.create(name, role, maps or None, until, learn=learn)
+    try:
+        key, token = store.create(name, role, maps or None, until, keep_admin=not lock_out, learn=learn)
+    except LastAdminKey as error:
+        raise Failure(
+            "Every request would need a key, and none in force could manage the service. Create an admin key for all "
+            "maps first ('placerec keys create NAME --role admin'), or give --lock-out."
+        ) from error
     _note(data_dir, "create_key", key, 201, role=key.role, maps=maps or None, learn=key.learn)
     if as_json:
         show_json(_view(key) | {"key": token})

@@ -51,7 +51,10 @@ class JobView(BaseModel):
     cancelling: bool = Field(description="The job was cancelled, and stops at the next point where it can.")
     resumable: bool = Field(description="The job goes on after a restart of the service; otherwise it then fails.")
     attempt: int = Field(description="How often the job was started.")
-    result: dict[str, Any] | None = Field(description="The result, once the job has succeeded.")
+    result: dict[str, Any] | None = Field(
+        description="The result, once the job has succeeded, as its kind has it; of `learn`, `refused` counts by their "
+        "reasons the frames that were not proposed."
+    )
     problem: Problem | None = Field(description="Why the job failed.")
     created_at: Timestamp
     started_at: Timestamp | None = Field(description="When the job was last started.")

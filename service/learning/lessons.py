@@ -8,11 +8,12 @@ independent evidence agrees (:mod:`service.learning.adoption`).
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,14 @@ log = logging.getLogger("placerec.learning")
 
 Calibrate = Callable[[Map, RunNotes, StagedTrials], Mapping[str, Any]]
 """Has a map calibrated by the frames of a run; returns JSON that tells what became of that."""
+
+Unproposed = Literal["surer frame", "no score", "most looks", "not kept"]
+"""Why a frame that the rest of the run is certain of is not proposed: another frame of the run shows the place more
+surely; the run does not tell from which score on a match with it is to be believed; its place has all looks that it
+may have, or is gone; or the same file is under review with a label, or is larger than all frames there may be together.
+"""
+
+AFTERWARDS: tuple[Unproposed, ...] = get_args(Unproposed)
 
 TOGETHER = 16
 """Frames that are encoded together; in between, requests go first."""
@@ -111,8 +120,8 @@ def learn(
             meanwhile.
 
     Returns:
-        JSON: the frames of the run, how many of them were proposed as looks, and why others were not; and what became
-        of the calibration, if the run says anything of it.
+        JSON: the frames of the run, how many of them were proposed as looks, and how many were not, by the reason
+        (``Refusal``, ``Unproposed``); and what became of the calibration, if the run says anything of it.
 
     Raises:
         UnknownMap, EncoderNotInstalled, StorageFull, StorageFailure: nothing but proposals was stored.
@@ -135,17 +144,20 @@ def learn(
     graph = graph_of(map_)
     lesson = lesson_of(frames, graph, LessonOptions(least_probability=setting.least_probability))
     scores = _Scores(encoder, encoded)
-    count, trail = 0, Trail.of(frames)
-    for proposal in best_of_places(lesson.proposals):
+    surest, trail = best_of_places(lesson.proposals), Trail.of(frames)
+    refused = Counter[str](lesson.refused)
+    refused["surer frame"] = len(lesson.proposals) - len(surest)
+    for proposal in surest:
         context.check_cancelled()
         least = _least(proposal.frame, trail, graph, scores, map_, encoder)
-        if least is not None and _propose(map_, notes, proposal, least):
-            count += 1
+        reason = "no score" if least is None else _propose(map_, notes, proposal, least)
+        if reason is not None:
+            refused[reason] += 1
     found |= {
-        "proposals": count,
+        "proposals": len(lesson.proposals) - sum(refused[reason] for reason in AFTERWARDS),
         "contradiction": lesson.contradiction,
         "anchors": len(lesson.anchors),
-        "refused": dict(lesson.refused),
+        "refused": {reason: count for reason, count in refused.items() if count},
     }
     if setting.calibration != "off":
         context.check_cancelled()
@@ -273,11 +285,11 @@ def _least(frame: int, trail: Trail, graph: PlaceGraph, scores: _Scores, map_: M
     return least_score(beside, far, calibration_of(map_, encoder))
 
 
-def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> bool:
-    """Store a proposal for review; whether there was room for it, and it is new."""
+def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> Unproposed | None:
+    """Store a proposal for review; returns why it was not stored."""
     (place,) = map_.places_at([proposal.row])
     if place is None or place.looks >= MOST_LOOKS:
-        return False
+        return "most looks"
     noted = notes.frames[proposal.frame]
     told = {
         "place": place.id,
@@ -294,4 +306,5 @@ def _propose(map_: Map, notes: RunNotes, proposal: Proposal, least: float) -> bo
         "taken": moment_text(noted.taken),
     }
     setting = map_.record.review or ReviewSetting()
-    return map_.review.keep(noted.data, {**noted.answer, "proposal": told}, setting, renew=True)
+    kept = map_.review.keep(noted.data, {**noted.answer, "proposal": told}, setting, renew=True)
+    return None if kept else "not kept"

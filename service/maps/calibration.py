@@ -270,7 +270,7 @@ def measure(
     """
     if order.method == "runs":
         found = _from_runs(map_, encoder, ran, order.target)
-        return _report(map_, encoder, order, found, calibration_warnings(found, "runs")), found.trials
+        return _report(map_, encoder, order, found, calibration_warnings(found, "runs", order.target)), found.trials
     snapshot = map_.snapshot()
     queries = _queries(map_, snapshot, order, encoded, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
@@ -280,7 +280,8 @@ def measure(
         found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
     else:
         found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
-    warnings = calibration_warnings(found, "adjusted" if adjusted else order.method, queries.aligned)
+    method, target = ("adjusted", None) if adjusted else (order.method, order.target)
+    warnings = calibration_warnings(found, method, target, queries.aligned)
     return _report(map_, encoder, order, found, warnings), found.trials
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
+from core.judgement.background import HIGHEST_DECISION, LOWEST_DECISION
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
 from core.maps import (
@@ -156,13 +157,28 @@ class CalibrationChanges(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    threshold: float | None = Field(strict=True, default=None, allow_inf_nan=False)
+    threshold: float | None = Field(
+        strict=True,
+        default=None,
+        allow_inf_nan=False,
+        description="Least decision value of a recognized place; every decision value is from -1 to 1.",
+        json_schema_extra={"minimum": LOWEST_DECISION, "maximum": HIGHEST_DECISION},
+    )
     margin: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
     measured_at: Timestamp | None = Field(
         default=None,
         description="Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time "
         "at which it was measured, `measured.at` of the calibration. If it was measured again since, this is refused.",
     )
+
+    @field_validator("threshold")
+    @classmethod
+    def _within_reach(cls, threshold: float | None) -> float | None:
+        if threshold is not None and not LOWEST_DECISION <= threshold <= HIGHEST_DECISION:
+            raise ValueError(
+                f"a threshold is from {LOWEST_DECISION:g} to {HIGHEST_DECISION:g}, as every decision value is"
+            )
+        return threshold
 
     @model_validator(mode="after")
     def _sets_or_stores(self) -> CalibrationChanges:
@@ -312,7 +328,8 @@ class CalibrationOrder(BaseModel):
         description="Which frames query the map. `frames`: the labelled frames of this form. `sequence`: one "
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
         "neighbours, which is the least reliable method. `labels`: the frames stored for review and labelled. "
-        "`runs`: the frames of robots' sessions whose place the whole run knew beyond doubt; the target is not used."
+        "`runs`: the frames of robots' sessions whose place the whole run knew beyond doubt; the target has to be a "
+        "precision."
     )
     target: Target = Field(default=Target(rule="precision", value=0.95), description="The target of the threshold.")
     dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")

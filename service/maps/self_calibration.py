@@ -12,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from core.errors import CalibrationImpossible, PlacerecError, RevisionMismatch
+from core.judgement.calibration import effect_of
 from core.judgement.reliability import reliability
 from core.judgement.trials import StagedTrials, Trials
 from core.learning import count_witnesses
@@ -109,14 +110,19 @@ def _offered(
 
     Returns:
         JSON: the ``outcome``: ``stored``, ``proposed`` or ``holds`` (the calibration in force is no worse); and the
-        calibration ``error`` before and after, the latter cross-validated.
+        calibration ``error``, the ``recall`` and the ``precision`` before and after, the latter cross-validated.
 
     Raises:
         StorageFull, StorageFailure: the map keeps its calibration.
     """
     before = reliability(asked.probabilities(report.previous), asked.right) if report.previous.curve else None
     after = report.measurement.cross_validated.reliability
-    told = {"error": [None if before is None else round(before.ece, 4), round(after.ece, 4)]}
+    now, then = effect_of(asked, report.previous), report.measurement.cross_validated
+    told: dict[str, Any] = {
+        "error": [_rounded(None if before is None else before.ece), _rounded(after.ece)],
+        "recall": [_rounded(now.recall.value), _rounded(then.recall.value)],
+        "precision": [_rounded(now.precision.value), _rounded(then.precision.value)],
+    }
     if before is not None and after.brier >= before.brier:
         return told | {"outcome": "holds"}
     replaces = map_.record.calibration
@@ -133,6 +139,10 @@ def _offered(
     if not _waits(statistics, map_):
         remember(statistics, map_, report, asked)
     return told | {"outcome": "proposed"}
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
 
 
 def _waits(statistics: QueryStatistics, map_: Map) -> bool:

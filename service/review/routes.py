@@ -14,7 +14,7 @@ from core import errors
 from core.frames.containers import read_header
 from core.maps import Map
 from core.maps.pagination import Listing, decode_number, page_of
-from core.places import PlaceFields, check_place_id
+from core.places import PlaceFields, check_place_id, look_address
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -27,7 +27,16 @@ from service.http.uploads import FORMATS
 from service.places.enrolment import FrameToEnrol, LookOrigin, digest_of, enrol, enrol_look
 from service.places.schemas import PlaceView
 from service.review.labels import withdraw_contradicted
-from service.review.schemas import ExportedLabel, Labelled, LabelList, LabelOrder, NewPlace, ReviewFrameView, ReviewPage
+from service.review.schemas import (
+    ExportedLabel,
+    Labelled,
+    LabelList,
+    LabelOrder,
+    NewPlace,
+    ReviewFrameView,
+    ReviewLabel,
+    ReviewPage,
+)
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -52,13 +61,23 @@ def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], e
     A map keeps frames whose answers have the verdicts that its setting `review` names, from a moment after the answer
     on; by default it keeps none.
     """
-    review = engine.maps.get(map_id).review
+    map_ = engine.maps.get(map_id)
     listing: Listing = ["review-of", map_id, str(page.labelled)]
     before = decode_number(listing, page.cursor)
-    found = review.page(None if before < 0 else before, page.limit + 1, page.labelled)
+    found = map_.review.page(None if before < 0 else before, page.limit + 1, page.labelled)
     shown, more = page_of(listing, found.frames, page.limit, lambda one: one.number)
     items = [ReviewFrameView.of(one) for one in shown]
+    _forget_gone_looks(map_, [view.label for view in items if view.label is not None])
     return ReviewPage(items=items, next_cursor=more, frames=found.count, bytes=found.size)
+
+
+def _forget_gone_looks(map_: Map, labels: list[ReviewLabel]) -> None:
+    """Leave the look out of labels where it was undone, withdrawn or deleted since; they still say the place."""
+    named = [one for one in labels if one.place is not None and one.look is not None]
+    rows = map_.rows_of([look_address(str(one.place), str(one.look)) for one in named])
+    for label, row in zip(named, rows, strict=True):
+        if row is None:
+            label.look = None
 
 
 @router.get("/labels")

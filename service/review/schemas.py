@@ -21,7 +21,7 @@ class ReviewLabel(BaseModel):
     look: str | None = Field(
         default=None,
         exclude_if=lambda name: name is None,
-        description="The look of this place as which it was added; left out if it was not.",
+        description="The look of this place as which it was added; left out if it was not, or is gone again.",
     )
     new: str | None = Field(default=None, description="The place as which it was enrolled.")
     stranger: bool = Field(default=False, description="It shows no place of the map.")

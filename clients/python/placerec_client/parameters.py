@@ -1272,6 +1272,7 @@ class CalibrationChanges(TypedDict):
     """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
     threshold: NotRequired[float | None]
+    """Least decision value of a recognized place; every decision value is from -1 to 1."""
 
     margin: NotRequired[float | None]
 

@@ -83,8 +83,26 @@ def list_maps(url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 
 @maps.command("show")
 def show_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """Show one map."""
-    _show_map(ask(CommandTarget(url, data_dir), "GET", path_of("maps", map_id)).json(), as_json)
+    """Show one map, and the calibration that was measured for it but not stored, if there is one."""
+
+    async def work() -> tuple[Any, Any]:
+        async with open_service(CommandTarget(url, data_dir)) as service:
+            found = await service.get(path_of("maps", map_id))
+            return found, None if as_json else await service.get(path_of("maps", map_id, "calibration"))
+
+    found, measured = run(work())
+    _show_map(found, as_json, None if measured is None else _proposal(measured))
+
+
+def _proposal(found: dict[str, Any]) -> str | None:
+    """A line on the calibration that was measured and not stored, beside the one in force; None if there is none."""
+    now, then = found["now"], found["proposed"]
+    proposed = None if then is None else found["measured"]["report"]["calibration"]
+    if now is None or proposed is None or proposed == found["calibration"]:
+        return None
+    pairs = ((name, number(now[name]["value"]), number(then[name]["value"])) for name in ("recall", "precision"))
+    changes = ", ".join(f"{name} {before} → {after}" for name, before, after in pairs)
+    return f"{proposed['source']}: {changes}"
 
 
 @maps.command("create")
@@ -184,7 +202,7 @@ def _given(
     return {name: value for name, value in settings.items() if value is not None}
 
 
-def _show_map(found: dict[str, Any], as_json: bool) -> None:
+def _show_map(found: dict[str, Any], as_json: bool, proposal: str | None = None) -> None:
     if as_json:
         show_json(found)
         return
@@ -194,6 +212,8 @@ def _show_map(found: dict[str, Any], as_json: bool) -> None:
             shown.add_row(
                 name, f"{value['source']}: threshold {number(value['threshold'])}, margin {value['margin']:g}"
             )
+            if proposal is not None:
+                shown.add_row("proposed calibration", proposal)
         elif name != "id":
             shown.add_row(name, "–" if value is None else str(value))
     show(shown)

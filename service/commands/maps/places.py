@@ -247,9 +247,11 @@ def delete_sequence(
 ) -> None:
     """Delete all places of a traverse. This cannot be undone."""
     path = path_of("maps", map_id, "sequences", sequence)
+    target = CommandTarget(url, data_dir)
+    if erase and sequence not in (item["name"] for item in list_items(target, path_of("maps", map_id, "sequences"))):
+        raise Failure(f"The map {map_id} has no sequence {sequence}; nothing was deleted.")
     if not yes:
         typer.confirm(f"Delete all places of the sequence {sequence} of the map {map_id}?", abort=True)
-    target = CommandTarget(url, data_dir)
     if erase:
         order = {"filter": {"sequence": sequence}}
         show_erased(submit(target, path_of("maps", map_id, "erase"), order, wait=True))

@@ -13,12 +13,12 @@ const OUTCOMES = {
 
 /** The outcome, and the calibration error before and after. */
 export function CalibrationOutcome({ map, told }) {
-  const { outcome, error, frames, detail } = told;
+  const { outcome, error, recall, frames, detail } = told;
   const text = OUTCOMES[outcome] || outcome;
   const measured = outcome === "stored" || outcome === "proposed";
-  const before = error?.[0] === null ? "" : `${decimal(error?.[0])} → `;
+  const change = ([before, after]) => `${before === null ? "" : `${decimal(before)} → `}${decimal(after)}`;
   return html`
     ${measured ? html`<a href=${href("maps", map, "calibration")}>${text}</a>` : html`<span title=${detail}>${text}</span>`}
-    ${error ? html`<span class="faint"> error ${before}${decimal(error[1])}</span>` : frames !== undefined && html`<span class="faint"> (${integer(frames)})</span>`}
+    ${error ? html`<span class="faint"> error ${change(error)}${recall ? `, recall ${change(recall)}` : ""}</span>` : frames !== undefined && html`<span class="faint"> (${integer(frames)})</span>`}
   `;
 }

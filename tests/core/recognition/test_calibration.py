@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.judgement.calibration import adjust_calibration
+from core.judgement.probability import Curve
 from core.judgement.trials import Trials
 from core.maps import Enrolment, MapSettings
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
-from core.recognition.calibration import queries_from_map, run_trials
+from core.recognition.calibration import calibration_warnings, queries_from_map, run_trials
 from core.storage import Atlas
+from tests.core.judgement.test_calibration import BASE, PRECISE, drawn
 
 PLACES, QUERIES = 400, 30
 
@@ -58,3 +61,14 @@ def test_a_place_without_its_surroundings_is_tried_in_a_dense_map(
     np.testing.assert_array_equal(compact.known, exact.known)
     np.testing.assert_array_equal(compact.right, exact.right)
     assert np.isclose(compact.decision, exact.decision, atol=0.01).mean() > 0.9
+
+
+def test_a_precision_that_held_out_answers_do_not_have_is_warned_of() -> None:
+    believing = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-2), "threshold": 0.02})
+    plain, precise = (adjust_calibration(drawn(200), believing, "runs", one) for one in (None, PRECISE))
+    held = plain.measurement.cross_validated.precision
+    assert held.high < 0.95 <= precise.measurement.cross_validated.precision.high
+    told = calibration_warnings(plain, "runs", PRECISE)[-1]
+    assert f"Only {held.value:.0%} of the answers" in told and "the 95% of the target" in told
+    assert not any("of the target" in one for one in calibration_warnings(precise, "runs", PRECISE))
+    assert not any("of the target" in one for one in calibration_warnings(plain, "runs", None))

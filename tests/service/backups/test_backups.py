@@ -12,7 +12,7 @@ import pytest
 from core.maps import Map
 from core.maps.archives.reading import Archive, check
 from service.app.runtime import Runtime
-from service.backups.backups import AGAIN, Backups
+from service.backups.backups import AGAIN, PATIENCE, SETTLED, Backups
 from service.backups.index import INDEX
 from service.backups.shelf import BackupSchedule, Shelf, moment_of, name_of
 from service.errors.faults import BackupFolderMissing
@@ -122,7 +122,7 @@ def test_a_backup_is_due_after_its_interval_and_sooner_after_a_failure(tmp_path:
         assert failed.state == "failed" and failed.problem and failed.problem["type"].endswith(":storage-failure")
         assert failed.ended_at is not None
         (tmp_path / "disk").unlink()  # now the disk is there
-        assert backups.check(failed.ended_at + AGAIN - timedelta(seconds=1)) is None
+        assert backups.check(failed.ended_at + AGAIN - SETTLED) is None
         begun = backups.check(failed.ended_at + AGAIN)
         assert begun is not None
         job = end_of(runtime, begun)
@@ -136,16 +136,34 @@ def test_a_backup_is_due_after_its_interval_and_sooner_after_a_failure(tmp_path:
         end_of(runtime, runtime.jobs.all()[-1])
 
 
-def test_where_there_is_no_map_none_is_due_and_none_is_displaced(runtime: Runtime, tmp_path: Path) -> None:
+def test_where_there_is_no_place_none_is_due_and_none_is_displaced(runtime: Runtime, tmp_path: Path) -> None:
     backups, shelf, later = runtime.backups, Shelf(tmp_path / SAVED), datetime.now(UTC) + timedelta(days=2)
     assert backups.check(later) is None and backups.next_at(shelf.schedule(), [], None) is None
     asked = backed_up(runtime)  # who asks for one gets one of nothing
     assert asked.result and (asked.result["maps"], asked.result["bytes"]) == (0, 0)
+    runtime.engine.maps.create("lab", ENCODER, 8)
+    assert backups.next_at(shelf.schedule(), shelf.backups(), asked) is None, "it has no place yet"
+    backed_up(runtime)  # one of an empty map postpones none either
     fill(runtime, "hall")
-    first = backups.check(datetime.now(UTC))  # one of nothing does not postpone it
-    assert first is not None and (end_of(runtime, first).result or {})["maps"] == 1
+    assert backups.check(later) is None, "more may come"
+    assert backups.next_at(shelf.schedule(), shelf.backups(), None) == later + SETTLED
+    first = backups.check(later + SETTLED)
+    assert first is not None and (end_of(runtime, first).result or {})["maps"] == 2
     runtime.engine.maps.delete("hall")
     assert backups.check(later + timedelta(days=2)) is None
+
+
+def test_the_first_backup_waits_until_no_place_is_added_but_not_for_ever(runtime: Runtime, tmp_path: Path) -> None:
+    backups, start = runtime.backups, datetime.now(UTC) + timedelta(days=1)
+    (hall,) = fill(runtime, "hall")
+    assert backups.check(start) is None
+    hall.enrol(enrolments(50, 1, "q", "tuesday"))
+    assert backups.check(start + SETTLED) is None, "a place was added meanwhile"
+    assert backups.check(start + 1.9 * SETTLED) is None
+    hall.enrol(enrolments(60, 1, "r", "tuesday"))
+    first = backups.check(start + PATIENCE)
+    assert first is not None and end_of(runtime, first).state == "succeeded"
+    assert Shelf(tmp_path / SAVED).backups()[0].index.find("hall").places == 5  # type: ignore[union-attr]
 
 
 def test_what_was_begun_is_gone_on_with_or_removed(runtime: Runtime, tmp_path: Path) -> None:

@@ -78,8 +78,8 @@ def test_a_service_that_is_killed_while_it_saves_goes_on(tmp_path: Path) -> None
     settings = {"backup_dir": tmp_path / "backups"}
     server = Server(tmp_path, settings).wait()
     server.create_map("m0", keep="image")
-    wait_until(lambda: len(server.client.get("/v1/backups").json()["items"]) > 0)
     assert server.enrol("m0", "p", jpeg(0)).status_code == 201
+    wait_until(lambda: len(server.client.get("/v1/backups").json()["items"]) > 0)
     content = server.client.get("/v1/maps/m0/export").content
     for number in range(1, 40):
         made = server.client.post("/v1/maps/import", params={"id": f"m{number}"}, content=content,

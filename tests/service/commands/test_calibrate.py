@@ -37,6 +37,9 @@ def test_by_a_traverse_with_its_figures(placerec: Placerec, server: Server, stri
     assert "would be calibrated by 12 frames" in dry.stdout
     assert "area under the ROC" in dry.stdout
     assert "12 frames" in dry.stderr
+    for title in ("Verdicts on frames held out", "Thresholds alone, on all frames"):
+        assert title in dry.stdout
+    assert "its recall is another" in " ".join(dry.stderr.split()), "which recall is which"
     told = json.loads(placerec(*words, "--json", *there).stdout)
     assert told["stored"] is True
     assert server.client.get(f"/v1/maps/{strip}").json()["calibration"] == told["calibration"]

@@ -22,7 +22,8 @@ from tests.service.commands.conftest import Placerec
 
 
 def test_a_key_is_shown_once(placerec: Placerec, tmp_path: Path) -> None:
-    made = placerec("keys", "create", "robot-7", "--role", "query", "--map", "lab", "--map", "yard", "--expires", "30d")
+    limits = ("--map", "lab", "--map", "yard", "--expires", "30d")
+    made = placerec("keys", "create", "robot-7", "--role", "query", *limits, "--lock-out")
     token = made.stdout.strip()
     assert TOKEN.fullmatch(token), "all of standard output, for a script"
     assert "From now on every request needs a key" in made.stderr and token not in made.stderr
@@ -41,11 +42,21 @@ def test_a_key_is_shown_once(placerec: Placerec, tmp_path: Path) -> None:
     assert (tmp_path / "data" / "keys.sqlite").exists() and not (tmp_path / "data" / "maps").exists()
 
 
+def test_the_first_key_can_manage_the_service(placerec: Placerec, tmp_path: Path) -> None:
+    for robot in (("--role", "query"), ("--role", "admin", "--map", "lab")):
+        refused = placerec("keys", "create", "robot-7", *robot, status=1)
+        assert "Create an admin key for all maps first" in refused.stderr and not refused.stdout
+    assert not (tmp_path / "data" / "keys.sqlite").exists(), "the service still needs no key"
+    placerec("keys", "create", "ann", "--role", "admin")
+    placerec("keys", "create", "robot-7", "--role", "query")
+    assert [key["name"] for key in json.loads(placerec("keys", "list", "--json").stdout)] == ["ann", "robot-7"]
+
+
 def test_the_audit_file_knows_the_keys_of_the_command_line(
     placerec: Placerec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLACEREC_AUDIT_FILE", str(tmp_path / "audit.jsonl"))
-    token = placerec("keys", "create", "robot-7", "--role", "query", "--map", "lab").stdout.strip()
+    token = placerec("keys", "create", "robot-7", "--role", "enrol", "--map", "lab", "--lock-out").stdout.strip()
     placerec("keys", "delete", "robot-7")
     written = (tmp_path / "audit.jsonl").read_text()
     created, deleted = map(json.loads, written.splitlines())
@@ -53,7 +64,7 @@ def test_the_audit_file_knows_the_keys_of_the_command_line(
     for line, operation, status in ((created, "create_key", 201), (deleted, "delete_key", 200)):
         told = (line["message"], line["principal"], line["operation"], line["changed_key_name"], line["status"])
         assert told == ("change", "owner", operation, "robot-7", status)
-    assert (created["role"], created["maps"]) == ("query", ["lab"])
+    assert (created["role"], created["maps"]) == ("enrol", ["lab"])
 
 
 def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Path) -> None:
@@ -63,7 +74,7 @@ def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Pa
     assert (
         "neither a span" in placerec("keys", "create", "ann", "--role", "query", "--expires", "soon", status=1).stderr
     )
-    Keys.of(tmp_path / "data").create("ann", "query")
+    Keys.of(tmp_path / "data").create("ann", "admin")
     assert "already" in placerec("keys", "create", "ann", "--role", "query", status=1).stderr
     (tmp_path / "data" / "keys.sqlite").write_bytes(b"no database")
     for words in (("list",), ("delete", "ann"), ("create", "bob", "--role", "query")):

@@ -27,7 +27,7 @@ def test_a_second_look_is_recognized_where_the_threshold_lets_it(
     assert [match["rank"] for match in again["matches"]] == [1, 2, 3]
     assert (tenth["verdict"], tenth["place"]["id"]) == ("recognized", "10")
 
-    placerec("maps", "edit", "lab", "--threshold", 1000)
+    placerec("maps", "edit", "lab", "--threshold", 1)
     strict = json.loads(placerec("query", tmp_path / "again.png", "-m", "lab", "--json").stdout)
     assert (strict["verdict"], strict["place"]) == ("unknown", None)
     assert strict["matches"][0]["place"]["id"] == "9"

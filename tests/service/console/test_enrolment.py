@@ -205,7 +205,8 @@ def test_what_a_run_taught_is_shown_and_undone(admin: Operator, keyed: Server) -
     row = page.get_by_role("region", name="Lessons").get_by_role("row").nth(1)
     expect(row.get_by_role("cell").nth(4)).to_have_text(str(lesson["proposals"]))
     assert lesson["calibration"]["outcome"] == "proposed"
-    expect(row.get_by_role("cell").nth(7)).to_contain_text(re.compile(r"proposed error 0\.\d+ → 0\.\d+"))
+    figures = re.compile(r"proposed error 0\.\d+ → 0\.\d+, recall \d\.\d+ → \d\.\d+")
+    expect(row.get_by_role("cell").nth(7)).to_contain_text(figures)
 
     one = learnt[0]  # one by one, by run, or within the lasso
     group.get_by_role("button", name=f"Remove the look {one['name']} of {one['place']}").click()

@@ -15,6 +15,7 @@ import pytest
 
 from core.frames.images import decode
 from service.access.keys import Keys
+from tests.service.commands.conftest import Placerec, placerec
 from tests.service.map_jobs import finished
 from tests.service.scenes import encoded
 from tests.service.server import Server, typed
@@ -22,6 +23,8 @@ from tests.service.server import Server, typed
 CORRIDOR = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
 DARK = range(25, 40)
 SAME = 3.0
+
+__all__ = ["placerec"]
 
 pytestmark = [
     pytest.mark.thorough,
@@ -101,7 +104,7 @@ def proposals(server: Server, map_id: str) -> list[dict[str, Any]]:
     return [frame for frame in page["items"] if "proposal" in frame["answer"]]
 
 
-def test_a_run_teaches_what_it_saw_in_the_dark(running: Server) -> None:
+def test_a_run_teaches_what_it_saw_in_the_dark(running: Server, placerec: Placerec) -> None:
     answers = drive(running, "hall")
     doubted = [n for n in DARK if answers[n]["single"]["verdict"] != "recognized"]
     assert len(doubted) >= 8, "the dark hides too little for a test"
@@ -109,6 +112,10 @@ def test_a_run_teaches_what_it_saw_in_the_dark(running: Server) -> None:
     assert result["frames"] == len(answers) and result["contradiction"] is None
     found = proposals(running, "hall")
     assert result["proposals"] == len(found) >= len(doubted) / 2
+    assert result["proposals"] + sum(result["refused"].values()) == result["frames"], "each frame has its reason"
+    latest, url = running.client.get("/v1/jobs").json()["items"][0]["id"], str(running.client.base_url)
+    shown = " ".join(placerec("jobs", "show", latest, "--url", url).stdout.split())
+    assert f"recognized: {result['refused']['recognized']}" in shown
     for frame in found:
         proposal, alone = frame["answer"]["proposal"], frame["answer"]
         assert alone["verdict"] != "recognized" and proposal["certainty"] >= 0.95 and proposal["why"]
@@ -128,9 +135,17 @@ def test_a_run_teaches_what_it_saw_in_the_dark(running: Server) -> None:
         if (place := answer["single"]["place"]) and abs(int(place["id"][1:]) - n) > SAME + 2
     ]  # fmt: skip
     assert len(right) >= len(found) / 2 and not wrong
+    said = {frame["id"]: frame["label"] for frame in proposals(running, "hall") if frame["label"]}
+    assert len(said) == len(found) and all(label["look"] for label in said.values())
     undone = running.client.delete("/v1/maps/hall/looks", params={"run": result["session"]}).json()
     assert undone["looks"] == len(found)
     assert running.client.get("/v1/maps/hall/looks").json()["items"] == []
+    labels = {frame["id"]: frame["label"] for frame in proposals(running, "hall") if frame["label"]}
+    for label in said.values():
+        del label["look"]
+    assert labels == said, "they say the place alone"
+    drive(running, "hall")
+    assert lessons(running, "hall")[0]["refused"]["not kept"] == len(found), "a person has labelled these very files"
 
 
 def test_a_run_with_wrong_odometry_teaches_nothing(running: Server) -> None:

@@ -9,9 +9,12 @@ from typing import Any
 import pytest
 
 from service.access.keys import Keys
+from tests.service.commands.conftest import Placerec, placerec
 from tests.service.learning.test_lessons import CORRIDOR, SAME, drive, frames_of, lessons, taught
 from tests.service.map_jobs import finished, wait_until
 from tests.service.server import Server, assert_problem
+
+__all__ = ["placerec"]
 
 pytestmark = [
     pytest.mark.thorough,
@@ -130,7 +133,9 @@ def walked_twice(keyed: tuple[Server, list[str]]) -> Server:
     return server
 
 
-def test_an_alignment_proposes_a_calibration(walked_twice: Server) -> None:
+def test_an_alignment_proposes_a_calibration(
+    walked_twice: Server, placerec: Placerec, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server, path = walked_twice, "/v1/maps/twice"
     assert "calibration" not in aligned(server, "twice", dry_run=True), "nothing is aligned yet"
     set_learning(server, "twice", "off")
@@ -141,7 +146,18 @@ def test_an_alignment_proposes_a_calibration(walked_twice: Server) -> None:
     assert (told["outcome"], told["frames"]) == ("proposed", 60)
     before, after = told["error"]
     assert after < before
+    monkeypatch.setenv("PLACEREC_URL", str(server.client.base_url))
+    monkeypatch.setenv("PLACEREC_KEY", server.client.headers["Authorization"].removeprefix("Bearer "))
+    once_more = " ".join(placerec("maps", "align", "twice", "--sequence", "later").stdout.split())
+    change = "recall {:.3f} → {:.3f}, precision {:.3f} → {:.3f}"
+    assert f"proposed, by 60 frames: {change.format(*told['recall'], *told['precision'])}" in once_more
     found = calibration(server, "twice")
+    held = found["measured"]["report"]["measurement"]["cross_validated"]
+    for name in ("recall", "precision"):
+        assert told[name] == pytest.approx([found["now"][name]["value"], held[name]["value"]], abs=1e-4)
+    shown = " ".join(placerec("maps", "show", "twice").stdout.split())
+    effects = [found[which][share]["value"] for share in ("recall", "precision") for which in ("now", "proposed")]
+    assert f"aligned:later: {change.format(*effects)}" in shown
     report = found["measured"]["report"]
     assert (report["method"], report["stored"]) == ("sequence", False) and found["proposed"] is not None
     assert found["calibration"]["source"] == "encoder-default", "nothing is stored"
@@ -149,6 +165,7 @@ def test_an_alignment_proposes_a_calibration(walked_twice: Server) -> None:
     order, tag = {"calibration": {"measured_at": found["measured"]["at"]}}, f'"{found["revision"]}"'
     assert server.client.patch(path, json=order, headers={"If-Match": tag}).status_code == 200
     assert calibration(server, "twice")["calibration"]["source"] == "aligned:later"
+    assert "proposed calibration" not in placerec("maps", "show", "twice").stdout, "it is in force"
     assert aligned(server, "twice")["calibration"]["outcome"] == "holds", "there is nothing to gain any more"
     assert "calibration" not in aligned(server, "twice", **{"with": []}), "the traverses were parted again"
 

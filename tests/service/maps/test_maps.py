@@ -211,13 +211,22 @@ def test_editing_is_a_merge_patch(client: httpx.Client, map_id: str) -> None:
 def test_a_calibration_set_by_hand(client: httpx.Client, map_id: str) -> None:
     path = f"/v1/maps/{map_id}"
     default = client.get(path).json()["calibration"]
-    own = client.patch(path, json={"calibration": {"threshold": 3.25}}).json()["calibration"]
-    assert own == default | {"source": "manual", "threshold": 3.25}
+    own = client.patch(path, json={"calibration": {"threshold": 0.75}}).json()["calibration"]
+    assert own == default | {"source": "manual", "threshold": 0.75}
     more = client.patch(path, json={"calibration": {"margin": 0.5}}).json()["calibration"]
-    assert (more["threshold"], more["margin"]) == (3.25, 0.5)
+    assert (more["threshold"], more["margin"]) == (0.75, 0.5)
     back = client.patch(path, json={"calibration": {"threshold": None}}).json()["calibration"]
     assert (back["threshold"], back["margin"]) == (default["threshold"], 0.5)
     assert client.patch(path, json={"calibration": None}).json()["calibration"] == default
+
+
+def test_a_threshold_out_of_reach_is_refused(client: httpx.Client, map_id: str) -> None:
+    path = f"/v1/maps/{map_id}"
+    refused = client.patch(path, json={"calibration": {"threshold": 5}})
+    assert refused.status_code == 422 and refused.json()["type"].endswith("invalid-request")
+    assert "from -1 to 1" in refused.json()["detail"]
+    for edge in (-1.0, 1.0):
+        assert client.patch(path, json={"calibration": {"threshold": edge}}).is_success
 
 
 @pytest.mark.parametrize(
@@ -230,6 +239,8 @@ def test_a_calibration_set_by_hand(client: httpx.Client, map_id: str) -> None:
         {"same_place_radius": -1},
         {"calibration": {"source": "me"}},
         {"calibration": {"margin": -1}},
+        {"calibration": {"threshold": 1.01}},
+        {"calibration": {"threshold": -1.01}},
         {"calibration": 3},
         [],
     ],

@@ -30,12 +30,14 @@ def test_a_map_from_its_making_to_its_end(placerec: Placerec, where: list[str]) 
     again = placerec("maps", "create", name, *where, status=1)
     assert name in again.stderr
 
-    edited = placerec("maps", "edit", name, "--threshold", 2.25, "--keep", "image", "--json", *where)
-    assert json.loads(edited.stdout)["calibration"]["threshold"] == 2.25
+    edited = placerec("maps", "edit", name, "--threshold", 0.25, "--keep", "image", "--json", *where)
+    assert json.loads(edited.stdout)["calibration"]["threshold"] == 0.25
     assert json.loads(edited.stdout)["description"] == "by day"
     table = placerec("maps", "show", name, *where).stdout
-    assert "threshold 2.250" in table
+    assert "threshold 0.250" in table
     assert "by day" in table
+    unreachable = placerec("maps", "edit", name, "--threshold", 5, *where, status=1)
+    assert "from -1 to 1" in " ".join(unreachable.stderr.split())
     default = placerec("maps", "edit", name, "--default-calibration", "--json", *where)
     assert json.loads(default.stdout)["calibration"]["source"] == "encoder-default"
 
@@ -91,6 +93,9 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     assert "Deleted: 1, 2." in placerec(*delete, "1", *where, stdin="y\n").stderr
     listed = json.loads(placerec("maps", "places", "list", name, "--sequence", "monday", "--json", *where).stdout)
     assert [place["id"] for place in listed] == ["9", "10"]
+    missing = placerec("maps", "sequences", "delete", name, "nosuch", "--erase", "--yes", *where, status=1)
+    assert f"The map {name} has no sequence nosuch; nothing was deleted." in missing.stderr
+    assert "nosuch" in placerec("maps", "sequences", "delete", name, "nosuch", "--yes", *where, status=1).stderr
     forgotten = placerec("maps", "sequences", "delete", name, "monday", "--yes", *where)
     assert "2 places" in forgotten.stderr
     assert json.loads(placerec("maps", "sequences", "list", name, "--json", *where).stdout) == []

@@ -92,6 +92,7 @@ def test_aligning_traverses(placerec: Placerec, where: list[str], tmp_path: Path
     assert "0 of 12 frames show places of other traverses" in first
     second = placerec("enrol", tmp_path / "day1", "--map", name, "--align", *where).stdout
     assert "frames show places of other traverses (day0: 1" in second
+    assert "Calibration: impossible: A calibration rests on at least" in " ".join(second.split())
     asked = ("maps", "align", name, "--sequence", "day1", "--json", *where)
     told = json.loads(placerec(*asked, "--with", "day0", "--no-poses", "--dry-run").stdout)
     assert told["arguments"] == {"sequence": "day1", "with": ["day0"], "poses": False, "dry_run": True}
