@@ -20,9 +20,9 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.vlad import aggregate
 from core.threads import allowed_threads, cores, share_cores, use_threads
-from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import jpeg, sample_frame
 from service.commands.timing.stages import better_forward, encoding_runs, medians
+from service.malloc import configure_malloc
 
 LIMIT = 1.3
 TOGETHER = 8

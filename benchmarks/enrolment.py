@@ -25,7 +25,7 @@ from benchmarks.report import report, verdict
 from benchmarks.service import BATCH, SETTLE, encode_in_batches
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import allowed_threads, share_cores
-from service.commands.malloc import configure_malloc
+from service.malloc import configure_malloc
 
 LIMIT = 0.7
 

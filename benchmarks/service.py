@@ -34,9 +34,9 @@ from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from core.threads import allowed_threads, cores, share_cores
 from service.commands.load import measure
-from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import fill_map
 from service.commands.timing.stages import encode_batch
+from service.malloc import configure_malloc
 
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query?verify=never"

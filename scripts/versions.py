@@ -3,6 +3,8 @@
     python3 scripts/versions.py           # what stands where
     python3 scripts/versions.py 1.0.0     # sets it everywhere but in openapi.json, which scripts/release makes anew
 
+Where CHANGELOG.md says of the version that it is not released yet, it says today's date instead.
+
 Only the standard library is used.
 """
 
@@ -11,10 +13,12 @@ from __future__ import annotations
 import re
 import sys
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"\d+\.\d+\.\d+"
+CHANGES, UNRELEASED = "CHANGELOG.md", "not released yet"
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,11 @@ def _match(place: Place, text: str) -> re.Match[str]:
     return matches[0]
 
 
-def put(version: str, root: Path = ROOT) -> None:
-    """Write a version to all places but those that are made from them.
+def put(version: str, root: Path = ROOT, day: date | None = None) -> None:
+    """Write a version to all places but those that are made from them, and its day to the changelog.
+
+    Args:
+        day: of the release; None: today.
 
     Raises:
         ValueError: it is no version of three numbers, a place has none, or the changelog says nothing of it; nothing is
@@ -71,12 +78,15 @@ def put(version: str, root: Path = ROOT) -> None:
     """
     if not re.fullmatch(NUMBER, version):
         raise ValueError(f"{version} is no version of three numbers")
-    if not re.search(rf"^## {re.escape(version)}\b", (root / "CHANGELOG.md").read_text(), re.MULTILINE):
-        raise ValueError(f"CHANGELOG.md has no section {version}")
+    changes = (root / CHANGES).read_text()
+    if not re.search(rf"^## {re.escape(version)}\b", changes, re.MULTILINE):
+        raise ValueError(f"{CHANGES} has no section {version}")
     texts = {place.path: (root / place.path).read_text() for place in PLACES}
     for place in PLACES:
         _match(place, texts[place.path])
         texts[place.path] = place.expression().sub(rf"\g<1>{version}\g<3>", texts[place.path])
+    heading = f"\n## {version} – "
+    texts[CHANGES] = changes.replace(f"{heading}{UNRELEASED}\n", f"{heading}{day or date.today()}\n")
     for path, text in texts.items():
         (root / path).write_text(text)
 

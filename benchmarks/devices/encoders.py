@@ -28,8 +28,8 @@ from core.method.encoder import Encoder
 from core.recognition.stages import agree
 from core.storage import Atlas, Map
 from core.threads import share_cores
-from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import write_map
+from service.malloc import configure_malloc
 
 LIMIT = 1.1
 TOGETHER, ANSWER, SERVED = "both together", "query over HTTP, until the answer", "query over HTTP, processor time"

@@ -26,8 +26,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.backbone import Device
 from core.threads import cores, share_cores
-from service.commands.malloc import configure_malloc
 from service.commands.timing.samples import sample_frame
+from service.malloc import configure_malloc
 
 ON_A_GPU = 4
 """Threads to a core where the forward pass is on a GPU, for a thread sleeps while it is computed there."""

@@ -7,7 +7,7 @@ others wait for, loads no other command.
 
 import sys
 
-from service.commands.malloc import configure_malloc
+from service.malloc import configure_malloc
 
 
 def main() -> None:

@@ -52,7 +52,7 @@ def _serve(settings: Settings) -> None:
 
 
 def _serve_logged(settings: Settings) -> None:
-    gc.disable()  # all of it lives as long as the process: the engine freezes it once it has loaded
+    gc.disable()
     from service.app.application import create_app
     from service.http.connections import Connections
     from service.http.server import CannotListen, serve_application
@@ -60,6 +60,7 @@ def _serve_logged(settings: Settings) -> None:
     from service.settings import SettingsError
     from service.telemetry.requests import configure_logging
 
+    gc.freeze()  # all of it lives as long as the process, so the garbage collector need not go through it
     gc.enable()
     configure_logging(settings.log_level)
     try:

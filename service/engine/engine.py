@@ -36,6 +36,7 @@ from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Answered, Searches, search_ahead
 from service.engine.stores import OpenStore
 from service.events.events import Events
+from service.malloc import return_free_memory
 from service.settings import Settings
 from service.telemetry.metrics import MapCollector, Metrics
 from service.worker_threads import in_thread as in_thread
@@ -164,6 +165,7 @@ class Engine:
             # Objects that are loaded by now live as long as the process: the garbage collector can skip them.
             gc.collect()
             gc.freeze()
+            await in_thread(return_free_memory)  # what loading took and needs no more
             self.encoder_state = "ok"
             log.info("ready", extra={"encoder": identity, "seconds": round(time.perf_counter() - began, 2)})
 

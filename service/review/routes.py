@@ -103,7 +103,7 @@ def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
 
 
 @router.get(
-    "/{frame}/picture",
+    "/{frame:int}/picture",
     response_class=Response,
     responses={
         200: {"description": "The file as it was sent.", "content": {kind: {"schema": BINARY} for kind in FORMATS}},
@@ -118,7 +118,7 @@ def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) ->
 
 
 @router.post(
-    "/{frame}",
+    "/{frame:int}",
     dependencies=[Depends(json_body)],
     responses=problem_documentation(
         errors.UnknownFrame,

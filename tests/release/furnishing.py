@@ -24,7 +24,7 @@ from core.ledger import Tables
 from core.storage import review
 from core.storage.atlas import FORMAT
 from core.storage.database import schema
-from placerec_client import Client, Map
+from placerec_client import Client, Map, NewPlace
 from service.access import key_table
 from service.access.keys import Keys
 from service.jobs import rows
@@ -128,6 +128,7 @@ def converse(client: Client) -> None:
     assert hall.coverage(x=2.2, y=0.0).state == "covered" and hall.calibration(threshold=0.5).map == "hall"
     edited = hall.edit({"description": "the hall"}, if_match=hall.read().revision)
     assert edited.description == "the hall"
+    administer(client, hall)
     with hall.sessions.begin(advance=1) as run:
         for number in (0, 1, 2):
             run.send(again(number), forward=2.0)
@@ -137,6 +138,28 @@ def converse(client: Client) -> None:
     hall.places.delete("p9")
     assert hall.sequences.delete("monday").places == 4 and hall.read().places == 0
     attic.delete()
+
+
+def administer(client: Client, hall: Map) -> None:
+    """Change what operators change, and leave the places that there were; nothing in it ages."""
+    assert hall.cameras.put("rear", mask={"polygons": [[(0, 0), (1, 0), (1, 0.1)]]}).name == "rear"
+    assert hall.cameras.read("rear").mask
+    hall.cameras.delete("rear")
+    (look,) = [one.name for one in hall.places.looks("p1")]
+    assert hall.places.look_thumbnail("p1", look) and [one.name for one in hall.places.all_looks()] == [look]
+    hall.places.delete_look("p1", look)
+    batch = [NewPlace(f"p{number}", elsewhere(number), {"sequence": "tuesday"}) for number in (7, 8)]
+    assert [one.change for one in hall.enrol(batch, known=())] == ["created"] * 2
+    assert hall.places.delete_many(ids=["p7"], dry_run=False).ids == ["p7"]
+    assert hall.erase(ids=["p8"]).wait().state == "succeeded"
+    assert hall.keypoints().wait().state == "succeeded"
+    assert hall.answers().items and hall.places.matches("p0").items and client.regions(jpeg(0))
+    frame = next(one.id for one in hall.review)
+    assert hall.review.picture(frame) and hall.review.label(frame, discard=True).discarded
+    assert hall.review.stretches() == [] and any(one.default for one in client.encoders.list())
+    made = client.keys.create("robot-8", "enrol", maps=["hall"])
+    assert client.keys.read(made.id).name == "robot-8"
+    assert client.keys.narrow(made.id, {"role": "query"}).role == "query" and client.keys.delete(made.id).id == made.id
 
 
 @contextmanager

@@ -7,11 +7,12 @@ import json
 import re
 import shutil
 import subprocess
+from datetime import date
 from pathlib import Path
 
 import pytest
 
-from scripts.versions import MADE, PLACES, SOURCE, found, put
+from scripts.versions import CHANGES, MADE, PLACES, SOURCE, UNRELEASED, found, put
 from tests.project.sources import ROOT
 
 
@@ -22,7 +23,7 @@ def checkout(tmp_path: Path) -> Path:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / path, tmp_path / path)
     changes = tmp_path / "CHANGELOG.md"
-    changes.write_text(changes.read_text() + "\n## 7.8.9\n")
+    changes.write_text(changes.read_text() + "\n## 7.8.9 – not released yet\n")
     return tmp_path
 
 
@@ -44,13 +45,19 @@ def test_it_stands_nowhere_else() -> None:
 
 
 def test_one_command_sets_it_everywhere(checkout: Path) -> None:
-    put("7.8.9", checkout)
+    put("7.8.9", checkout, date(2031, 5, 4))
     versions = found(checkout)
     assert {versions[place] for place in PLACES} == {"7.8.9"}
     for place in PLACES:
         was, now = (root.joinpath(place.path).read_text().splitlines() for root in (ROOT, checkout))
         changed = [line for line, other in zip(was, now, strict=True) if line != other]
         assert len(changed) == sum(one.path == place.path for one in PLACES), "more than the version has changed"
+    expected = (ROOT / CHANGES).read_text() + "\n## 7.8.9 – 2031-05-04\n"
+    assert (checkout / CHANGES).read_text() == expected, "more than the day of this version has changed"
+
+
+def test_the_changelog_does_not_call_the_present_version_unreleased() -> None:
+    assert f"\n## {found()[SOURCE]} – {UNRELEASED}" not in (ROOT / CHANGES).read_text()
 
 
 @pytest.mark.parametrize("version", ["1.0", "v1.0.0", "1.0.0rc1", "6.6.6"])

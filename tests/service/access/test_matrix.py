@@ -25,7 +25,10 @@ from tests.service.access.test_access import asking
 
 DOCUMENT: dict[str, Any] = json.loads((Path(__file__).parents[3] / "openapi.json").read_text())
 ROLES: tuple[Role, ...] = ("query", "enrol", "admin")
-NAMED = {"map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e"}
+NAMED = {
+    "map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e",
+    "frame": "1",
+}  # fmt: skip
 
 PROBLEMS = {"none": "key-needed", "basic": "key-needed", "cut": "key-needed", "twice": "key-needed"}
 PROBLEMS |= dict.fromkeys(("unknown", "wrong", "revoked", "expired"), "key-refused")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import json
+import re
+from typing import Any
 
 import httpx
 import pytest
@@ -14,8 +17,10 @@ from service.app.application import create_app
 from service.errors import faults
 from service.errors.problems import BY_STATUS, KINDS, TYPE_PREFIX, kind_of, problem_of
 from service.settings import Settings
-from tests.service.server import assert_problem
+from tests.service.server import ROOT, assert_problem
 
+INTERFACE: dict[str, Any] = json.loads((ROOT / "openapi.json").read_text())["paths"]
+METHODS = {"get", "put", "post", "patch", "delete"}
 CONTRACT = {400, 401, 403, 404, 405, 406, 408, 409, 410, 412, 413, 414, 415, 416, 422, 429, 431, 500, 501, 503, 507}
 OURS = [
     cls
@@ -79,6 +84,21 @@ def test_wrong_methods(client: httpx.Client, method: str, path: str, allowed: st
     response = client.request(method, path)
     assert_problem(response, 405, "method-not-allowed")
     assert response.headers["allow"] == allowed
+
+
+@pytest.mark.parametrize("path", INTERFACE)
+def test_the_methods_of_a_path_are_those_that_it_documents(client: httpx.Client, path: str) -> None:
+    """A path with a name in the place of an id, such as ``review/labels``, is not taken for the one with the id."""
+    methods = {method.upper() for method in INTERFACE[path] if method in METHODS}
+    methods |= {"HEAD"} if "GET" in methods else set()
+    concrete = re.sub(r"\{\w+\}", "1", path)
+    response = client.options(concrete)
+    assert_problem(response, 405, "method-not-allowed")
+    assert response.headers["allow"] == ", ".join(sorted(methods))
+    if path == "/v1/maps/import":
+        return  # other methods take it for the id of a map, which none can have
+    for method in METHODS - {one.lower() for one in methods}:
+        assert client.request(method, concrete).status_code == 405, method
 
 
 def test_head_is_answered_like_get(client: httpx.Client) -> None:

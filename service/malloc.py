@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from contextlib import suppress
 
 MIB = 1 << 20
 
@@ -40,3 +41,9 @@ def configure_malloc() -> bool:
         return False
     done = [mallopt(name, value) == 1 for name, value in OPTIONS.items()]  # all of them, even if one fails
     return all(done)
+
+
+def return_free_memory() -> None:
+    """Return the pages of all freed blocks to the system; of another C library than glibc, nothing is asked."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
