@@ -293,6 +293,8 @@ def test_jobs_on_a_map_know_its_looks(server: Server, hall: str) -> None:
     verified = client.post(f"/v1/maps/{other}/verify").json()
     assert verified["ok"] and (verified["places"], verified["rows"]) == (6, 7)
     client.delete(f"/v1/maps/{other}")
+    refused = client.post(f"/v1/maps/{hall}/re-encode", json={"to": "without-images"})
+    assert assert_problem(refused, 409, "images-missing")["detail"].startswith("7 frames of the 6 places")
 
 
 def test_a_new_encoding_brings_looks_along(server: Server) -> None:
