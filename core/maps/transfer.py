@@ -21,7 +21,7 @@ class Transfer(Protocol):
         """
 
     def count_without_image(self) -> int:
-        """How many places keep no original image."""
+        """How many places and looks keep no original image."""
 
     def sequence_ends(self) -> dict[str | None, int]:
         """The ordinal that the next place of each sequence will get; the key None is for places without a sequence."""

@@ -43,6 +43,11 @@ _MAPS = "maps"
 _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"
 
 
+def has_map(directory: Path, map_id: str) -> bool:
+    """Whether a data directory, which a service may be using, has a map of this id, sound or damaged."""
+    return (directory / _MAPS / map_id).is_dir()
+
+
 class Atlas:
     """All maps of a data directory (:class:`core.maps.store.Store`).
 

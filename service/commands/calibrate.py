@@ -187,6 +187,9 @@ def _of_recording(path: Path, topic: str | None, ids: list[str]) -> Iterator[byt
 def _target(precision: float | None, false_accept_rate: float | None, mean_of_negatives: bool) -> dict[str, Any]:
     if (precision is not None) + (false_accept_rate is not None) + mean_of_negatives > 1:
         raise typer.BadParameter("give at most one of --precision, --false-accept-rate and --mean-of-negatives")
+    for option, share in (("--precision", precision), ("--false-accept-rate", false_accept_rate)):
+        if share is not None and not 0 < share < 1:
+            raise typer.BadParameter(f"{option} is a share between 0 and 1, such as 0.95 for 95 %, not {share:g}")
     if mean_of_negatives:
         return {"rule": "mean_of_negatives"}
     if false_accept_rate is not None:

@@ -71,6 +71,8 @@ def create(
     if is_first:
         remark("From now on every request needs a key.")
     remark(f"The key {key.name} ({key.id}, {_described(key)}) is shown only this once. Store it now.")
+    for absent in _absent(data_dir, maps or []):
+        remark(f"There is no map {absent} yet: is the name mistyped? The maps of a key cannot be changed here.")
 
 
 @keys.command("list")
@@ -132,6 +134,14 @@ def _store(data_dir: Any) -> Keys:
     if database is not None:
         atexit.register(database.close)
     return Keys.of(settings.data_dir, database)
+
+
+def _absent(data_dir: Any, maps: list[str]) -> list[str]:
+    """Those of the maps that the data directory does not have; none if maps are in a database."""
+    from core.storage.atlas import has_map
+
+    settings = read_settings(data_dir)
+    return [name for name in maps if settings.database is None and not has_map(settings.data_dir, name)]
 
 
 def _note(data_dir: Any, operation: str, key: Key, status: int, **fields: object) -> None:

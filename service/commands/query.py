@@ -219,8 +219,9 @@ async def _ask(service: Service, map_id: str, data: bytes, parameters: dict[str,
 
 def _cells(answer: dict[str, Any]) -> list[str]:
     matches = answer["matches"]
+    reason = f" ({answer['reason']})" if answer["reason"] else ""  # such as no-place-allowed, of a mistyped traverse
     return [
-        answer["verdict"],
+        answer["verdict"] + reason,
         answer["place"]["id"] if answer["place"] else "–",
         number(answer["probability"]),
         number(answer["score"]),

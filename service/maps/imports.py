@@ -218,7 +218,7 @@ class Imports:
         """
         name, map_id = str(context.arguments["file"]), str(context.arguments["to"])
         if (made := context.notes.get("result")) is not None and self._is_listed(made):
-            return dict(made)  # the process was killed after the map was listed and before the job ended
+            return self._counted(made)  # the process was killed after the map was listed and before the job ended
 
         def advance(done: int, total: int) -> None:
             context.check_cancelled()
@@ -238,7 +238,13 @@ class Imports:
             )
 
         self._build(name, map_id, advance, before_listing)
-        return dict(context.notes["result"])
+        return self._counted(context.notes["result"])
+
+    def _counted(self, made: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The result of a job with the places of its map alone; the file counts their looks, too."""
+        with suppress(UnknownMap):  # it was deleted at once
+            return {**made, "places": self._engine.maps.find(made["map"]).count_places()}
+        return dict(made)
 
     def _build(
         self,

@@ -428,7 +428,7 @@ def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: Bas
     except PlacerecError as further:
         raise StorageFailure(
             f"The merge failed ({error or type(error).__name__}), and the places that it had copied could not be "
-            f"removed ({further}): places of the map {context.arguments['from']} remain; merge it again or forget them."
+            f"removed ({further}): places of the map {context.arguments['from']} remain; merge it again or delete them."
         ) from error
 
 

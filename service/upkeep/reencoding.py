@@ -43,8 +43,9 @@ def check_images(map_: Map) -> None:
     """
     if missing := map_.transfer.count_without_image():
         raise ImagesMissing(
-            f"{missing} of the {map_.count_places()} places of the map {map_.record.id} keep no image, so they cannot "
-            "be encoded again: enrol their frames again while the map keeps images, or forget them."
+            f"{missing} frames of the {map_.count_places()} places of the map {map_.record.id} and of their looks are "
+            "not kept as images, so they cannot be encoded again: enrol them again while the map keeps images, or "
+            "delete these places and looks."
         )
 
 
@@ -156,7 +157,8 @@ class _Reencoding:
         """Copy to the new map what differs in the old map now."""
         due, theirs, gone = self._differences()
         if missing := sum(place.picture != "image" for place in due):
-            raise ImagesMissing(f"{missing} places of the map {self.source.record.id} no longer keep an image.")
+            map_id = self.source.record.id
+            raise ImagesMissing(f"{missing} places and looks of the map {map_id} no longer keep an image.")
         self.made.transfer.forget(gone)
         total = len(theirs) + len(due)
         for first in range(0, len(due), PLACES_PER_COMMIT):

@@ -195,7 +195,7 @@ async def _save(service: Service, folder: Path, index: BackupIndex, map_id: str)
     )
     index.put(entry)
     _write_index(folder, index)
-    remark(f"{map_id}: {entry.places} places in {file.name}.")
+    remark(f"{map_id}: {entry.places} places and looks in {file.name}.")
 
 
 def _rename(downloaded: Path, file: Path) -> None:
@@ -255,7 +255,7 @@ def _held(folder: Path) -> Iterator[None]:
 def verify(folder: Folder, only: Maps = None) -> None:
     """Read every file of a backup and compare it with its checksums. This needs no service."""
     index, damaged = read_index(folder), []
-    shown = table("map", "#places", "#bytes", "saved", "state")
+    shown = table("map", "#places and looks", "#bytes", "saved", "state")
     for entry in _chosen(index, only):
         state = "good" if entry.listed else "good; no longer in the service"
         try:

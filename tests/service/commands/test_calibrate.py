@@ -81,6 +81,8 @@ def test_what_it_refuses(placerec: Placerec, tmp_path: Path, strip: str, there: 
     both = ("--sequence", "tuesday", "--precision", 0.9, "--mean-of-negatives")
     assert "give at most one of" in placerec("calibrate", strip, *both, *there, status=2).stderr
     assert "needs --sequence" in placerec("calibrate", strip, "--itself", "--pairs", tmp_path, *there, status=2).stderr
+    percent = placerec("calibrate", strip, "--sequence", "tuesday", "--precision", 95, *there, status=2).stderr
+    assert "a share between 0 and 1" in " ".join(percent.replace("│", " ").split())
     empty = tmp_path / "empty.csv"
     empty.write_text("file,place\n")
     assert "no row" in placerec("calibrate", strip, "--frames", empty, *there, status=1).stderr

@@ -52,6 +52,13 @@ def test_the_first_key_can_manage_the_service(placerec: Placerec, tmp_path: Path
     assert [key["name"] for key in json.loads(placerec("keys", "list", "--json").stdout)] == ["ann", "robot-7"]
 
 
+def test_a_map_that_is_not_there_is_named(placerec: Placerec) -> None:
+    placerec("maps", "create", "lab")
+    placerec("keys", "create", "ann", "--role", "admin")
+    told = placerec("keys", "create", "robot-7", "--role", "query", "--map", "lab", "--map", "lob").stderr
+    assert "There is no map lob yet" in told and "no map lab" not in told
+
+
 def test_the_audit_file_knows_the_keys_of_the_command_line(
     placerec: Placerec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

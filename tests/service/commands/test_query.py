@@ -106,3 +106,12 @@ def test_what_is_known_of_the_place(placerec: Placerec, server: Server, traverse
     assert ids("--near", "10,0", "--radius", 2, "--geographic") == set()
     assert "two numbers" in placerec(*asked, "--near", "10", "--radius", 2, status=1).stderr
     assert "radius" in placerec(*asked, "--near", "10,0", status=1).stderr
+
+
+def test_the_table_says_why_there_was_nothing_to_compare(
+    placerec: Placerec, server: Server, traverse: str, tmp_path: Path
+) -> None:
+    (tmp_path / "again.jpg").write_bytes(encoded(scene(5)))
+    asked = ("query", tmp_path / "again.jpg", "-m", traverse, "--url", server.client.base_url)
+    assert "unknown (no-place-allowed)" in placerec(*asked, "--sequences", "mondy").stdout
+    assert "(" not in placerec(*asked).stdout

@@ -268,10 +268,13 @@ def test_the_listeners_of_a_map_hear_of_looks(server: Server, hall: str) -> None
 def test_a_map_keeps_its_looks_in_a_file(server: Server, hall: str) -> None:
     client = server.client
     exported = client.get(f"/v1/maps/{hall}/export").content
-    made = client.post(
-        "/v1/maps/import", params={"id": f"{hall}-2"}, content=exported, headers={"Content-Type": "application/x-tar"}
-    )
+    headers = {"Content-Type": "application/x-tar"}
+    made = client.post("/v1/maps/import", params={"id": f"{hall}-2"}, content=exported, headers=headers)
     assert made.status_code == 201 and made.json()["places"] == 6
+    as_job = {"id": f"{hall}-3", "background": "true"}
+    job = finished(server, client.post("/v1/maps/import", params=as_job, content=exported, headers=headers).json())
+    assert job["result"]["places"] == 6, "the look is no place"
+    client.delete(f"/v1/maps/{hall}-3")
     assert server.query(f"{hall}-2", again(71))["place"]["id"] == "p1"
     (here,), (there,) = (client.get(f"/v1/maps/{name}/looks").json()["items"] for name in (hall, f"{hall}-2"))
     assert here == there
@@ -290,6 +293,8 @@ def test_jobs_on_a_map_know_its_looks(server: Server, hall: str) -> None:
     verified = client.post(f"/v1/maps/{other}/verify").json()
     assert verified["ok"] and (verified["places"], verified["rows"]) == (6, 7)
     client.delete(f"/v1/maps/{other}")
+    refused = client.post(f"/v1/maps/{hall}/re-encode", json={"to": "without-images"})
+    assert assert_problem(refused, 409, "images-missing")["detail"].startswith("7 frames of the 6 places")
 
 
 def test_a_new_encoding_brings_looks_along(server: Server) -> None:

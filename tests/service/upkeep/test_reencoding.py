@@ -101,7 +101,7 @@ def test_a_request_that_cannot_be_fulfilled_is_refused(
         fill(server, "bare", 2, keep="thumbnail")
     problem = assert_problem(server.client.post("/v1/maps/bare/re-encode", json=body), status, slug)
     if slug == "images-missing":
-        assert problem["detail"].startswith("2 of the 2 places")
+        assert problem["detail"].startswith("2 frames of the 2 places")
 
 
 def test_a_name_that_is_taken_is_refused(server: Server) -> None:

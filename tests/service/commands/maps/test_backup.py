@@ -134,7 +134,7 @@ def test_backup_and_restore(
     times = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.tar")}
     assert server.enrol("hall-to-save", "q", jpeg(6)).status_code == 201
     told = placerec("backup", "create", folder, *chosen, *url).stderr
-    assert f"{lab}: unchanged" in told and "hall-to-save: 2 places" in told
+    assert f"{lab}: unchanged" in told and "hall-to-save: 2 places and looks in" in told
     now = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.tar")}
     assert len(now) == 2 and {name: at for name, at in now.items() if name in times} == {
         name: at for name, at in times.items() if name.startswith(lab)
@@ -143,7 +143,7 @@ def test_backup_and_restore(
     (saved,) = folder.glob(f"{lab}.*.tar")
     damaged(saved)
     assert f"Damaged: {lab}" in placerec("backup", "verify", folder, status=1).stderr
-    assert f"{lab}: 3 places" in placerec("backup", "create", folder, *chosen, *url).stderr
+    assert f"{lab}: 3 places and looks in" in placerec("backup", "create", folder, *chosen, *url).stderr
     placerec("backup", "verify", folder)
     # A map that is gone stays in the backup.
     assert server.client.delete("/v1/maps/hall-to-save").status_code == 204
