@@ -535,7 +535,7 @@ class Store(Protocol):
         advance: Callable[[int, int], None],
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
-        before_listing: Callable[[], None],
+        before_listing: Callable[[int], None],
         check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file; it is listed, and durable, when this returns, and not before.
@@ -545,7 +545,8 @@ class Store(Protocol):
             advance: called with the number of places done and of all; its exceptions end the work.
             check_picture: raises InvalidImage for bytes that must not be shown as a picture.
             most_picture_bytes: a larger picture is refused before it is read.
-            before_listing: called when the map is complete; its exceptions end the work.
+            before_listing: called with the number of places, their looks apart, when the map is complete; its
+                exceptions end the work.
             check_descriptors: says which descriptors the map's encoder can have given.
 
         Raises:

@@ -131,7 +131,7 @@ class PostgresStore(ABC, Generic[MapT]):
         advance: Callable[[int, int], None],
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
-        before_listing: Callable[[], None],
+        before_listing: Callable[[int], None],
         check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
@@ -146,8 +146,11 @@ class PostgresStore(ABC, Generic[MapT]):
         try:
             writing = self._map(map_id, number).writing
             layout = layout_of(archive.manifest)
-            Importing(archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors).fill()
-            before_listing()
+            importing = Importing(
+                archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors
+            )
+            importing.fill()
+            before_listing(importing.places)
             with self.database.transaction(f"import map {map_id!r}", Lock.MAPS) as connection:
                 record.publish(connection, number, map_id)
         except BaseException:

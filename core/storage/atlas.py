@@ -217,13 +217,13 @@ class Atlas:
         advance: Callable[[int, int], None],
         check_picture: Callable[[bytes], None],
         most_picture_bytes: int,
-        before_listing: Callable[[], None],
+        before_listing: Callable[[int], None],
         check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
         try:
             with self.building(map_id) as folder:
-                build(
+                places = build(
                     archive,
                     folder,
                     map_id,
@@ -232,7 +232,7 @@ class Atlas:
                     most_picture_bytes=most_picture_bytes,
                     check_descriptors=check_descriptors,
                 )
-                before_listing()
+                before_listing(places)
         except Damage as damage:
             raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
 

@@ -22,7 +22,7 @@ class InvalidIndex(Exception):
 
 
 class BackupEntry(BaseModel):
-    """A map of a backup; ``listed`` is whether the service had it when the backup was last made."""
+    """A map of a backup; ``places`` counts looks, too; ``listed`` is whether the service had it at the last backup."""
 
     model_config = ConfigDict(extra="forbid")
 

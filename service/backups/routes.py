@@ -42,7 +42,7 @@ class BackupView(BaseModel):
     id: str = Field(description="The name of its folder, which `placerec backup restore` restores.")
     at: Timestamp = Field(description="When it was begun.")
     maps: int
-    places: int
+    places: int = Field(description="And their looks.")
     bytes: int = Field(description="Of all its files; those of unchanged maps take no room again.")
 
     @classmethod

@@ -35,7 +35,7 @@ from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive, opening_of
 from core.maps.archives.tar_layout import BLOCK
 from core.maps.enrolling import any_descriptors
-from core.maps.records import Precision
+from core.maps.records import MOST_LOOKS, Precision
 from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
 from core.storage.archives.unpacking import check_sizes
@@ -155,7 +155,7 @@ class Imports:
         if (record.dimension, record.local_shape) != (installed.dimension, installed.local_shape):
             raise InvalidArchive("The file's descriptors have another shape than those of its encoder.")
         check_sizes(manifest)
-        if manifest.places > most_places:
+        if manifest.places > most_places * (1 + MOST_LOOKS):  # the file counts looks as well; they tell later
             raise TooManyPlaces(f"The file has {manifest.places} places; a map may have at most {most_places}.")
         name = record.id if map_id is None else map_id
         check_new_map(self._engine, self._jobs, check_map_id(name))
@@ -179,7 +179,8 @@ class Imports:
         """Make the map of a file; it is listed when this returns.  The file is removed in any case.
 
         Raises:
-            WrongEncoder, InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
+            WrongEncoder, InvalidArchive, MapExists, TooManyPlaces, StorageFull, StorageFailure: nothing of the map is
+                left.
         """
         cancelled = threading.Event()
 
@@ -213,46 +214,48 @@ class Imports:
         """Make the map of a job's file; an attempt after a restart begins again, since only the file is stored.
 
         Raises:
-            WrongEncoder, InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
+            WrongEncoder, InvalidArchive, MapExists, TooManyPlaces, StorageFull, StorageFailure: nothing of the map is
+                left.
             JobCancelled, JobInterrupted.
         """
         name, map_id = str(context.arguments["file"]), str(context.arguments["to"])
         if (made := context.notes.get("result")) is not None and self._is_listed(made):
-            return self._counted(made)  # the process was killed after the map was listed and before the job ended
+            return dict(made)  # the process was killed after the map was listed and before the job ended
 
         def advance(done: int, total: int) -> None:
             context.check_cancelled()
             context.progress(done, total)
 
-        def before_listing(archive: Archive) -> None:
+        def before_listing(archive: Archive, places: int) -> None:
             context.check_cancelled()  # from here on it cannot be undone
             record = archive.manifest.map
             context.remember(
                 result={
                     "map": map_id,
                     "encoder": record.encoder,
-                    "places": archive.manifest.places,
+                    "places": places,
                     "created_at": record.created_at.isoformat(),
                     "manifest": archive.tag,
                 }
             )
 
         self._build(name, map_id, advance, before_listing)
-        return self._counted(context.notes["result"])
-
-    def _counted(self, made: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The result of a job with the places of its map alone; the file counts their looks, too."""
-        with suppress(UnknownMap):  # it was deleted at once
-            return {**made, "places": self._engine.maps.find(made["map"]).count_places()}
-        return dict(made)
+        return dict(context.notes["result"])
 
     def _build(
         self,
         name: str,
         map_id: str,
         advance: Callable[[int, int], None],
-        before_listing: Callable[[Archive], None] = lambda _archive: None,
+        before_listing: Callable[[Archive, int], None] = lambda _archive, _places: None,
     ) -> None:
+        most_places = self._engine.settings.max_places
+
+        def complete(places: int) -> None:
+            if places > most_places:
+                raise TooManyPlaces(f"The file has {places} places; a map may have at most {most_places}.")
+            before_listing(archive, places)
+
         with disk_errors("read the map file"):
             archive = Archive(self._folder / name)
         with archive:
@@ -265,7 +268,7 @@ class Imports:
                 advance,
                 partial(_check_picture, limits=limits),
                 limits.max_bytes,
-                lambda: before_listing(archive),
+                complete,
                 any_descriptors if definition is None else partial(definition.could_give, tolerance=tolerance),
             )
         log.info("map imported", extra={"map": map_id, "places": archive.manifest.places, "manifest": archive.tag})

@@ -32,13 +32,16 @@ def build(
     check_picture: CheckPicture = lambda _content: None,
     most_picture_bytes: int = MOST_PICTURE_BYTES,
     check_descriptors: CheckDescriptors = any_descriptors,
-) -> None:
+) -> int:
     """Make ``folder`` with the map of an export file in it, durable except for the folder's own name.
 
     Args:
         map_id: of the new map; it may differ from that in the file.
         most_picture_bytes: a larger picture is refused before it is read.
         check_descriptors: says which descriptors the map's encoder can have given.
+
+    Returns:
+        The number of places, their looks apart.
 
     Raises:
         InvalidArchive: the file is damaged, or its content is not valid for a map; ``folder`` is then of no use.
@@ -70,3 +73,4 @@ def build(
         driver.close()  # SQLite moves its log into the file and deletes it
     sync_file(folder / FILE)
     sync_folder(folder)
+    return importing.places

@@ -64,6 +64,8 @@ class Importing(Unpacking):
     ) -> None:
         super().__init__(archive, layout, advance, check_picture, most_picture_bytes, check_descriptors)
         self._writing = writing
+        self.places = 0
+        """Places that are stored, their looks apart."""
         self._codes: dict[str, int] = {}
         self._lost: dict[int, int] = {}  # the codes of the tracks whose sequences are gone, by their numbers there
 
@@ -109,6 +111,7 @@ class Importing(Unpacking):
                 known[line.id] = row = write.state.rows
                 read = self._place(write, line, row, write.add_stored(stored[at : at + 1]))
                 made = write.insert(read) if place is None else write.insert_look(place, places.as_look(read, place))
+                self.places += place is None
                 if content.picture is not None:
                     write.put_picture(row, content.picture[0])
                 if content.keypoints is not None:

@@ -106,7 +106,7 @@ class Unpacking(ABC):
         self.archive, self.layout, self.advance = archive, layout, advance
         self._check_picture, self._most_picture_bytes = check_picture, most_picture_bytes
         self.rows = 0
-        """Places that are stored."""
+        """Places and looks that are stored."""
 
     @abstractmethod
     def put_sequences_and_cameras(self, sequences: Iterator[SequenceLine], cameras: Iterator[CameraLine]) -> None:

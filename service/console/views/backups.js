@@ -68,7 +68,7 @@ function Table({ items }) {
   return html`
     <div class="table" tabindex="0" role="region" aria-label="Backups">
       <table>
-        <thead><tr><th>Begun</th><th>Folder</th><th class="number">Maps</th><th class="number">Places</th><th class="number">Size</th></tr></thead>
+        <thead><tr><th>Begun</th><th>Folder</th><th class="number">Maps</th><th class="number">Places and looks</th><th class="number">Size</th></tr></thead>
         <tbody>
           ${items.map((one) => html`
             <tr key=${one.id}>

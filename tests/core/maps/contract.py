@@ -362,9 +362,9 @@ class StoreContract(RuleBasedStateMachine):
             self.map.exporter.write(first)
             with Archive(first) as archive:
                 check(archive)
-                self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda: None)
+                self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda _: None)
                 with pytest.raises(errors.MapExists):
-                    self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda: None)
+                    self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda _: None)
             copy = self.store.get("copy")
             copy.exporter.write(second)
             with Archive(first) as archive, Archive(second) as other:

@@ -20,7 +20,7 @@ ID = "moved"
 def imported(store: Store, file: Path) -> Map:
     """The map ``moved``, made of an export file."""
     with Archive(file) as archive:
-        store.import_map(archive, ID, lambda *_: None, lambda _: None, 10**6, lambda: None)
+        store.import_map(archive, ID, lambda *_: None, lambda _: None, 10**6, lambda _: None)
     return store.get(ID)
 
 
@@ -69,7 +69,7 @@ def check_a_refused_import_leaves_nothing(store: Store, folder: Path) -> None:
     here, file = Atlas(folder), folder / "lab.tar"
     filled(here.create(ID, ENCODER, DIMENSION, MapSettings(), LOCAL_SHAPE)).exporter.write(file)
 
-    def refuse() -> None:
+    def refuse(_places: int) -> None:
         raise InterruptedError
 
     with Archive(file) as archive, pytest.raises(InterruptedError):

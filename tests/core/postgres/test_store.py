@@ -65,7 +65,7 @@ def test_one_of_two_imports_under_one_id_is_refused(postgres: Postgres, store: C
     here.close()
     other, both = CodedStore(postgres.address), threading.Barrier(2)
 
-    def meet() -> None:
+    def meet(_places: int) -> None:
         both.wait(60)
 
     def take(into: CodedStore) -> str:

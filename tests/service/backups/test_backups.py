@@ -91,7 +91,7 @@ def test_a_map_that_is_restored_is_the_one_that_was_saved(runtime: Runtime, tmp_
     assert job.result is not None
     runtime.engine.maps.delete("hall")
     with Archive(files_of(tmp_path / SAVED / job.result["backup"])["hall"]) as archive:
-        runtime.engine.maps.import_map(archive, "hall", lambda *_: None, lambda _: None, 10**6, lambda: None)
+        runtime.engine.maps.import_map(archive, "hall", lambda *_: None, lambda _: None, 10**6, lambda _: None)
     assert state_of(runtime.engine, "hall") == before
 
 

@@ -7,7 +7,7 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 
 from tests.service.scenes import jpeg
-from tests.service.server import Server
+from tests.service.server import Server, assert_problem
 from tests.service.wire import answer, get, opened, post
 
 
@@ -57,3 +57,22 @@ def test_there_are_no_more_maps_and_places_than_may_be(strict: Server) -> None:
     batch = server.client.post("/v1/maps/one/places", data={"places": places}, files=files)
     assert batch.status_code == 409, batch.text
     assert len(server.client.get("/v1/maps/one/places").json()["items"]) == 3
+
+
+def test_a_full_map_with_looks_can_be_imported_and_a_fuller_one_cannot(server: Server, strict: Server) -> None:
+    """A file counts looks as well, which are no places."""
+    map_id, tar = server.create_map("full-of-places")["id"], {"Content-Type": "application/x-tar"}
+    for number in range(3):
+        server.enrol(map_id, f"p{number}", jpeg(number))
+    looks = f"/v1/maps/{map_id}/places/p1/looks"
+    server.client.post(looks, content=jpeg(7), headers={"Content-Type": "image/jpeg"}).raise_for_status()
+    three = server.client.get(f"/v1/maps/{map_id}/export").content
+    server.enrol(map_id, "p3", jpeg(3))
+    four = server.client.get(f"/v1/maps/{map_id}/export").content
+    made = strict.client.post("/v1/maps/import", params={"id": "three"}, content=three, headers=tar)
+    assert made.status_code == 201 and made.json()["places"] == 3
+    refused = strict.client.post("/v1/maps/import", params={"id": "four"}, content=four, headers=tar)
+    assert "has 4 places" in assert_problem(refused, 409, "too-many-places")["detail"]
+    assert strict.client.get("/v1/maps/four").status_code == 404
+    strict.client.delete("/v1/maps/three")
+    server.client.delete(f"/v1/maps/{map_id}")
