@@ -116,7 +116,8 @@ PARTS = {
     "cluster-search": Part(
         "benchmarks.cluster.search", "--datasets {data} --places 100000", "data sets, PostgreSQL, scripts/cluster"
     ),
-    "sizing": Part("benchmarks.cluster.sizing"),
+    "engines": Part("benchmarks.cluster.engines", "--service", "PostgreSQL"),
+    "sizing": Part("benchmarks.cluster.sizing", needs="PostgreSQL"),
     "kills": Part("tests.core.cluster.kills", "--kills 100", "PostgreSQL"),
     "milvus-kills": Part("tests.core.cluster.kills", "--vectors milvus --kills 30", "PostgreSQL, .venv-cluster"),
     "ray": Part("benchmarks.ray_serve.overhead", "--places 400 --robots 1 --robots 16", "placerec[ray]"),

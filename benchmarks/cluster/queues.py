@@ -3,17 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
 
 TOO_BUSY = 0.999
-
-
-class Station(NamedTuple):
-    """A place where a query waits for one of several servers, and then has it for ``service`` seconds in the mean."""
-
-    service: float
-    servers: int
 
 
 def waiting(arrivals: float, service: float, servers: int) -> float:
@@ -47,23 +38,20 @@ def servers_for(arrivals: float, service: float, most_waiting: float) -> int:
     return low
 
 
-def closed(stations: Sequence[Station], robots: int, thinking: float = 0.0) -> tuple[float, float]:
+def closed(service: float, servers: int, robots: int, thinking: float = 0.0) -> tuple[float, float]:
     """Answers a second and seconds of one, where each robot asks again ``thinking`` seconds after its answer.
 
-    Source: exact mean value analysis of a closed network of stations with several servers (Reiser and Lavenberg, 1980).
+    Source: exact mean value analysis of a closed network with one station of several servers (Reiser and Lavenberg,
+    1980).
     """
-    # The probability of n robots at each station, with one robot fewer in the network.
-    there = [[1.0] + [0.0] * robots for _ in stations]
+    there = [1.0] + [0.0] * robots  # the probability of n robots at the station, with one robot fewer in the network
     rate = seconds = 0.0
     for population in range(1, robots + 1):
-        seconds = 0.0
-        for (service, servers), at in zip(stations, there, strict=True):
-            seconds += sum(n * service / min(n, servers) * at[n - 1] for n in range(1, population + 1))
+        seconds = sum(n * service / min(n, servers) * there[n - 1] for n in range(1, population + 1))
         rate = population / (thinking + seconds)
-        for number, (service, servers) in enumerate(stations):
-            now = [0.0] * (robots + 1)
-            for n in range(1, population + 1):
-                now[n] = rate * service / min(n, servers) * there[number][n - 1]
-            now[0] = max(0.0, 1.0 - sum(now[1:]))
-            there[number] = now
+        now = [0.0] * (robots + 1)
+        for n in range(1, population + 1):
+            now[n] = rate * service / min(n, servers) * there[n - 1]
+        now[0] = max(0.0, 1.0 - sum(now[1:]))
+        there = now
     return rate, seconds

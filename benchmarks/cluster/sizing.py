@@ -4,8 +4,8 @@
 
 Measured here are the processor time of a query in a service and in PostgreSQL, memory and disk of a place, and the
 answers a second of robots that ask again at once, by one service and by two.  From the times alone the model foretells
-these answers: a query holds the interpreter of its service, of which each service has one, for some of its time, and a
-core for the rest.  Then it sizes fleets whose robots ask at random moments, so that the mean wait for a core is at most
+these answers: cores are the servers of one queue, and each service has one interpreter, which a query holds for a part
+of its time.  Then it sizes fleets whose robots ask at random moments, so that the mean wait for a core is at most
 ``--wait`` of the time that a query takes there.
 """
 
@@ -27,7 +27,7 @@ import psycopg
 import typer
 
 from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
-from benchmarks.cluster.queues import Station, closed, servers_for
+from benchmarks.cluster.queues import closed, servers_for
 from benchmarks.frames import camera_frames
 from benchmarks.process import descendants, median, memory, processor_time
 from benchmarks.report import report, verdict
@@ -62,10 +62,10 @@ class Times:
     service: float
     postgres: float
 
-    def stations(self, services: int, processors: int) -> list[Station]:
-        """The interpreters of services, and processors that they share with PostgreSQL."""
-        held = INTERPRETER * self.service
-        return [Station(held, services), Station(self.service - held + self.postgres, processors)]
+    def foretold(self, services: int, robots: int, processors: int) -> float:
+        """Answers a second of robots that ask again at once, on processors that services share with PostgreSQL."""
+        rate, _ = closed(self.service + self.postgres, processors, robots)
+        return min(rate, services / (INTERPRETER * self.service))
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,7 @@ def stored_bytes(server: Postgres) -> int:
 def measured(places: int, rounds: int, seconds: float) -> Measured:
     """Enrol a map in PostgreSQL and let robots ask one service, and two."""
     frames, _ = camera_frames(48)
+    references, _ = camera_frames(places, "reference")
     answers: dict[tuple[int, int], list[float]] = defaultdict(list)
     times: list[Times] = []
     with running_postgres() as server, ExitStack() as stack:
@@ -116,7 +117,7 @@ def measured(places: int, rounds: int, seconds: float) -> Measured:
         base, before = memory(pids[0]), stored_bytes(server)
         clients[0].post("/v1/maps", json={"id": "lab", "keep": "none"}).raise_for_status()
         for first in range(0, places, BATCH):
-            enrol(clients[0], "lab", frames, first, min(BATCH, places - first))
+            enrol(clients[0], "lab", references, first, min(BATCH, places - first))
         disk = (stored_bytes(server) - before) / places
         urls = [str(client.base_url) for client in clients]
         for turn in range(rounds + 1):  # the first one warms up
@@ -153,7 +154,7 @@ def sized(robots: int, places: int, rate: float, wait: float, found: Measured) -
 def main(
     rate: Annotated[float, typer.Option(help="Queries a second of a robot.")] = 1.0,
     wait: Annotated[float, typer.Option(help="Mean wait for a core, in the time of a query there, at most.")] = 0.5,
-    places: Annotated[int, typer.Option(min=100, help="Of the map that is asked.")] = 600,
+    places: Annotated[int, typer.Option(min=100, help="Of the map that is asked, a street.")] = 400,
     rounds: Annotated[int, typer.Option(min=1, help="Turns of each number of robots.")] = 5,
     seconds: Annotated[float, typer.Option(min=1, help="Of one turn.")] = 4.0,
 ) -> None:
@@ -161,7 +162,7 @@ def main(
     found = measured(places, rounds, seconds)
     times, rows, worst = found.times, [], 0.0
     for (services, robots), rate_there in found.answers.items():
-        foretold, _ = closed(times.stations(services, cores()), robots)
+        foretold = times.foretold(services, robots, cores())
         error = foretold / rate_there - 1
         worst = max(worst, abs(error))
         rows.append([f"{services} services, {robots} robots", foretold, rate_there, f"{error:+.0%}"])

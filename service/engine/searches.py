@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+import weakref
 from collections import defaultdict
 from collections.abc import Sequence
 from contextvars import Context
@@ -28,11 +29,12 @@ from service.worker_threads import in_thread
 MOST_TOGETHER = 8
 """The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""
 
-CORES_A_SEARCH = 4
-"""One search of a map runs at a time for each group of this many cores: that of a large map uses several itself."""
-
 MOST_AHEAD = 4000
-"""The most places of a map that is searched in the encoder's thread; such a search takes a few milliseconds."""
+"""The most places of a small map, which is searched in the encoder's thread: that takes a few milliseconds.  One that
+is not in memory is searched elsewhere, but each query by itself, for what follows the search takes longer."""
+
+CORES_A_SEARCH = 4
+"""One search of a larger map runs at a time for each group of this many cores, because it uses several itself."""
 
 EXPECTED_MILLISECONDS = 10.0
 """The expected time of one query of a search; the real time is counted when it is done."""
@@ -94,7 +96,12 @@ class Searches:
         self._waiting: dict[_SearchKey, FairQueue[_Waiting]] = {}
         self._running: defaultdict[_SearchKey, int] = defaultdict(int)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._at_once = max(1, cores() // CORES_A_SEARCH)
+        self._places: weakref.WeakKeyDictionary[Map, int] = weakref.WeakKeyDictionary()  # as the last search saw them
+
+    def _at_once(self, map_: Map) -> int:
+        """How many searches of a map may run at the same time, besides those in encoders' threads."""
+        small = self._places.get(map_, MOST_AHEAD + 1) <= MOST_AHEAD
+        return cores() if small else max(1, cores() // CORES_A_SEARCH)
 
     async def answer(self, map_: Map, frames: Sequence[Encoded], question: Question) -> list[Answered]:
         """Answer a question about frames that the map's encoder has encoded, as :class:`SearchAhead` may have done.
@@ -141,7 +148,7 @@ class Searches:
         waiting = self._waiting.setdefault(key, FairQueue())
         for part in parts:
             waiting.add(part.caller, part)
-        if self._running[key] < self._at_once:
+        if self._running[key] < self._at_once(map_):
             self._running[key] += 1
             # Starting a little later lets frames that were encoded at the same time join the search.
             # The search serves several requests, so it must not log under the id of this one.
@@ -169,7 +176,7 @@ class Searches:
     def _take(self, key: _SearchKey) -> list[_Waiting]:
         """The queries of the next search: an equal share for each thread that the map may use."""
         waiting = self._waiting.get(key, FairQueue[_Waiting]())
-        most = min(MOST_TOGETHER, -(-sum(len(one.queries) for one in waiting) // self._at_once))
+        most = min(MOST_TOGETHER, -(-sum(len(one.queries) for one in waiting) // self._at_once(key.map_)))
         taken: list[_Waiting] = []
         count = 0
         while (first := waiting.first()) is not None and (not taken or count + len(first.queries) <= most):
@@ -193,6 +200,7 @@ class Searches:
             elif not together[0].answer.done():
                 together[0].answer.set_exception(error)
             return
+        self._places[key.map_] = answers[0].candidates.places
         surplus = 1e3 * (time.perf_counter() - began) / len(queries) - EXPECTED_MILLISECONDS
         remaining = iter(answers)
         for one in together:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from benchmarks.cluster.queues import Station, closed, servers_for, waiting
+from benchmarks.cluster.queues import closed, servers_for, waiting
 
 
 def test_one_server_is_the_textbook_queue() -> None:
@@ -25,20 +25,9 @@ def test_no_more_servers_than_are_needed() -> None:
 
 
 def test_robots_that_wait_for_their_answers() -> None:
-    two = [Station(0.01, 2)]
-    assert closed(two, 1) == pytest.approx((100.0, 0.01))
-    assert closed(two, 2) == pytest.approx((200.0, 0.01))
-    rate, seconds = closed(two, 64)
+    assert closed(0.01, 2, 1) == pytest.approx((100.0, 0.01))
+    assert closed(0.01, 2, 2) == pytest.approx((200.0, 0.01))
+    rate, seconds = closed(0.01, 2, 64)
     assert rate == pytest.approx(200.0, rel=1e-6) and seconds == pytest.approx(0.32, rel=1e-6)
-    rate, seconds = closed(two, 50, thinking=1.0)
+    rate, seconds = closed(0.01, 2, 50, thinking=1.0)
     assert rate == pytest.approx(50 / (1.0 + seconds)) and 0.01 < seconds < 0.0125
-
-
-def test_a_query_takes_the_time_of_all_stations_and_the_busiest_limits_the_rate() -> None:
-    stations = [Station(0.005, 1), Station(0.02, 16)]
-    assert closed(stations, 1) == pytest.approx((40.0, 0.025))
-    rate, _ = closed(stations, 64)
-    assert rate == pytest.approx(200.0, rel=1e-3)
-    # Two M/M/1 stations alike: with n robots, n / (n + 1) of each one's rate.
-    rate, _ = closed([Station(0.01, 1), Station(0.01, 1)], 3)
-    assert rate == pytest.approx(75.0)

@@ -88,10 +88,10 @@ def ids(located: Answer) -> list[str]:
 
 
 async def test_searches_together_answer_as_alone(
-    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(searches, "cores", lambda: 1)
     together = Searches()
-    together._at_once = 1
     found = await asyncio.gather(*(together.locate(map_, encoder, asking([query], 3)) for query in queries))
     assert sizes == [len(queries)], "all that came in one moment were one search"
     for query, (one,) in zip(queries, found, strict=True):
@@ -105,10 +105,10 @@ async def test_searches_together_answer_as_alone(
 
 
 async def test_queries_that_arrive_during_a_search_share_the_next_one(
-    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(searches, "cores", lambda: 1)
     together = Searches()
-    together._at_once = 1
     first = asyncio.ensure_future(together.locate(map_, encoder, asking(queries[:1], 3)))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
@@ -116,6 +116,21 @@ async def test_queries_that_arrive_during_a_search_share_the_next_one(
     later = [asyncio.ensure_future(together.locate(map_, encoder, asking([query], 3))) for query in queries[1:5]]
     await asyncio.gather(first, *later)
     assert sizes == [1, 4]
+
+
+async def test_queries_of_a_small_map_are_shared_out_among_the_cores(
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searches, "cores", lambda: 2)
+    together = Searches()
+    await together.locate(map_, encoder, asking(queries[:1], 3))  # by which it learns how small the map is
+    found = await asyncio.gather(*(together.locate(map_, encoder, asking([query], 3)) for query in queries[:4]))
+    assert max(sizes) == 2 and sum(sizes) == 5
+    assert [ids(one)[0] for (one,) in found] == ["p0", "p1", "p2", "p3"]
+    sizes.clear()
+    monkeypatch.setattr(searches, "MOST_AHEAD", 3)
+    await asyncio.gather(*(together.locate(map_, encoder, asking([query], 3)) for query in queries[:4]))
+    assert sizes == [4]
 
 
 async def test_queries_for_different_k_are_searched_together(
