@@ -8,7 +8,7 @@ NAME = "placerec_ros"
 
 setup(
     name=NAME,
-    version="0.2.0",
+    version="1.0.0",
     description="A lifecycle node of ROS 2 that localizes a robot by a placerec service.",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     python_requires=">=3.11",
