@@ -70,7 +70,7 @@ class Times:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured.
+    """Measurements of services and PostgreSQL.
 
     times: of a query of one of four robots.
     answers: a second, by services and robots.

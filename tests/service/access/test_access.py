@@ -30,7 +30,10 @@ from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 from tests.service.wire import eventually
 
-PARTS = {"map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e"}
+PARTS = {
+    "map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e",
+    "frame": "1",
+}  # fmt: skip
 
 
 def bearer(token: str) -> dict[str, str]:

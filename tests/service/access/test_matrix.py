@@ -21,15 +21,10 @@ from service.access.keys import Keys
 from service.access.roles import Role
 from service.app.application import create_app
 from service.settings import Settings
-from tests.service.access.test_access import asking
+from tests.service.access.test_access import PARTS, asking
 
 DOCUMENT: dict[str, Any] = json.loads((Path(__file__).parents[3] / "openapi.json").read_text())
 ROLES: tuple[Role, ...] = ("query", "enrol", "admin")
-NAMED = {
-    "map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e",
-    "frame": "1",
-}  # fmt: skip
-
 PROBLEMS = {"none": "key-needed", "basic": "key-needed", "cut": "key-needed", "twice": "key-needed"}
 PROBLEMS |= dict.fromkeys(("unknown", "wrong", "revoked", "expired"), "key-refused")
 """Kinds of keys that let nobody in, and the problem of each."""
@@ -123,7 +118,7 @@ async def test_every_operation_with_a_kind_of_key(guarded: tuple[FastAPI, dict[s
     differing = {}
     async with asking(app) as client:
         for one in OPERATIONS:
-            path = re.sub(r"\{(\w+)\}", lambda found: NAMED.get(found[1], "x"), one.path)
+            path = re.sub(r"\{(\w+)\}", lambda found: PARTS.get(found[1], "x"), one.path)
             app.state.gate.rates._failures._full_at.clear()  # another address, as it were
             given = [("Authorization", text) for text in headers[kind]]
             found = refusal(await client.request(one.method, path, headers=given))
