@@ -64,6 +64,11 @@ def processor_time(pid: int) -> float:
     return sum(int(field) for field in fields[11:13]) / os.sysconf("SC_CLK_TCK") if fields else 0.0
 
 
+def total_processor_time(pid: int) -> float:
+    """The processor time of a process and of those that it started and that still run, in seconds."""
+    return sum(map(processor_time, {pid, *descendants(pid)}))
+
+
 def descendants(pid: int) -> set[int]:
     """The processes that a process has started, and those that these have."""
     parents = {int(path.name): _stat(int(path.name)) for path in Path("/proc").iterdir() if path.name.isdigit()}

@@ -29,7 +29,7 @@ import typer
 from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
 from benchmarks.cluster.queues import closed, servers_for
 from benchmarks.frames import camera_frames
-from benchmarks.process import descendants, median, memory, processor_time
+from benchmarks.process import median, memory, total_processor_time
 from benchmarks.report import report, verdict
 from core.threads import cores
 from tests.servers.postgres import Postgres, running_postgres
@@ -84,11 +84,6 @@ class Measured:
     disk: float
 
 
-def family_time(pid: int) -> float:
-    """The processor time of a process and of those that it started, in seconds; some may have ended since."""
-    return sum(map(processor_time, {pid, *descendants(pid)}))
-
-
 def stored_bytes(server: Postgres) -> int:
     """The size of the database."""
     with psycopg.connect(server.address) as connection:
@@ -123,7 +118,7 @@ def measured(places: int, rounds: int, seconds: float) -> Measured:
         for turn in range(rounds + 1):  # the first one warms up
             for asked, robots in SETUPS:
                 time.sleep(SETTLE)
-                spent = family_time(pids[0]), family_time(postgres)
+                spent = total_processor_time(pids[0]), total_processor_time(postgres)
                 with ThreadPoolExecutor(asked) as pool:
                     turns = pool.map(partial(load, frames=shown, robots=robots // asked, seconds=seconds), urls[:asked])
                     seen = list(turns)
@@ -131,7 +126,8 @@ def measured(places: int, rounds: int, seconds: float) -> Measured:
                     answers[asked, robots].append(sum(len(one["milliseconds"]) / one["seconds"] for one in seen))
                 if turn and (asked, robots) == (1, 4):
                     count = len(seen[0]["milliseconds"])
-                    service, stored = family_time(pids[0]) - spent[0], family_time(postgres) - spent[1]
+                    service = total_processor_time(pids[0]) - spent[0]
+                    stored = total_processor_time(postgres) - spent[1]
                     times.append(Times(service / count, stored / count))
     typical = Times(median([one.service for one in times]), median([one.postgres for one in times]))
     return Measured(typical, {setup: median(values) for setup, values in answers.items()}, base, disk)

@@ -21,7 +21,7 @@ import numpy as np
 import typer
 
 from benchmarks.frames import camera_frames
-from benchmarks.process import descendants, median, processor_time, service
+from benchmarks.process import median, service, total_processor_time
 from benchmarks.report import report, verdict
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import cores
@@ -31,11 +31,6 @@ from service.commands.timing.samples import fill_map
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query?verify=never"
 LIMIT = 1.25
-
-
-def total_processor_time(pid: int) -> float:
-    """Of a process and all that it has started, in seconds."""
-    return sum(processor_time(one) for one in {pid, *descendants(pid)})
 
 
 def main(

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.frames import camera_frames
-from benchmarks.process import descendants, median, processor_time, service
+from benchmarks.process import median, processor_time, service, total_processor_time
 from benchmarks.ray_serve.waiting import WAIT, WaitingReplica, prepare
 from benchmarks.report import report, verdict
 from core.frames.images import Limits
@@ -44,8 +44,7 @@ START_SECONDS = 300.0
 def time_of_all() -> float:
     """Processor time of the front, Ray, the replicas and the robots so far, in seconds."""
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    running = sum(processor_time(pid) for pid in {os.getpid(), *descendants(os.getpid())})
-    return running + ended.ru_utime + ended.ru_stime
+    return total_processor_time(os.getpid()) + ended.ru_utime + ended.ru_stime
 
 
 def cluster_of(folder: Path, replicas: int, batch: int) -> Cluster:

@@ -262,11 +262,6 @@ class Encoder:
         """
         self.extractor.compute("float32", device)
 
-    def _hold_against(self, made: Encoding, descriptor: NDArray[Any], local: Cells, what: str) -> None:
-        for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
-            if not cosine >= GOLDEN_COSINE:
-                raise GoldenMismatch(f"{self.name} gives a cosine of {cosine:.4f} to {what} on this machine.")
-
     def check_golden(self) -> None:
         """Encode the canary frame and compare its descriptors with the golden ones.
 
@@ -276,7 +271,11 @@ class Encoder:
         if self._golden is None:
             raise GoldenMismatch(f"{self.name} has no golden values.")
         made = self.encode(canary_frame())
-        self._hold_against(made, *self._golden, "its golden values")
+        descriptor, local = self._golden
+        for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
+            if not cosine >= GOLDEN_COSINE:
+                what = f"{self.name} gives a cosine of {cosine:.4f} to its golden values"
+                raise GoldenMismatch(f"{what} on this machine.")
         self.agreement(made.local, made.local[np.newaxis])  # compile the second stage now, not in the first query
         if self.screened > self.candidates:
             self.promise(made.local, made.local[np.newaxis])
