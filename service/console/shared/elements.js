@@ -153,15 +153,23 @@ export function Field({ label, hint, children, inline = false }) {
   `;
 }
 
-/** An input that is read when it is left: what is typed stays when the view is drawn again, until there is another value. */
+/** An input that is read when it is left: what is typed stays until then, whatever value comes meanwhile. */
 export function Typed({ value, change, ...more }) {
   const [text, setText] = useState(null); // null: nothing is being typed
-  useEffect(() => setText(null), [value]);
   const left = ({ target }) => {
     setText(null);
     change(target);
   };
-  return html`<input ...${more} value=${text ?? value} onInput=${(event) => setText(event.target.value)} onChange=${left} spellcheck=${false} />`;
+  return html`
+    <input
+      ...${more}
+      value=${text ?? value}
+      onInput=${(event) => setText(event.target.value)}
+      onChange=${left}
+      onBlur=${() => setText(null)}
+      spellcheck=${false}
+    />
+  `;
 }
 
 /** An input of a number: change gets it with every letter, and NaN as long as what is written is none, such as "0.". */

@@ -34,6 +34,14 @@ PIXEL = """(canvas, share) => {
 }"""
 
 
+CLICK_AND_TYPE = """([image, field, text]) => {
+  image.click();
+  field.select();
+  document.execCommand('insertText', false, text);
+}"""
+"""A click into the picture and a text into a field, before the page is drawn again."""
+
+
 def thickness(page: Page, canvas: str = "places") -> int:
     found: int = page.locator(f".plan-canvas canvas.{canvas}").evaluate(THICKNESS)
     return found
@@ -123,7 +131,12 @@ def test_a_floor_plan_is_laid_by_two_places_and_stays_in_the_browser(admin: Oper
     assert box is not None
     image.click(position={"x": 0.1 * box["width"], "y": 0.5 * box["height"]})
     image.click(position={"x": 0.5 * box["width"], "y": 0.5 * box["height"]})
-    dialog.get_by_label("Place 2, % from the left").fill("90")
+    across = dialog.get_by_label("Place 2, % from the left")
+    expect(across).to_have_value("50")
+    dialog.get_by_label("Place 2", exact=True).focus()
+    page.evaluate(CLICK_AND_TYPE, [image.element_handle(), across.element_handle(), "90"])
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => setTimeout(done, 50)))")
+    expect(across).to_have_value("90")
     lay.click()
     dialog.wait_for(state="detached")
     ground = page.locator(".plan-canvas canvas.ground")
