@@ -84,7 +84,7 @@ def keypoints_in(network: XFeat, scaled: ScaledFrame) -> Keypoints:
     found = (maps.heat == highest) & (maps.heat > LEAST_HEAT)
     if scaled.mask is not None:
         found &= ~scaled.mask.covered(rows, columns)
-    y, x = np.nonzero(found)
+    y, x = np.divmod(np.flatnonzero(found), columns)
     reliability = cv2.resize(maps.reliability, (columns, rows), interpolation=cv2.INTER_LINEAR)
     best = np.argsort(-maps.heat[y, x] * reliability[y, x], kind="stable")[:MOST]
     x, y = x[best], y[best]

@@ -149,10 +149,7 @@ class StagedTrials:
         return found
 
     def answered(self, calibration: Calibration) -> Trials:
-        """The outcomes with ``verify=auto``: by three stages where two leave doubt, by a calibration with a curve.
-
-        A best match whose own evidence would settle the doubt is here verified with all others.
-        """
+        """The outcomes with ``verify=auto``: by three stages where two leave doubt, by a calibration with a curve."""
         two = self.two
         if calibration.geometry is None or calibration.curve is None:
             return two

@@ -2,9 +2,9 @@
 
 ``always`` verifies the best places of two stages, the best of the first alone, and those that match at a glance best of
 the best hundred: where the view has moved far, cells on a grid mislead the second stage.  The most promising come
-first, and a place that cannot win any more is left out.  ``auto`` looks only where two stages leave doubt: at the
-best match first, whose evidence may settle it, and else at the others.  A place without keypoints, as of a map that
-stores none, stays where the first two stages have put it.
+first, and a place that cannot win any more is left out.  ``auto`` does the same where two stages leave doubt.  It does
+not stop at a best match with evidence, for the places beside the true one have as much.  A place without keypoints, as
+of a map that stores none, stays where the first two stages have put it.
 """
 
 from __future__ import annotations
@@ -129,15 +129,16 @@ def verify_candidates(
     before = judgement = judged(candidates)
     if verifier.when == "never" or not len(candidates.rows):
         return candidates, judgement, NOT_VERIFIED
-    automatic = verifier.when == "auto"
-    if automatic and not (worth_verifying(judgement, calibration) or tells_pose(judgement)):
+    doubtful = verifier.when == "always" or worth_verifying(judgement, calibration)
+    if not doubtful and not tells_pose(judgement):
         return candidates, judgement, ThirdStage("not-needed")
     began, ranked, trial = time.perf_counter(), candidates, _Trial(candidates, comparison)
-    if automatic:
+    if not doubtful:
         trial.verify(np.zeros(1, np.int64))
         ranked = trial.ranked()
         judgement = judged(ranked)
-    if not automatic or not trial.found or worth_verifying(judgement, calibration):
+        doubtful = not trial.found or worth_verifying(judgement, calibration)
+    if doubtful:
         trial.verify_chosen()
         ranked = trial.ranked()
         judgement = judged(ranked)

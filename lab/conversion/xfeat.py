@@ -126,7 +126,8 @@ def xfeat_graph(weights: Weights) -> ModelProto:
     pixels = graph.add("Slice", shares, *map(graph.whole_numbers, (0, CELL * CELL, 1)))
     heat = graph.add("DepthToSpace", pixels, blocksize=CELL)
     reliability = graph.add("Sigmoid", graph.block("reliability", features))
-    descriptors = graph.add("Transpose", graph.add("LpNormalization", features, axis=1, p=2), perm=[0, 2, 3, 1])
+    # Along the last axis ONNX Runtime takes a tenth of the time.
+    descriptors = graph.add("LpNormalization", graph.add("Transpose", features, perm=[0, 2, 3, 1]), axis=-1, p=2)
     return graph.model(
         heat=graph.add("Squeeze", heat, graph.whole_numbers(0, 1)),
         reliability=graph.add("Squeeze", reliability, graph.whole_numbers(0, 1)),

@@ -131,13 +131,14 @@ def test_another_order_leaves_the_background_the_same() -> None:
     ("scores", "evidence", "worth"),
     [
         (full(0.5), (), False),  # certain
-        (full(0.121), (), False),  # hopeless
+        (full(0.11), (), False),  # hopeless
+        (full(0.121), (), True),
         (full(0.157), (), True),  # in doubt
         (full(0.3, 0.299), (), True),  # two that look alike
         (np.array([0.2], np.float32), (), True),  # a small map
         (np.array([0.6], np.float32), (), True),
         (np.array([], np.float32), (), False),
-        (full(0.157), (300.0,), False),  # settled by the best candidate
+        (full(0.157), (300.0,), False),  # verified for the pose
         (full(0.157), (0.0,), False),
         (full(0.157), (20.0,), True),
     ],
