@@ -80,8 +80,14 @@ def close_loop(
 
     Raises:
         PlaceTaken: a place of the frame's id exists, and has another frame.
+        UnknownSequence: only places of a traverse are allowed that the map does not have, and it is not the frame's
+            own, which begins with it.
         StorageFull, StorageFailure: nothing was enrolled.
     """
+    filters = (question.selection or Selection()).filters
+    others = [name for name in filters.sequences or () if name != frame.fields.sequence]
+    if others and (absent := map_.unknown_sequences(others)):
+        raise errors.UnknownSequence(f"The map has no sequence {min(absent)[:128]!r}, so the frame would seem new.")
     digest = digest_of(frame)
     enrolment = describe_frame(engine, map_, frame, digest, encoded)
     with engine.writing(map_.record.id):
@@ -107,6 +113,7 @@ router = APIRouter(
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
         errors.UnknownCamera,
+        errors.UnknownSequence,
         errors.WrongEncoder,
         PlaceTaken,
         UnsupportedMediaType,

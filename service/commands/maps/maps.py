@@ -58,6 +58,10 @@ Verification = Annotated[
         "--verification/--no-verification", help="Keep keypoints of each frame, by which answers are verified."
     ),
 ]
+Learning = Annotated[
+    Literal["off", "propose", "auto"] | None,
+    typer.Option(help="Whether the map learns looks from runs: for review, or by itself where evidence agrees."),
+]
 
 
 @maps.command("list")
@@ -114,12 +118,13 @@ def create_map(
     same_place_radius: Radius = None,
     same_place_frames: Frames = None,
     verification: Verification = None,
+    learning: Learning = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Create a map. Its encoder cannot be changed later."""
-    given = _given(description, keep, same_place_radius, same_place_frames, verification)
+    given = _given(description, keep, same_place_radius, same_place_frames, verification, learning)
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
     _show_map(ask(CommandTarget(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
 
@@ -132,6 +137,7 @@ def edit_map(
     same_place_radius: Radius = None,
     same_place_frames: Frames = None,
     verification: Verification = None,
+    learning: Learning = None,
     threshold: Annotated[float | None, typer.Option(help="Least decision value of a recognized place.")] = None,
     margin: Annotated[float | None, typer.Option(min=0, help="Least lead over the best rival.")] = None,
     default_calibration: Annotated[
@@ -142,7 +148,7 @@ def edit_map(
     as_json: AsJson = False,
 ) -> None:
     """Change settings of a map; the others stay as they are."""
-    changes = _given(description, keep, same_place_radius, same_place_frames, verification)
+    changes = _given(description, keep, same_place_radius, same_place_frames, verification, learning)
     calibration = {"threshold": threshold, "margin": margin}
     calibration = {name: value for name, value in calibration.items() if value is not None}
     if calibration and default_calibration:
@@ -190,7 +196,12 @@ def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json
 
 
 def _given(
-    description: str | None, keep: str | None, radius: float | None, frames: int | None, verification: bool | None
+    description: str | None,
+    keep: str | None,
+    radius: float | None,
+    frames: int | None,
+    verification: bool | None,
+    learning: str | None,
 ) -> dict[str, Any]:
     settings = {
         "description": description,
@@ -198,6 +209,7 @@ def _given(
         "same_place_radius": radius,
         "same_place_frames": frames,
         "verification": verification,
+        "learning": None if learning is None else {"mode": learning},
     }
     return {name: value for name, value in settings.items() if value is not None}
 
@@ -215,5 +227,17 @@ def _show_map(found: dict[str, Any], as_json: bool, proposal: str | None = None)
             if proposal is not None:
                 shown.add_row("proposed calibration", proposal)
         elif name != "id":
-            shown.add_row(name, "–" if value is None else str(value))
+            shown.add_row(name, _in_words(value))
     show(shown)
+
+
+def _in_words(value: Any) -> str:
+    """A value of a map as a person reads it: the parts of an object side by side, without those that are not set."""
+    if isinstance(value, dict):
+        parts = (f"{name} {_in_words(part)}" for name, part in value.items() if part is not None and part != [])
+        return ", ".join(parts) or "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return str(len(value))
+    return "–" if value is None else str(value)

@@ -68,6 +68,17 @@ def test_the_very_picture_of_a_place_does_not_become_another(server: Server, map
     assert answer["enrolment"] is None and count(server, map_id) == 1
 
 
+def test_a_mistyped_traverse_enrols_nothing(server: Server, map_id: str) -> None:
+    server.enrol(map_id, "p1", jpeg(1), sequence="monday")
+    known = encoded(seen_again(scene(1)))
+    assert_problem(close(server, map_id, "p2", known, sequences="mondy", sequence="tuesday"), 404, "unknown-sequence")
+    assert_problem(close(server, map_id, "p2", known, sequences="monday,mondy"), 404, "unknown-sequence")
+    assert count(server, map_id) == 1
+    first = close(server, map_id, "p2", known, sequences="tuesday", sequence="tuesday")
+    assert first.status_code == 201, "a run among its own frames begins with one"
+    assert close(server, map_id, "p3", known, sequences="monday,tuesday", sequence="tuesday").status_code == 200
+
+
 @pytest.mark.thorough
 def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
     fill(server, map_id)
