@@ -6,8 +6,10 @@ import copy
 import hashlib
 import json
 import lzma
+import os
 import shutil
 import sqlite3
+import subprocess
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -33,7 +35,7 @@ from tests.release.furnishing import (
     unpacked,
 )  # fmt: skip
 from tests.release.surface import broken, interface, missing, surface
-from tests.service.server import Server
+from tests.service.server import ROOT, Server
 
 RELEASES = sorted(path for path in FIXTURES.iterdir() if path.is_dir())
 
@@ -188,6 +190,20 @@ def test_a_file_of_a_later_version_is_refused_and_left_as_it_is(file: str, tmp_p
     said = refusal(data, tmp_path / "service", about(release)["key"])
     assert f"was written by a later version of placerec (schema {version + 1}, this one knows {version})" in said
     assert (data / file).read_bytes() == kept and not list(data.rglob("*.damaged-*"))
+
+
+def test_fixtures_of_a_released_version_stay(tmp_path: Path) -> None:
+    def git(*words: str) -> None:
+        who = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+        subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    git("init")
+    git("commit", "--allow-empty", "--message", "one")
+    git("tag", "v9.9.9")
+    command = [str(ROOT / "scripts/fixtures"), "9.9.9"]
+    there = {**os.environ, "GIT_DIR": str(tmp_path / ".git")}
+    done = subprocess.run(command, env=there, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "Version 9.9.9 is released" in done.stderr
 
 
 @pytest.mark.thorough
