@@ -25,7 +25,6 @@ FIXED = {
         "x",
         "y",
         "heading",
-        "rank",
         "places",
         "columns",
         "done",
@@ -37,6 +36,9 @@ FIXED = {
     *("source", "same_place_radius", "learning", "verification", "index", "missing", "discarded", "origin", "alone"),
 }
 """Fields that say what happened, or what was stored; all others depend on machines and moments."""
+
+OPEN = {"places": ".pose", "state": ".index"}
+"""Fixed fields that are not in some objects: how many places tell a pose, and how far an index in the background is."""
 
 CHOSEN = ("id", "job", "session", "key", "next_cursor", "picture", "frame")
 """Fields with what the service chooses and requests repeat."""
@@ -190,7 +192,9 @@ class Replay:
                     yield f"{path} has no {name}"
                     continue
                 self._learn(name, value, now[name])
-                if name in FIXED and not isinstance(value, dict | list | float) and now[name] != value:
+                if name == "matches":
+                    value = _promised(value, then.get("verdict") == "recognized")
+                if _is_fixed(name, path) and not isinstance(value, dict | list | float) and now[name] != value:
                     yield f"{path}.{name} is {now[name]!r} in place of {value!r}"
                 yield from self.unlike(value, now[name], f"{path}.{name}")
         elif isinstance(then, list):
@@ -205,6 +209,21 @@ class Replay:
     def _learn(self, name: str, then: Any, now: Any) -> None:
         if name in CHOSEN and isinstance(then, str) and isinstance(now, str) and then != now and len(then) > 7:
             self.names[then] = now
+
+
+def _is_fixed(name: str, path: str) -> bool:
+    """Whether a field of an object has the value that was recorded."""
+    return name in FIXED and not (name in OPEN and path.endswith(OPEN[name]))
+
+
+def _promised(matches: Any, recognized: bool) -> Any:
+    """Matches without their places, but for the recognized one: a later version may order the others otherwise."""
+    if not isinstance(matches, list):
+        return matches
+    return [
+        {name: value for name, value in one.items() if name != "place" or (recognized and not index)}
+        for index, one in enumerate(matches)
+    ]
 
 
 def _kind(value: Any) -> str:
