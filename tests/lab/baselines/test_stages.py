@@ -119,10 +119,10 @@ def test_a_default_encoder_is_judged_by_what_the_service_answers(
 
 
 @pytest.mark.thorough
-def test_by_default_a_best_match_that_fits_is_verified_alone(models: EncoderCatalogue) -> None:
+def test_by_default_a_frame_in_doubt_is_verified_as_every_frame_may_be(models: EncoderCatalogue) -> None:
     systems_ = [build(DEFAULT_ENCODER, models=models, verify=verify) for verify in ("never", "auto", "always")]
     described = [systems_[1].describe(scene(seed)) for seed in range(24)]
     never, automatic, always = (system.index(described).score([described[5]])[0] for system in systems_)
     assert never.argmax() == automatic.argmax() == always.argmax() == 5
-    np.testing.assert_allclose(automatic, never)
+    np.testing.assert_allclose(automatic, always)  # so few places leave doubt
     assert always[5] != never[5]
