@@ -25,6 +25,7 @@ FIXED = {
         "x",
         "y",
         "heading",
+        "rank",
         "places",
         "columns",
         "done",
@@ -37,8 +38,9 @@ FIXED = {
 }
 """Fields that say what happened, or what was stored; all others depend on machines and moments."""
 
-OPEN = {"places": ".pose", "state": ".index"}
-"""Fixed fields that are not in some objects: how many places tell a pose, and how far an index in the background is."""
+OPEN = {"places": ".pose", "state": ".index", "rank": ".items["}
+"""Fixed fields that are not in some objects: how many places tell a pose, how far an index in the background is, and at
+which ranks a place was among the matches of earlier queries."""
 
 CHOSEN = ("id", "job", "session", "key", "next_cursor", "picture", "frame")
 """Fields with what the service chooses and requests repeat."""
@@ -213,7 +215,7 @@ class Replay:
 
 def _is_fixed(name: str, path: str) -> bool:
     """Whether a field of an object has the value that was recorded."""
-    return name in FIXED and not (name in OPEN and path.endswith(OPEN[name]))
+    return name in FIXED and not (name in OPEN and OPEN[name] in path)
 
 
 def _promised(matches: Any, recognized: bool) -> Any:

@@ -17,7 +17,7 @@ from service.commands.connection.client import (
     path_of,
     run,
 )
-from service.commands.console import Commands, Failure, number, remark, say, show, show_json, table
+from service.commands.console import Commands, Failure, number, remark, say, show, show_json, table, words
 from service.commands.maps.backup import export, import_
 from service.commands.maps.coverage import coverage
 from service.commands.maps.places import places, sequences
@@ -227,17 +227,5 @@ def _show_map(found: dict[str, Any], as_json: bool, proposal: str | None = None)
             if proposal is not None:
                 shown.add_row("proposed calibration", proposal)
         elif name != "id":
-            shown.add_row(name, _in_words(value))
+            shown.add_row(name, words(value))
     show(shown)
-
-
-def _in_words(value: Any) -> str:
-    """A value of a map as a person reads it: the parts of an object side by side, without those that are not set."""
-    if isinstance(value, dict):
-        parts = (f"{name} {_in_words(part)}" for name, part in value.items() if part is not None and part != [])
-        return ", ".join(parts) or "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list):
-        return str(len(value))
-    return "–" if value is None else str(value)

@@ -37,7 +37,7 @@ def test_a_map_from_its_making_to_its_end(placerec: Placerec, where: list[str]) 
     assert "threshold 0.250" in table
     assert "by day" in table
     taught = placerec("maps", "edit", name, "--learning", "propose", *where).stdout
-    assert "mode propose, least_probability 0.95" in taught and "'" not in taught
+    assert "mode: propose; least_probability: 0.95" in taught and "'" not in taught
     unreachable = placerec("maps", "edit", name, "--threshold", 5, *where, status=1)
     assert "from -1 to 1" in " ".join(unreachable.stderr.split())
     default = placerec("maps", "edit", name, "--default-calibration", "--json", *where)
