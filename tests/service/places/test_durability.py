@@ -14,10 +14,11 @@ from typing import Any
 import httpx
 import pytest
 
+from service.telemetry import history
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
-from tests.syscalls import audit, is_success_response, strace, strace_arguments
+from tests.syscalls import audit, is_sqlite_index, is_success_response, strace, strace_arguments
 
 TRAVERSE = 12
 
@@ -232,6 +233,11 @@ def test_what_is_deleted_on_a_full_file_system_makes_room(tmp_path: Path, small_
     assert server.stop() == 0
 
 
+def needs_no_sync(path: str) -> bool:
+    """The history of the load is written when a minute ends, whatever is answered then, and may lose its last one."""
+    return is_sqlite_index(path) or Path(path).name.startswith(history.FILE)
+
+
 @pytest.mark.thorough
 @pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
 def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
@@ -261,7 +267,7 @@ def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
     server.process.wait(60)
     client.close()
 
-    report = audit(trace.read_text(), server.data_dir, is_success_response)
+    report = audit(trace.read_text(), server.data_dir, is_success_response, is_ignored=needs_no_sync)
     assert report.violations == []
     assert report.acknowledgements > writes
     assert report.syncs >= 2 * writes and report.writes >= writes
