@@ -29,6 +29,11 @@ PLACES = 12
 EXTRA_SECONDS = 0.2
 """By which a first request may exceed its steady time."""
 
+WIDTH = 600
+"""Of the frames, in pixels."""
+
+CAMERA = "front"
+
 START = 1_764_000_000
 JPEG = {"Content-Type": "image/jpeg"}
 
@@ -37,7 +42,7 @@ Request = Callable[[int], object]
 
 def view(number: int, step: int = 0) -> bytes:
     """The JPEG file of a frame at a place, seen a few pixels aside."""
-    return jpeg(sample_frame(number)[:, 8 * step : 600 + 8 * step])
+    return jpeg(sample_frame(number)[:, 8 * step : WIDTH + 8 * step])
 
 
 def moment(number: int) -> str:
@@ -46,14 +51,19 @@ def moment(number: int) -> str:
 
 
 def enrol(client: httpx.Client) -> None:
-    """Two maps of the same two traverses: ``posed`` has poses and times, ``plain`` has neither."""
+    """Two maps of the same two traverses: ``posed`` has poses, times and intrinsics, ``plain`` has none of them."""
     for name in ("posed", "plain"):
         client.post("/v1/maps", json={"id": name, "same_place_frames": 1}).raise_for_status()
+        if name == "posed":
+            height = sample_frame(0).shape[0]
+            pinhole = {"width": WIDTH, "height": height, "fx": 500, "fy": 500, "cx": WIDTH / 2, "cy": height / 2}
+            client.put(f"/v1/maps/posed/cameras/{CAMERA}", json={"intrinsics": pinhole}).raise_for_status()
         for step, sequence in enumerate(("monday", "tuesday")):
             for number in range(PLACES):
                 about: dict[str, str | float] = {"sequence": sequence}
                 if name == "posed":
                     about |= {"x": 5.0 * number, "y": 1.0 * step, "heading": 0.0, "timestamp": moment(number)}
+                    about["camera"] = CAMERA
                 path = f"/v1/maps/{name}/places/{sequence}-{number}"
                 client.put(path, params=about, content=view(number, step), headers=JPEG).raise_for_status()
 
@@ -121,6 +131,7 @@ def kinds(client: httpx.Client) -> dict[str, Callable[[], Request]]:
         "query, never": lambda: post("/v1/maps/posed/query", params={"verify": "never"}),
         "query, auto": lambda: post("/v1/maps/posed/query"),
         "query, always": lambda: post("/v1/maps/posed/query", params={"verify": "always"}),
+        "query, by intrinsics": lambda: post("/v1/maps/posed/query", params={"verify": "always", "camera": CAMERA}),
         "query, explained": lambda: post("/v1/maps/posed/query", params={"explain": True, "verify": "always"}),
         "query of two maps": lambda: post("/v1/query", params={"maps": "posed,plain"}),
         "query or enrol": lambda: enrolling,

@@ -58,11 +58,11 @@ FOLLOWED = 4
 """The starts that are followed to their minima."""
 SAME = 0.02
 """Minima that differ by less, in metres, are one."""
-TEMPERATURE = 8.0
+TEMPERATURE = 16.0
 """Minima are weighed by the exponential of half their cost over this, as points are no independent evidence."""
 NEGLIGIBLE = 1e-3
 """Weight from which on a minimum is a part of the mixture."""
-INFLATION = 2.0
+INFLATION = 2.5
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
 OUTLYING = 2.0
 """Residuals of this many deviations weigh a quarter (Geman and McClure, 1985).
@@ -161,25 +161,15 @@ class _Bundle:
     def declines(self, tried: Array) -> tuple[Array, Array]:
         """By how much the counts of shared points miss distances of the query, and the derivatives.
 
-        Fewer points are shared from farther away, whatever the size of the scene.
-
         Args:
             tried: positions of the query, [n, 3].
 
         Returns:
             [n, k - 1] and [n, k - 1, 3].
         """
-        away = tried[:, np.newaxis] - self.places
-        squares = np.square(away).sum(axis=2) + LEAST_DISTANCE**2
-        logarithms, slopes = np.log(squares) / 2, away / squares[:, :, np.newaxis]
+        missed, slopes = decline_misses(tried, self.places, self.counts)
         by = DECLINE_DEVIATION * np.sqrt(len(self.counts) - 1)
-        missed = logarithms[:, :1] - logarithms[:, 1:] - self.expected[1:]
-        return missed / by, (slopes[:, :1] - slopes[:, 1:]) / by
-
-    @cached_property
-    def expected(self) -> Array:
-        """The logarithms of the ratios of the query's distances from the best match and from places, [k]."""
-        return DECLINE * np.log(self.counts / self.counts[0])
+        return missed / by, slopes / by
 
     @cached_property
     def places(self) -> Array:
@@ -263,6 +253,27 @@ class _Normal:
         shared = self.mixed / diagonal[:, np.newaxis]
         matrix = self.poses + damping * np.diag(np.diag(self.poses)) - self.mixed.T @ shared
         return matrix, self.poses_gradient - shared.T @ self.nearness_gradient, diagonal
+
+
+def decline_misses(tried: Array, places: Array, counts: Array) -> tuple[Array, Array]:
+    """By how much counts of shared points miss the distances of a query from places, and the derivatives.
+
+    Fewer points are shared from farther away, whatever the size of the scene.
+
+    Args:
+        tried: positions of the query, [n, 3].
+        places: where the places are, the best match first, [k, 3].
+        counts: of points that the query shares with each, [k].
+
+    Returns:
+        Of the logarithm of the ratio of the query's distances from the best match and from each other place, [n, k - 1]
+        and [n, k - 1, 3].
+    """
+    away = tried[:, np.newaxis] - places
+    squares = np.square(away).sum(axis=2) + LEAST_DISTANCE**2
+    logarithms, slopes = np.log(squares) / 2, away / squares[:, :, np.newaxis]
+    expected = DECLINE * np.log(counts[1:] / counts[0])
+    return logarithms[:, :1] - logarithms[:, 1:] - expected, slopes[:, :1] - slopes[:, 1:]
 
 
 def bundle_stand(

@@ -35,6 +35,7 @@ from core.frames.intrinsics import Intrinsics
 from core.geometry.detection import shown_scale
 from core.geometry.keypoints import RESOLUTION, Keypoints
 from core.geometry.verification import CONFIDENCE, ITERATIONS, THRESHOLD, Verification
+from core.kernels import views as kernels
 
 Array = NDArray[np.float64]
 Source = Literal["intrinsics", "field-of-view"]
@@ -258,7 +259,7 @@ class _Plane:
 
     def at(self) -> Array:
         """The values that the prior is of, float64 [8]."""
-        return np.r_[np.zeros(3), self.centre, self.tilt]
+        return np.concatenate([np.zeros(3), self.centre, self.tilt])
 
     def moved(self, step: Array) -> _Plane:
         """The plane after a step of its values."""
@@ -274,24 +275,20 @@ class _Plane:
         homography = self.rotation @ (np.eye(3) - np.outer(self.centre, np.r_[-self.tilt, 1.0]))
         return _planes_of(homography, p)
 
-    def linearized(self, p: Array, q: Array) -> tuple[Array, Array]:
-        """Residuals, float64 [n, 3], and their derivatives, [n, 3, 8].
+    def squares(self, p: Array, q: Array) -> Array:
+        """The squares of what points miss, float64 [n].
 
-        A residual is the difference of two unit vectors, almost at right angles to both, so its length is an angle.
-        Both directions have the same noise, hence the root of two.
+        That is the difference of two unit vectors, almost at right angles to both, so its length is an angle.
         """
-        ahead = p @ np.r_[-self.tilt, 1.0]
-        nearness = np.maximum(ahead, LEAST_NEARNESS)
-        ray = (p - self.centre * nearness[:, np.newaxis]) @ self.rotation.T
-        length = np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        seen = ray / length
-        tangent = (np.eye(3) - seen[:, :, np.newaxis] * seen[:, np.newaxis]) / length[:, :, np.newaxis]
-        jacobian = np.empty((len(p), 3, 8))
-        jacobian[:, :, :3] = -_cross_matrices(seen)
-        jacobian[:, :, 3:6] = -nearness[:, np.newaxis, np.newaxis] * (tangent @ self.rotation)
-        sideways = p[:, :2] * (ahead > LEAST_NEARNESS)[:, np.newaxis]
-        jacobian[:, :, 6:] = (tangent @ (self.rotation @ self.centre))[:, :, np.newaxis] * sideways[:, np.newaxis]
-        return (seen - q) / np.sqrt(2), jacobian / np.sqrt(2)
+        found = np.empty(len(p))
+        kernels.plane_squares(p, q, self.rotation, self.centre, self.tilt, LEAST_NEARNESS, found)
+        return found
+
+    def add_equations(self, p: Array, q: Array, noise: float, normal: Array, gradient: Array) -> None:
+        """Add the points to the normal equations, [8, 8] and [8]."""
+        kernels.plane_equations(
+            p, q, self.rotation, self.centre, self.tilt, LEAST_NEARNESS, 1 / noise**2, OUTLYING**2, normal, gradient
+        )
 
     def shift(self, p: Array, q: Array, covariance: Array) -> tuple[Array, Array]:
         """c in units of the typical distance of the points, and the covariance of ω and it, [6, 6]."""
@@ -325,15 +322,16 @@ class _RigidScene:
         apart = float(np.abs(self.rotation - other.rotation).max() + 1 - abs(self.centre @ other.centre))
         return isinstance(other, _RigidScene) and apart < SAME
 
-    def linearized(self, p: Array, q: Array) -> tuple[Array, Array]:
-        """Residuals, float64 [n, 1], and their derivatives, [n, 1, 5]: Sampson's error, on the sphere an angle."""
-        turned = q @ self.rotation
-        normal = _cross(self.centre, p)
-        plane = _cross(p, turned)
-        size = np.sqrt(np.square(normal).sum(axis=1) + np.square(_cross(self.centre, turned)).sum(axis=1))
-        size = np.maximum(size, 1e-6)[:, np.newaxis]
-        jacobian = np.hstack([-_cross(q, normal @ self.rotation.T), plane @ _across(self.centre)]) / size
-        return (plane @ self.centre)[:, np.newaxis] / size, jacobian[:, np.newaxis]
+    def squares(self, p: Array, q: Array) -> Array:
+        """The squares of what points miss, float64 [n]: Sampson's error, on the sphere an angle."""
+        found = np.empty(len(p))
+        kernels.rigid_squares(p, q, self.rotation, self.centre, found)
+        return found
+
+    def add_equations(self, p: Array, q: Array, noise: float, normal: Array, gradient: Array) -> None:
+        """Add the points to the normal equations, [5, 5] and [5]."""
+        across = _across(self.centre)
+        kernels.rigid_equations(p, q, self.rotation, self.centre, across, 1 / noise**2, OUTLYING**2, normal, gradient)
 
     def shift(self, p: Array, q: Array, covariance: Array) -> tuple[Array, Array]:
         """c in units of the typical distance of the points, and the covariance of ω and it, [6, 6]."""
@@ -439,29 +437,19 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
-def _cross_matrices(vectors: Array) -> Array:
-    """The matrices of v ×, float64 [n, 3, 3]."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-
-
 def _minimized(p: Array, q: Array, model: _Model, noise: float, steps: int = MOST_STEPS) -> _Model:
     """The model at the minimum of the robust cost that is reached from it (Levenberg and Marquardt)."""
-    residuals, jacobian = model.linearized(p, q)
-    cost, damping = _cost(residuals, model, noise), 1e-3
+    cost, damping = _cost(p, q, model, noise), 1e-3
+    normal, gradient = _normal_equations(p, q, model, noise)
     for _ in range(steps):
-        normal, gradient = _normal_equations(residuals, jacobian, model, noise)
         damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
-        step = -np.asarray(np.linalg.solve(damped, gradient), np.float64)
-        tried = model.moved(step)
-        there = tried.linearized(p, q)
-        less = cost - _cost(there[0], tried, noise)
+        tried = model.moved(-np.asarray(np.linalg.solve(damped, gradient), np.float64))
+        less = cost - _cost(p, q, tried, noise)
         if less > 0:
             model, cost, damping = tried, cost - less, damping / 5
-            residuals, jacobian = there
             if less < ENOUGH:
                 break
+            normal, gradient = _normal_equations(p, q, model, noise)
         elif damping > 1e6:
             break
         else:
@@ -469,44 +457,39 @@ def _minimized(p: Array, q: Array, model: _Model, noise: float, steps: int = MOS
     return model
 
 
-def _cost(residuals: Array, model: _Model, noise: float) -> float:
+def _cost(p: Array, q: Array, model: _Model, noise: float) -> float:
     """Twice the negative log likelihood with the prior, but for constants."""
-    squares = np.square(residuals).sum(axis=1) / noise**2
+    squares = model.squares(p, q) / noise**2
     return float((squares / (1 + squares / OUTLYING**2)).sum() + model.prior @ np.square(model.at()))
 
 
-def _normal_equations(residuals: Array, jacobian: Array, model: _Model, noise: float) -> tuple[Array, Array]:
-    squares = np.square(residuals).sum(axis=1) / noise**2
-    weights = 1 / np.square(1 + squares / OUTLYING**2) / noise**2
-    flat = jacobian.reshape(-1, jacobian.shape[2])
-    weighted = (jacobian * weights[:, np.newaxis, np.newaxis]).reshape(flat.shape)
-    return flat.T @ weighted + np.diag(model.prior), weighted.T @ residuals.reshape(-1) + model.prior * model.at()
+def _normal_equations(p: Array, q: Array, model: _Model, noise: float) -> tuple[Array, Array]:
+    normal, gradient = np.diag(model.prior), model.prior * model.at()
+    model.add_equations(p, q, noise, normal, gradient)
+    return normal, gradient
 
 
 def _noise(p: Array, q: Array, model: _Model, pixel: float) -> float:
     """The noise of directions, by the median of the squared residuals."""
-    residuals, _ = model.linearized(p, q)
     median = 0.455 if model.free_distances else 1.386  # of χ² with one and with two degrees of freedom
     free = max(0.2, 1 - model.values / ((2 - model.free_distances) * len(p)))
     low, high = NOISE_LIMITS
-    measured = np.sqrt(np.median(np.square(residuals).sum(axis=1)) / median / free)
+    measured = np.sqrt(np.median(model.squares(p, q)) / median / free)
     return float(np.clip(measured, low * NOISE * pixel, high * NOISE * pixel))
 
 
 def _criterion(p: Array, q: Array, model: _Model, noise: float) -> float:
     """The geometric robust information criterion (Torr, 1998, eq. 19); less is better."""
-    squares = np.square(model.linearized(p, q)[0]).sum(axis=1) / noise**2
-    missed = np.minimum(squares, 2 * (2 - model.free_distances)).sum()
+    missed = np.minimum(model.squares(p, q) / noise**2, 2 * (2 - model.free_distances)).sum()
     prior = model.prior @ np.square(model.at())
     return float(missed + PER_MATCH * (2 + model.free_distances) * len(p) + PER_VALUE * model.values + prior)
 
 
 def _view(p: Array, q: Array, model: _Model, noise: float) -> RelativeView:
-    residuals, jacobian = model.linearized(p, q)
-    normal, _ = _normal_equations(residuals, jacobian, model, noise)
+    normal, _ = _normal_equations(p, q, model, noise)
     inverse = np.asarray(np.linalg.inv(normal + np.diag(np.full(len(normal), 1e-9))), np.float64)
     centre, covariance = model.shift(p, q, INFLATION * inverse)
-    inliers = int((np.square(residuals).sum(axis=1) < (3 * noise) ** 2).sum())
+    inliers = int((model.squares(p, q) < (3 * noise) ** 2).sum())
     # A rotation that precedes R by -Rᵀ ω is one that follows it by ω; both in the axes of ROS.
     change = np.zeros((6, 6))
     change[:3, :3], change[3:, 3:] = -BODY @ model.rotation.T, BODY

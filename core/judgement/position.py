@@ -12,7 +12,10 @@ agree with each place's shift s and turn t,
     s = W^T (x - a) exp(-ζ),    t = ψ - φ,
 
 with the place's position a, its heading φ and its attitude W.  The errors of views are not independent, as they share
-the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).
+the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).  Given ζ,
+the problem is linear.  As ζ is hardly known and the position depends on its exponential, it is solved for a row of
+values, which make a mixture.  They are weighed by the prior of ζ, by what is missed, and by how many points the query
+shares with each place where that is known: fewer are shared from farther away.
 
 Where the best match and another place share points with the query and the intrinsics are known, that estimate is only
 where a bundle adjustment begins (:mod:`core.geometry.bundle`).  It gets the mean of the places as a prior that is wide.
@@ -27,7 +30,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.geometry.bundle import Stand, bundle_stand
+from core.geometry.bundle import Stand, bundle_stand, decline_misses
 from core.geometry.pose import RelativeView, SharedPoints
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
@@ -48,12 +51,18 @@ LEVEL = float(np.radians(8))
 """Deviation of a place's pitch and roll, which poses do not give: it tilts a shift by as much."""
 DISTANCE, DISTANCE_DEVIATION = float(np.log(8)), 1.0
 """Mean and deviation of the logarithm of the typical distance of a scene in metres: mostly 3 to 22 m."""
+DISTANCES = np.linspace(-2.5, 2.5, 11)
+"""Deviations from that mean at which the pose is computed; the answers make a mixture."""
 UNUSED = 1e4
 """Variance by which the shift of a view without intrinsics takes no part: on real traverses it was further off than its
 covariance says."""
 CONTRADICTION = 30.0
 """Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
-_STEPS = 8
+SHARING_DEVIATION = 0.5
+"""Deviation of the logarithm of the ratio of distances that counts of shared points tell; they are no independent
+evidence, so those of several places count as one."""
+WIDEST_GAP = 16.0
+"""Metres between places from which on a frame halfway is not recognized any more."""
 BUNDLED = 4
 """The most places whose points are adjusted together."""
 BUNDLE_REACH = 30.0
@@ -170,8 +179,9 @@ def estimate_pose(
     """Estimate the pose of a frame from its matches.
 
     Without views, the square of the spread is the weighted mean square distance of the poses from their mean, plus the
-    square of half the distance from the best match to its nearest neighbour among the places (half the reach if none is
-    within it): a frame taken between two places looks like one of them, and its distance from that one is not known.
+    square of half the distance from the best match to its nearest neighbour among the places, or of half of WIDEST_GAP
+    or the reach if that is less: a frame taken between two places looks like one of them, and its distance from that
+    one is not known.
     With views, it is the sum of the variances of x and y.
 
     Args:
@@ -201,8 +211,8 @@ def estimate_pose(
         length = float(np.linalg.norm(mean))
         mean = chosen.position[0] if length < 1 else mean * (EARTH_RADIUS / length)
     squares = weights @ np.square(chosen.position - mean).sum(axis=1)
-    apart = distance[(distance > 0) & (distance <= reach)]
-    gap = float(apart.min()) if len(apart) else reach
+    apart = distance[(distance > 0) & np.isfinite(distance)]
+    gap = min(float(apart.min(initial=np.inf)), max(reach, WIDEST_GAP))
     heading, heading_spread = _heading(chosen, weights, mean, on_earth)
     axes = _axes(mean) if on_earth else np.eye(3)
     local = (chosen.position - mean) @ axes.T
@@ -218,12 +228,13 @@ def estimate_pose(
         found = replace(found, heading_offset=sign * seen[0].heading_offset, offset_spread=seen[0].heading_spread)
     directions = _directions(chosen, axes, on_earth)
     rows = [place for place, row in enumerate(part) if row in seen and np.isfinite(directions[place])]
+    shared = _points_of_places(places, mean, axes, on_earth, sightings or ())
     if rows and heading is not None:
         yaw = float(np.radians(90 - heading if on_earth else heading))
         place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
-        found = _fused(found, place_views, yaw, mean, axes, on_earth)
-    if heading is not None and sightings and sightings[0] is not None:
-        found = _bundled(found, covariance, places, mean, axes, on_earth, seen.get(0), sightings)
+        found = _fused(found, place_views, yaw, mean, axes, on_earth, shared)
+    if heading is not None and shared is not None:
+        found = _bundled(found, covariance, mean, axes, on_earth, seen.get(0), shared)
     return found.without_height() if on_earth else found
 
 
@@ -237,9 +248,19 @@ class _PlaceViews:
 
 
 def _fused(
-    found: PoseEstimate, place_views: _PlaceViews, yaw: float, mean: Vectors, axes: Vectors, on_earth: bool
+    found: PoseEstimate,
+    place_views: _PlaceViews,
+    yaw: float,
+    mean: Vectors,
+    axes: Vectors,
+    on_earth: bool,
+    shared: _PlacePoints | None,
 ) -> PoseEstimate:
-    """The estimate fused with the views; unchanged if all of them contradict it."""
+    """The estimate fused with the views; unchanged if all of them contradict it.
+
+    Args:
+        shared: the points of several places, whose counts say how far the query is; None: not known.
+    """
     prior = np.zeros((5, 5))  # of x, y, z, ψ and ζ
     prior[:3, :3] = found.covariance[:3, :3]
     prior[3, 3], prior[4, 4] = found.covariance[5, 5], DISTANCE_DEVIATION**2
@@ -251,19 +272,28 @@ def _fused(
     ]
     if not retained:
         return found
-    information = np.linalg.inv(prior)
-    state, normal = begin, information
-    for _ in range(_STEPS):
-        normal, gradient = information.copy(), information @ (state - begin)
+    information = np.linalg.inv(prior[:4, :4])
+    states, covariances, costs = [], [], []
+    for deviations in DISTANCES:
+        # With the distance of the scene given, the problem is linear.
+        at = begin + np.r_[np.zeros(4), deviations * DISTANCE_DEVIATION]
+        normal, gradient, cost = information.copy(), np.zeros(4), float(deviations**2)
         for number in retained:
-            residual, jacobian, noise = _missed(state, place_views, number)
-            weighed = jacobian.T @ np.linalg.inv(noise * len(retained))
-            normal, gradient = normal + weighed @ jacobian, gradient + weighed @ residual
-        state = state - np.linalg.solve(normal, gradient)
+            residual, jacobian, noise = _missed(at, place_views, number)
+            weighed = jacobian[:, :4].T @ np.linalg.inv(noise * len(retained))
+            normal, gradient = normal + weighed @ jacobian[:, :4], gradient + weighed @ residual
+            cost += float(residual @ np.linalg.solve(noise * len(retained), residual))
+        covariance = np.linalg.inv(normal)
+        states.append(begin[:4] - covariance @ gradient)
+        covariances.append(covariance)
+        costs.append(cost - float(gradient @ covariance @ gradient))
+    if shared is not None:
+        missed, _ = decline_misses(np.array(states)[:, :3], shared.positions, shared.counts)
+        costs = np.array(costs) + np.square(missed / SHARING_DEVIATION).mean(axis=1)
+    state, posterior = _mixed(np.array(states), np.array(covariances), np.array(costs))
     covariance = found.covariance.copy()
-    posterior = np.linalg.inv(normal)
     which = [0, 1, 2, 5]
-    covariance[np.ix_(which, which)] = posterior[:4, :4]
+    covariance[np.ix_(which, which)] = posterior
     pose = _pose_at(mean + state[:3] @ axes, float(np.degrees(state[3])), on_earth)
     sources = {place_views.views[number].source for number in retained}
     return replace(
@@ -276,17 +306,41 @@ def _fused(
     )
 
 
-def _bundled(
-    found: PoseEstimate,
-    prior: Vectors,
-    places: Whereabouts,
-    mean: Vectors,
-    axes: Vectors,
-    on_earth: bool,
-    view: RelativeView | None,
-    sightings: Sequence[SharedPoints | None],
-) -> PoseEstimate:
-    """The estimate by the points of several places together; unchanged if they do not tell it."""
+def _mixed(states: Vectors, covariances: Vectors, costs: Vectors) -> tuple[Vectors, Vectors]:
+    """Mean and covariance of a mixture of normal distributions, with weights by costs, twice a negative logarithm.
+
+    Args:
+        states: means of the parts, [n, m].
+        covariances: [n, m, m].
+    """
+    weights = np.exp((costs.min() - costs) / 2)
+    weights /= weights.sum()
+    mean = weights @ states
+    apart = states - mean
+    return mean, np.einsum("n,nij->ij", weights, covariances) + apart.T @ (weights[:, np.newaxis] * apart)
+
+
+@dataclass(frozen=True)
+class _PlacePoints:
+    """The points that the query shares with k places, the best match first.
+
+    positions: from the mean, [k, 3].
+    directions: headings counter-clockwise from x, [k].
+    counts: of points that fit, [k].
+    """
+
+    positions: Vectors
+    directions: Vectors
+    counts: Vectors
+    sightings: list[SharedPoints]
+
+
+def _points_of_places(
+    places: Whereabouts, mean: Vectors, axes: Vectors, on_earth: bool, sightings: Sequence[SharedPoints | None]
+) -> _PlacePoints | None:
+    """The points of the places that share most with the query; None where these are not two that stand apart."""
+    if not sightings or sightings[0] is None:
+        return None
     local = (places.position - mean) @ axes.T
     directions = _directions(places, axes, on_earth)
     shared = {
@@ -298,20 +352,35 @@ def _bundled(
         and np.linalg.norm(local[row] - local[0]) <= BUNDLE_REACH
     }
     if 0 not in shared:
-        return found
+        return None
+    counts = {row: int(sighting.fitting.sum()) for row, sighting in shared.items()}
     rows: list[int] = []
-    for row in sorted(shared, key=lambda row: (row > 0, -int(shared[row].fitting.sum()))):
+    for row in sorted(shared, key=lambda row: (row > 0, -counts[row])):
         if len(rows) < BUNDLED and all(np.linalg.norm(local[row] - local[other]) >= APART for other in rows):
             rows.append(row)
     if len(rows) < 2:
-        return found
+        return None
+    number = np.array([counts[row] for row in rows], np.float64)
+    return _PlacePoints(local[rows], directions[rows], number, [shared[row] for row in rows])
 
-    def place(row: int) -> Stand:
-        height = PLACE_POSITION + SLOPE * float(np.linalg.norm(local[row] - local[0]))
+
+def _bundled(
+    found: PoseEstimate,
+    prior: Vectors,
+    mean: Vectors,
+    axes: Vectors,
+    on_earth: bool,
+    view: RelativeView | None,
+    shared: _PlacePoints,
+) -> PoseEstimate:
+    """The estimate by the points of several places together; unchanged if they do not tell it."""
+
+    def stand_of(position: Vectors, direction: float) -> Stand:
+        height = PLACE_POSITION + SLOPE * float(np.linalg.norm(position - shared.positions[0]))
         covariance = np.diag(np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height]))
-        return Stand(local[row], _level(directions[row]), covariance)
+        return Stand(position, _level(direction), covariance)
 
-    stands = [place(row) for row in rows]
+    stands = [stand_of(*one) for one in zip(shared.positions, shared.directions, strict=True)]
     position, yaw = _of(found.pose, mean, axes, on_earth)
     attitude = _level(yaw) if view is None else stands[0].attitude @ view.turn
     loose = np.zeros((6, 6))
@@ -319,7 +388,7 @@ def _bundled(
     loose[2, 2] = TURN**2
     loose[3:, 3:] = prior[:3, :3] * 4 + np.eye(3)
     best = Stand(np.zeros(3), _level(yaw), loose)
-    stand = bundle_stand(best, stands, [shared[row] for row in rows], Stand(position, attitude, loose))
+    stand = bundle_stand(best, stands, shared.sightings, Stand(position, attitude, loose))
     if stand is None:
         return found
     covariance = found.covariance.copy()
@@ -333,7 +402,7 @@ def _bundled(
         spread=float(np.sqrt(covariance[0, 0] + covariance[1, 1])),
         heading_spread=float(np.degrees(np.sqrt(covariance[5, 5]))),
         covariance=covariance,
-        places=len(rows),
+        places=len(stands),
         source="intrinsics",
     )
 

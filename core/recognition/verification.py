@@ -40,8 +40,8 @@ frame so few that they would say nothing."""
 MOST_VIEWS = 1
 """The most places whose turn and shift give the pose, or where a search for it begins; each takes some 20 ms."""
 
-NEIGHBOURS = 2
-"""Places beside the best match that are compared for the sake of the pose where no others were verified."""
+NEIGHBOURS = 3
+"""The places nearest to the best match that are compared for the sake of the pose if they were not verified."""
 
 OF_TWO_STAGES, OF_THE_FIRST, OF_GLANCES = 6, 2, 4
 """How many places are candidates for being the best of two stages, the best of the first, and by their matches."""
@@ -272,7 +272,7 @@ def sightings(
 ) -> list[SharedPoints | None]:
     """The points that the query shares with places that were verified, however far they are from the best match.
 
-    If only the best match was, its neighbours are compared as well: one place does not tell how far the query is.
+    The best match's neighbours are compared as well: one place does not tell how far the query is.
 
     Returns:
         One for each of the first candidates; None where the intrinsics of a camera are not known or do not fit.
@@ -285,8 +285,8 @@ def sightings(
         return []
     compared = {at: one for at, one in enumerate(candidates.verifications) if one is not None}
     stored = {at: stage.stored.get(int(candidates.rows[at])) for at in compared}
-    if list(compared) == [0] and compared[0].evidence >= LEAST_EVIDENCE:
-        around = _around(candidates)
+    if 0 in compared and compared[0].evidence >= LEAST_EVIDENCE:
+        around = [at for at in _around(candidates) if at not in compared]
         there = zip(around, map_.keypoints_at(candidates.rows[around].tolist()), strict=True)
         more = {at: keypoints for at, keypoints in there if keypoints is not None}
         stored |= more

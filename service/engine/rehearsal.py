@@ -24,6 +24,7 @@ import numpy as np
 
 from core.belief import Odometry, Run, RunOptions, Step, evidence_of, place_graph, view_of
 from core.errors import StorageFailure, StorageFull
+from core.frames.intrinsics import Intrinsics
 from core.frames.preprocessing import Pixels
 from core.judgement.alignment import LEAST_FRAMES, of_matrix, shared_stretches
 from core.kernels.compiled import PROCESSOR, instructions, levels, processor, settings_of
@@ -40,6 +41,9 @@ from core.storage.files.row_formats import COMPRESSED, inner_products, pack_desc
 
 FRAMES = 2
 """Of each of the two traverses."""
+
+CAMERA = "front"
+"""Its intrinsics are known, so that turns, shifts and the points of several places are computed."""
 
 STEPS = (Step(), Step(reach=2.0), Step(odometry=Odometry(2.0)))
 """The knowledge of a motion that sessions may have: none, a speed limit, odometry."""
@@ -79,14 +83,17 @@ def _rehearse(encoder: Encoder) -> None:
 
 def _rehearse_in(map_: Map, encoder: Encoder) -> None:
     frames, moment = list(_frames()), datetime(2026, 1, 1, tzinfo=UTC)
+    height, width = frames[0].shape[:2]
+    map_.cameras.put(CAMERA, None, Intrinsics(width=width, height=height, fx=500, fy=500, cx=width / 2, cy=height / 2))
     for number, frame in enumerate(frames):
         traverse, place = divmod(number, FRAMES)
         pose = Pose(x=2.0 * place, y=0.5 * traverse, heading=0.0)
         taken = moment + timedelta(seconds=number)
-        fields = PlaceFields(pose=pose, timestamp=taken, sequence=f"traverse-{traverse}")
+        fields = PlaceFields(pose=pose, timestamp=taken, sequence=f"traverse-{traverse}", camera=CAMERA)
         enrol(map_, f"place-{number}", _file(frame), encoder, fields)
     seen = frames[:FRAMES]
-    _follow(map_, seen, [recognize(map_, _file(frame), encoder, Question(verify="always")) for frame in seen])
+    question = Question(verify="always", camera=CAMERA)
+    _follow(map_, seen, [recognize(map_, _file(frame), encoder, question) for frame in seen])
 
 
 def _follow(map_: Map, frames: Sequence[Pixels], answers: Sequence[Answer]) -> None:

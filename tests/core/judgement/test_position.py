@@ -11,8 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from core.geometry.pose import RelativeView
-from core.judgement.position import UNKNOWN_ANGLE, UNKNOWN_HEIGHT, PoseEstimate, circular_mean, estimate_pose
+from core.geometry.pose import RelativeView, SharedPoints
+from core.judgement.position import (
+    UNKNOWN_ANGLE,
+    UNKNOWN_HEIGHT,
+    WIDEST_GAP,
+    PoseEstimate,
+    circular_mean,
+    estimate_pose,
+)
 from core.places import EARTH_RADIUS, Pose
 from tests.core.geometry.test_bundle import sightings, stand
 from tests.core.judgement.test_priors import places
@@ -61,7 +68,16 @@ def test_a_far_place_that_looks_alike_is_no_part_of_it() -> None:
 def test_one_place_alone_is_not_exact() -> None:
     found = estimate([Pose(x=3, y=4, heading=90)])
     assert (found.pose.x, found.pose.y, found.pose.heading) == (3, 4, 90)
-    assert (found.spread, found.heading_spread, found.places) == (REACH / 2, None, 1)
+    assert (found.spread, found.heading_spread, found.places) == (WIDEST_GAP / 2, None, 1)
+    assert estimate([Pose(x=3, y=4)], reach=40).spread == 20
+
+
+def test_places_beyond_the_reach_say_how_far_a_place_stands_for_all_around() -> None:
+    """A frame from anywhere up to halfway to the next place shows this one; from farther off none is recognized."""
+    for apart, gap in ((3.0, 3.0), (12.0, 12.0), (500.0, WIDEST_GAP)):
+        found = estimate([Pose(x=0, y=0), Pose(x=apart, y=0)], [0.0, -30.0])
+        assert found.pose.x == pytest.approx(0, abs=1e-6) and found.spread == pytest.approx(gap / 2)
+        assert found.covariance[0, 0] == pytest.approx(gap**2 / 8, rel=0.01)
 
 
 def test_no_better_than_the_distance_of_the_places() -> None:
@@ -167,6 +183,41 @@ def test_one_view_says_where_to_and_not_how_far() -> None:
     assert found.pose.heading == pytest.approx(80, abs=2)
     assert found.covariance[1, 1] > 4 * found.covariance[0, 0]  # along the shift, which is to +y
     assert found.pose.y is not None and found.pose.y > 5.3
+
+
+@pytest.mark.parametrize("distance", [4.0, 8.0, 24.0])
+def test_far_from_all_places_the_distance_of_the_scene_is_open(distance: float) -> None:
+    """Places are 14 m apart, beyond the reach, and the query is 5 m ahead of one of them."""
+    poses: list[Pose | None] = [Pose(x=14.0 * number, y=0, heading=0) for number in range(3)]
+    view = view_from(Pose(x=0, y=0, heading=0), 5, 0, 0, distance)
+    found = estimate_pose(places(poses), [0, -3, -6], REACH, views=[view])
+    assert found is not None and found.pose.x is not None and found.pose.y is not None
+    assert abs(found.pose.x - 5) < 2.2 * math.sqrt(found.covariance[0, 0])
+    assert 1 < math.sqrt(found.covariance[0, 0]) < 5
+    assert abs(found.pose.y) < 0.6 and math.sqrt(found.covariance[1, 1]) < 0.7
+
+
+def test_fewer_points_are_shared_from_farther_away() -> None:
+    """The query stands between two places: the nearer it is to the second one, the more points it shares with that."""
+    poses: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=14, y=0, heading=0)]
+    view = view_from(Pose(x=0, y=0, heading=0), 5, 0, 0, 24)
+    found = []
+    for count in (30, 60, 90):
+        seen = [sharing(100), sharing(count)]
+        estimated = estimate_pose(places(poses), [0, -3], REACH, views=[view], sightings=seen)
+        assert estimated is not None and estimated.pose.x is not None
+        found.append(estimated)
+    assert found[0].pose.x < found[1].pose.x - 0.3 < found[2].pose.x - 0.6  # type: ignore[operator]
+    alone = estimate_pose(places(poses), [0, -3], REACH, views=[view])
+    assert alone is not None and alone.pose.x is not None
+    assert abs(found[2].pose.x - 5) < 0.5 < abs(alone.pose.x - 5)  # type: ignore[operator]
+
+
+def sharing(count: int) -> SharedPoints:
+    """As many points that fit, each of which another place sees as another point."""
+    ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
+    numbers = np.arange(count) + 1000 * count
+    return SharedPoints(numbers, ahead, ahead, np.ones(count, np.bool_), np.ones(count), 1e-3)
 
 
 @pytest.mark.thorough

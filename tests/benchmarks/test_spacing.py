@@ -1,0 +1,26 @@
+"""Poses between places that stand far apart, on a street with measured poses where it is at hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.geometry.spacing import measured_traverse, outcome
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from tests.service.server import ROOT
+
+STREET = ROOT.parent / "shared" / "datasets" / "eval" / "kitti_short"
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not STREET.is_dir(), reason="the evaluation images are not at hand")
+def test_the_covariance_covers_the_errors_and_these_are_small() -> None:
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    street = measured_traverse(encoder, STREET)
+    # Metres from frame to frame: 1.2.  Where the best match alone told how far it is, errors were 0.3, 0.67 and 1.7 m.
+    for spacing, most in ((6, 0.2), (8, 0.45), (12, 1.2)):
+        found = outcome(encoder, street, spacing, 2, "auto")
+        assert len(found.distances) >= 0.95 * len(found.asked)
+        assert np.median(found.positions.errors) <= most
+        assert 0.3 < np.mean(found.positions.normalized) < 2.2
+        assert np.mean(found.headings.normalized) < 2
