@@ -1,6 +1,7 @@
 """The errors of poses where the places of a map are far apart, and whether their covariance covers them.
 
-    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2] [--auto]
+    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2] [--noise 0]
+        [--auto]
 
 The frames of kitti_short stand about 1.2 m apart, with measured poses.  Every second, fourth, … of them is a place of a
 map, with its x, y and heading and the camera's intrinsics.  The others are asked with ``verify`` ``always``, or
@@ -62,13 +63,17 @@ class MeasuredTraverse:
 
 @dataclass(frozen=True)
 class SpacingOutcome:
-    """The answers at one spacing; distances to the best place in metres, one for each recognized frame."""
+    """The answers at one spacing: for each recognized frame the distance to the best place in metres, and more.
+
+    places: how many places the pose rests on.
+    """
 
     asked: list[int] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     positions: Errors = field(default_factory=lambda: Errors([], [], []))
     headings: Errors = field(default_factory=lambda: Errors([], [], []))
     sources: list[str] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)
 
     def row(self) -> dict[str, float]:
         """The figures by the names of the table's columns."""
@@ -83,6 +88,7 @@ class SpacingOutcome:
             "stated (m)": float(np.median(self.positions.deviations)),
             "stated (°)": float(np.median(self.headings.deviations)),
             "by geometry": float(np.mean([source == "intrinsics" for source in self.sources])),
+            "places": float(np.mean(self.places)),
         }
 
 
@@ -113,19 +119,38 @@ def measured_traverse(encoder: Encoder, folder: Path) -> MeasuredTraverse:
     )
 
 
-def outcome(encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify) -> SpacingOutcome:
-    """The answers with every ``spacing``-th frame as a place, in maps that begin at several frames."""
+def outcome(
+    encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify, noise: float = 0.0
+) -> SpacingOutcome:
+    """The answers with every ``spacing``-th frame as a place, in maps that begin at several frames.
+
+    Args:
+        noise: metres, the deviation of errors of the places' x and of their y.
+    """
     found = SpacingOutcome()
+    errors = np.random.default_rng(1).normal(0, noise, (len(traverse.poses), 2))
+    stated = traverse.poses + np.pad(errors, ((0, 0), (0, 1)))
     for start in np.unique(np.linspace(0, spacing, starts, endpoint=False).astype(int)).tolist():
         with tempfile.TemporaryDirectory() as folder:
-            ask(encoder, traverse, list(range(start, len(traverse.frames), spacing)), Path(folder), when, found)
+            places = list(range(start, len(traverse.frames), spacing))
+            ask(encoder, traverse, places, stated, Path(folder), when, found)
     return found
 
 
 def ask(
-    encoder: Encoder, traverse: MeasuredTraverse, places: list[int], folder: Path, when: Verify, found: SpacingOutcome
+    encoder: Encoder,
+    traverse: MeasuredTraverse,
+    places: list[int],
+    stated: Array,
+    folder: Path,
+    when: Verify,
+    found: SpacingOutcome,
 ) -> None:
-    """Add the answers with some frames as places and the others between the first and the last one as queries."""
+    """Add the answers with some frames as places and the others between the first and the last one as queries.
+
+    Args:
+        stated: the poses that the places are enrolled with, as those of the traverse.
+    """
     atlas = Atlas(folder)
     settings = MapSettings(keep="none")
     map_ = atlas.create("spaced", encoder.identity, encoder.dimension, settings, encoder.local_shape)
@@ -135,7 +160,7 @@ def ask(
             describe(
                 map_,
                 f"p{number}",
-                PlaceFields(pose=pose(traverse.poses[number]), camera=CAMERA, sequence="drive"),
+                PlaceFields(pose=pose(stated[number]), camera=CAMERA, sequence="drive"),
                 None,
                 hashlib.sha256(str(number).encode()).digest(),
                 traverse.frames[number],
@@ -157,6 +182,7 @@ def ask(
             found.distances.append(float(np.linalg.norm(best[:2] - traverse.poses[number, :2])))
             add_pose(found.positions, found.headings, traverse.poses[number], answer.pose)
             found.sources.append(answer.pose.source)
+            found.places.append(answer.pose.places)
     atlas.close()
 
 
@@ -170,13 +196,15 @@ def main(
     data: Annotated[Path, typer.Option(help="Folder of eval/.")] = Path("../shared/datasets"),
     spacings: Annotated[str, typer.Option(help="Frames from place to place, separated by commas.")] = SPACINGS,
     starts: Annotated[int, typer.Option(min=1, help="Maps of each spacing, which begin at different frames.")] = 2,
+    noise: Annotated[float, typer.Option(help="Metres, the deviation of errors of places' x and y.")] = 0.0,
     auto: Annotated[bool, typer.Option(help="Verify where the scores leave doubt or a pose is wanted.")] = False,
 ) -> None:
     """Measure, print a table and write JSON."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
     traverse = measured_traverse(encoder, data / "eval" / "kitti_short")
     when: Verify = "auto" if auto else "always"
-    found = {int(spacing): outcome(encoder, traverse, int(spacing), starts, when) for spacing in spacings.split(",")}
+    apart = [int(spacing) for spacing in spacings.split(",")]
+    found = {spacing: outcome(encoder, traverse, spacing, starts, when, noise) for spacing in apart}
     rows = [{"frames apart": spacing, **one.row()} for spacing, one in found.items() if one.distances]
     columns = list(rows[0]) if rows else []
     figures = {

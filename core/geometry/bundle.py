@@ -62,7 +62,7 @@ TEMPERATURE = 16.0
 """Minima are weighed by the exponential of half their cost over this, as points are no independent evidence."""
 NEGLIGIBLE = 1e-3
 """Weight from which on a minimum is a part of the mixture."""
-INFLATION = 2.5
+INFLATION = 2.0
 """Factor of the covariance of directions, as errors of keypoints are not independent."""
 OUTLYING = 2.0
 """Residuals of this many deviations weigh a quarter (Geman and McClure, 1985).
@@ -70,6 +70,8 @@ OUTLYING = 2.0
 Of matches of frames that are 10 m apart, half are wrong along the epipolar line, where verification cannot tell."""
 CASES = 0.5
 """Cases as which the prior of the errors of places' headings and positions counts beside what their pictures show."""
+LOOSE_HEADING, LOOSE_POSITION = 3.0, 5.0
+"""Factors of these deviations at first: where poses of a map are less exact than is thought, its pictures show it."""
 LEAST_VARIANCE = 0.04
 """Share of the prior's variance that is left of it at least."""
 LEAST_FITTING = 0.5
@@ -197,6 +199,13 @@ class _Bundle:
         poses[3:6, 3:6] += by_position.T @ by_position
         gradient[3:6] += by_position.T @ decline
         return _Normal(poses, nearness, mixed, gradient, slope)
+
+    def loosened(self) -> _Bundle:
+        """The bundle with larger errors of places' headings and positions, which their pictures then show."""
+        factors = np.ones(6)
+        factors[2], factors[3:5] = LOOSE_HEADING, LOOSE_POSITION
+        loose = [replace(one, covariance=one.covariance * np.outer(factors, factors)) for one in self.stands[1:]]
+        return replace(self, stands=[self.stands[0], *loose])
 
     def with_measured_noise(self, state: _State) -> _Bundle:
         """The bundle with the noise that directions have, and places' headings and positions.
@@ -355,13 +364,14 @@ def _minima(bundle: _Bundle, start: Stand) -> tuple[list[tuple[float, _State]], 
     direction = away / length if length > 1e-9 else start.attitude[:, 0]
     tried = best.position + LENGTHS[:, np.newaxis] * direction
     likely = float(LENGTHS[np.square(bundle.declines(tried)[0]).sum(axis=1).argmin()])
-    blurred = replace(bundle, noise=bundle.noise * BLUR)
+    loose = bundle.loosened()
+    blurred = replace(loose, noise=loose.noise * BLUR)
     starts = [start.position, *(best.position + factor * likely * direction for factor in FACTORS)]
     begun = [_minimized(blurred, bundle.state(replace(start, position=position)), FIRST_STEPS) for position in starts]
     begun.sort(key=lambda pair: pair[0])
-    followed = _distinct([_minimized(bundle, state) for _, state in begun[:FOLLOWED]])
-    bundle = bundle.with_measured_noise(followed[0][1])
-    return _distinct([_minimized(bundle, state) for _, state in followed]), bundle
+    followed = _distinct([_minimized(loose, state) for _, state in begun[:FOLLOWED]])
+    learnt = bundle.with_measured_noise(followed[0][1])
+    return _distinct([_minimized(learnt, state) for _, state in followed]), learnt
 
 
 def _distinct(minima: list[tuple[float, _State]]) -> list[tuple[float, _State]]:

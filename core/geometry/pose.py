@@ -102,6 +102,7 @@ class RelativeView:
         shift.
     inliers: how many matches fit.
     source: the cameras' intrinsics, or a range of fields of view where one of them has none.
+    share: of keypoints, that the verification of the place found to fit (``Verification.inlier_share``).
     """
 
     turn: Array
@@ -109,6 +110,7 @@ class RelativeView:
     covariance: Array
     inliers: int
     source: Source
+    share: float = 1.0
 
     @property
     def heading_offset(self) -> float:
@@ -192,7 +194,10 @@ def relative_view(
     if sighting is None:
         return None
     view = view_of_bearings(sighting.place, sighting.query, sighting.pixel)
-    return _by_assumed_field(view) if view is not None and None in (query_camera, place_camera) else view
+    if view is None:
+        return None
+    view = replace(view, share=verification.inlier_share)
+    return _by_assumed_field(view) if None in (query_camera, place_camera) else view
 
 
 def _by_assumed_field(view: RelativeView) -> RelativeView:
@@ -278,7 +283,8 @@ class _Plane:
     def squares(self, p: Array, q: Array) -> Array:
         """The squares of what points miss, float64 [n].
 
-        That is the difference of two unit vectors, almost at right angles to both, so its length is an angle.
+        That is the difference of two unit vectors, almost at right angles to both, so its length is an angle.  Both
+        directions have the same noise, hence half of the square.
         """
         found = np.empty(len(p))
         kernels.plane_squares(p, q, self.rotation, self.centre, self.tilt, LEAST_NEARNESS, found)
@@ -413,7 +419,7 @@ def _planes_of(matrix: Array, p: Array) -> list[_Plane]:
 def _best_direction(p: Array, turned: Array) -> Array:
     """The unit vector c for which the squares of c · (p x u) are least, float64 [3]."""
     planes = _cross(p, turned)
-    return np.asarray(np.linalg.eigh(planes.T @ planes)[1][:, 0])
+    return np.ascontiguousarray(np.linalg.eigh(planes.T @ planes)[1][:, 0])
 
 
 def _distances(p: Array, turned: Array, centre: Array) -> Array:

@@ -13,9 +13,9 @@ agree with each place's shift s and turn t,
 
 with the place's position a, its heading φ and its attitude W.  The errors of views are not independent, as they share
 the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).  Given ζ,
-the problem is linear.  As ζ is hardly known and the position depends on its exponential, it is solved for a row of
-values, which make a mixture.  They are weighed by the prior of ζ, by what is missed, and by how many points the query
-shares with each place where that is known: fewer are shared from farther away.
+the problem is linear.  As ζ is hardly known from one view and the position depends on its exponential, it is solved for
+a row of values, which make a mixture.  They are weighed by the prior of ζ, by the evidence of the view, and by how many
+points the query shares with each place where that is known: fewer are shared from farther away.
 
 Where the best match and another place share points with the query and the intrinsics are known, that estimate is only
 where a bundle adjustment begins (:mod:`core.geometry.bundle`).  It gets the mean of the places as a prior that is wide.
@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.geometry.bundle import Stand, bundle_stand, decline_misses
 from core.geometry.pose import RelativeView, SharedPoints
-from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
 PoseSource = Literal["places", "intrinsics", "field-of-view"]
@@ -58,11 +58,14 @@ UNUSED = 1e4
 covariance says."""
 CONTRADICTION = 30.0
 """Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
-SHARING_DEVIATION = 0.5
-"""Deviation of the logarithm of the ratio of distances that counts of shared points tell; they are no independent
-evidence, so those of several places count as one."""
+WRONG_SHARE, WRONG_SLOPE = 0.115, 0.016
+"""The share of keypoints that fit at which half of the shifts are wrong, and how fast that changes; looked at on a
+street, where frames were recognized from up to 25 m away, and most matches that fit were wrong there."""
+SHARING_DEVIATION = 0.4
+"""Deviation of the logarithm of the ratio of distances that counts of shared points tell where no points are adjusted;
+they are no independent evidence, so those of several places count as one."""
 WIDEST_GAP = 16.0
-"""Metres between places from which on a frame halfway is not recognized any more."""
+"""Metres between places from which on a frame halfway shows neither; on a street it still did at 14."""
 BUNDLED = 4
 """The most places whose points are adjusted together."""
 BUNDLE_REACH = 30.0
@@ -179,9 +182,8 @@ def estimate_pose(
     """Estimate the pose of a frame from its matches.
 
     Without views, the square of the spread is the weighted mean square distance of the poses from their mean, plus the
-    square of half the distance from the best match to its nearest neighbour among the places, or of half of WIDEST_GAP
-    or the reach if that is less: a frame taken between two places looks like one of them, and its distance from that
-    one is not known.
+    square of half the distance from the best match to its neighbour (:func:`gap_around`): a frame taken between two
+    places looks like one of them, and its distance from that one is not known.
     With views, it is the sum of the variances of x and y.
 
     Args:
@@ -211,8 +213,7 @@ def estimate_pose(
         length = float(np.linalg.norm(mean))
         mean = chosen.position[0] if length < 1 else mean * (EARTH_RADIUS / length)
     squares = weights @ np.square(chosen.position - mean).sum(axis=1)
-    apart = distance[(distance > 0) & np.isfinite(distance)]
-    gap = min(float(apart.min(initial=np.inf)), max(reach, WIDEST_GAP))
+    gap = gap_around(places, reach)
     heading, heading_spread = _heading(chosen, weights, mean, on_earth)
     axes = _axes(mean) if on_earth else np.eye(3)
     local = (chosen.position - mean) @ axes.T
@@ -228,7 +229,7 @@ def estimate_pose(
         found = replace(found, heading_offset=sign * seen[0].heading_offset, offset_spread=seen[0].heading_spread)
     directions = _directions(chosen, axes, on_earth)
     rows = [place for place, row in enumerate(part) if row in seen and np.isfinite(directions[place])]
-    shared = _points_of_places(places, mean, axes, on_earth, sightings or ())
+    shared = _points_of_places(places, mean, axes, on_earth, reach, sightings or ())
     if rows and heading is not None:
         yaw = float(np.radians(90 - heading if on_earth else heading))
         place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
@@ -236,6 +237,37 @@ def estimate_pose(
     if heading is not None and shared is not None:
         found = _bundled(found, covariance, mean, axes, on_earth, seen.get(0), shared)
     return found.without_height() if on_earth else found
+
+
+def gap_around(places: Whereabouts, reach: float) -> float:
+    """Metres between the best match, the first of n places, and its neighbour in its traverse.
+
+    Where its traverse has no other place, or it is of none, that is the nearest place of all.  Places less than APART
+    away are no neighbours, and a traverse beside it says nothing of the frames between those of its own.  More than
+    WIDEST_GAP or the reach, whichever is more, counts as that.
+    """
+    distance = np.linalg.norm(places.position - places.position[0], axis=1)
+    usable = (places.kind == places.kind[0]) & (distance >= APART)
+    own = usable & (places.sequence == places.sequence[0]) & (places.sequence != NO_SEQUENCE)
+    nearest = float(distance[own if own.any() else usable].min(initial=np.inf))
+    return min(nearest, max(reach, WIDEST_GAP))
+
+
+def places_apart(places: Whereabouts, reach: float, order: Sequence[int], most: int) -> list[int]:
+    """The first rows of an order whose places tell, with the best match, how far a query is, at most ``most``.
+
+    They are within BUNDLE_REACH of it, and it and they stand half the gap around it apart: frames that were taken side
+    by side say nothing of distances.
+    """
+    least = max(APART, gap_around(places, reach) / 2)
+    chosen = [0]
+    for row in order:
+        if len(chosen) > most:
+            break
+        away = np.linalg.norm(places.position[chosen] - places.position[row], axis=1)
+        if places.kind[row] == places.kind[0] and away[0] <= BUNDLE_REACH and away.min() >= least:
+            chosen.append(row)
+    return chosen[1:]
 
 
 @dataclass(frozen=True)
@@ -275,22 +307,31 @@ def _fused(
     information = np.linalg.inv(prior[:4, :4])
     states, covariances, costs = [], [], []
     for deviations in DISTANCES:
-        # With the distance of the scene given, the problem is linear.
+        # With the distance of the scene given, the problem is linear.  Its evidence has the room that x and y have in
+        # it; a robot drives on the ground, so z does not count, which the prior leaves as free.
         at = begin + np.r_[np.zeros(4), deviations * DISTANCE_DEVIATION]
         normal, gradient, cost = information.copy(), np.zeros(4), float(deviations**2)
         for number in retained:
             residual, jacobian, noise = _missed(at, place_views, number)
             weighed = jacobian[:, :4].T @ np.linalg.inv(noise * len(retained))
             normal, gradient = normal + weighed @ jacobian[:, :4], gradient + weighed @ residual
-            cost += float(residual @ np.linalg.solve(noise * len(retained), residual))
+            cost += float(residual @ np.linalg.solve(noise * len(retained), residual) + np.linalg.slogdet(noise)[1])
         covariance = np.linalg.inv(normal)
         states.append(begin[:4] - covariance @ gradient)
         covariances.append(covariance)
-        costs.append(cost - float(gradient @ covariance @ gradient))
+        costs.append(cost - float(gradient @ covariance @ gradient + np.linalg.slogdet(covariance[:2, :2])[1]))
     if shared is not None:
         missed, _ = decline_misses(np.array(states)[:, :3], shared.positions, shared.counts)
         costs = np.array(costs) + np.square(missed / SHARING_DEVIATION).mean(axis=1)
     state, posterior = _mixed(np.array(states), np.array(covariances), np.array(costs))
+    # A wrong view, whose turn is mostly right all the same, leaves the position where the places put it.
+    wrong = float(np.prod([_wrong(place_views.views[number]) for number in retained]))
+    shift = state[:3] - begin[:3]
+    state[:3] -= wrong * shift
+    posterior[:3, 3] *= 1 - wrong
+    posterior[3, :3] *= 1 - wrong
+    posterior[:3, :3] *= 1 - wrong
+    posterior[:3, :3] += wrong * prior[:3, :3] + wrong * (1 - wrong) * np.outer(shift, shift)
     covariance = found.covariance.copy()
     which = [0, 1, 2, 5]
     covariance[np.ix_(which, which)] = posterior
@@ -304,6 +345,11 @@ def _fused(
         covariance=covariance,
         source="field-of-view" if "field-of-view" in sources else "intrinsics",
     )
+
+
+def _wrong(view: RelativeView) -> float:
+    """The probability that the shift of a view is wrong, by the share of keypoints that fit."""
+    return float(1 / (1 + np.exp((view.share - WRONG_SHARE) / WRONG_SLOPE)))
 
 
 def _mixed(states: Vectors, covariances: Vectors, costs: Vectors) -> tuple[Vectors, Vectors]:
@@ -336,32 +382,31 @@ class _PlacePoints:
 
 
 def _points_of_places(
-    places: Whereabouts, mean: Vectors, axes: Vectors, on_earth: bool, sightings: Sequence[SharedPoints | None]
+    places: Whereabouts,
+    mean: Vectors,
+    axes: Vectors,
+    on_earth: bool,
+    reach: float,
+    sightings: Sequence[SharedPoints | None],
 ) -> _PlacePoints | None:
     """The points of the places that share most with the query; None where these are not two that stand apart."""
     if not sightings or sightings[0] is None:
         return None
     local = (places.position - mean) @ axes.T
     directions = _directions(places, axes, on_earth)
-    shared = {
-        row: sighting
+    counts = {
+        row: int(sighting.fitting.sum())
         for row, sighting in enumerate(sightings)
-        if sighting is not None
-        and places.kind[row] == places.kind[0]
-        and np.isfinite(directions[row])
-        and np.linalg.norm(local[row] - local[0]) <= BUNDLE_REACH
+        if sighting is not None and np.isfinite(directions[row])
     }
-    if 0 not in shared:
+    counts = {row: count for row, count in counts.items() if count}
+    if 0 not in counts:
         return None
-    counts = {row: int(sighting.fitting.sum()) for row, sighting in shared.items()}
-    rows: list[int] = []
-    for row in sorted(shared, key=lambda row: (row > 0, -counts[row])):
-        if len(rows) < BUNDLED and all(np.linalg.norm(local[row] - local[other]) >= APART for other in rows):
-            rows.append(row)
+    rows = [0, *places_apart(places, reach, sorted(counts, key=lambda row: -counts[row]), BUNDLED - 1)]
     if len(rows) < 2:
         return None
     number = np.array([counts[row] for row in rows], np.float64)
-    return _PlacePoints(local[rows], directions[rows], number, [shared[row] for row in rows])
+    return _PlacePoints(local[rows], directions[rows], number, [one for row in rows if (one := sightings[row])])
 
 
 def _bundled(

@@ -13,12 +13,12 @@ import numba
 import numpy as np
 
 HALF = math.sqrt(0.5)
-"""What a plane misses is divided by the root of two, for both directions have the same noise."""
+"""Factor of what a plane misses, the difference of two directions that have the same noise."""
 
 
 @numba.njit(cache=True, nogil=True)
 def _ray(p, rotation, centre, tilt, least, ray):  # type: ignore[no-untyped-def]
-    """Write the direction in which the query sees a point of a plane; its length, and the nearness of the point."""
+    """Write the direction in which the query sees a point of a plane; its length, and the nearness before ``least``."""
     ahead = p[2] - tilt[0] * p[0] - tilt[1] * p[1]
     near = max(ahead, least)
     length = 0.0

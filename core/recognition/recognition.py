@@ -335,11 +335,26 @@ def _put_together(
         views, note = relative_views(map_, candidates, stage, query.verifier)
         shared = sightings(map_, candidates, stage, query.verifier)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views, sightings=shared)
+    if note is None and pose is not None and pose.source != "intrinsics":
+        note = _why_without_intrinsics(map_, query.question.camera, places[0], stage)
     rivals = rival_places(map_, candidates, judgement)
     if len(listed) < len(places):
         candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
+
+
+def _why_without_intrinsics(map_: Map, camera: str | None, best: Place, stage: ThirdStage) -> str | None:
+    """Why the intrinsics of a frame's camera did not serve the pose; None if it has none."""
+    if map_.cameras.intrinsics(camera) is None:
+        return None
+    if stage.state != "verified":
+        return "No keypoints of the frame were compared with those of the place."
+    if best.pose is None or best.pose.heading is None:
+        return f"The place {best.id!r} has no heading."
+    if map_.cameras.intrinsics(best.camera) is None:
+        return f"The intrinsics of the camera of the place {best.id!r} are not known."
+    return f"Too few keypoints of the frame fit those of the place {best.id!r}."
 
 
 def rival_places(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalPlaces, ...]:

@@ -24,7 +24,7 @@ from core.geometry.matching import GLANCED
 from core.geometry.pose import LEAST_EVIDENCE, RelativeView, SharedPoints, relative_view, sighting_of
 from core.geometry.verification import Verification, verify
 from core.judgement.geometry import INLIERS, Geometry, final_gains, final_order
-from core.judgement.position import APART, BUNDLE_REACH
+from core.judgement.position import places_apart
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
@@ -41,7 +41,7 @@ MOST_VIEWS = 1
 """The most places whose turn and shift give the pose, or where a search for it begins; each takes some 20 ms."""
 
 NEIGHBOURS = 3
-"""The places nearest to the best match that are compared for the sake of the pose if they were not verified."""
+"""The places around the best match that are compared for the sake of the pose if they were not verified."""
 
 OF_TWO_STAGES, OF_THE_FIRST, OF_GLANCES = 6, 2, 4
 """How many places are candidates for being the best of two stages, the best of the first, and by their matches."""
@@ -286,7 +286,7 @@ def sightings(
     compared = {at: one for at, one in enumerate(candidates.verifications) if one is not None}
     stored = {at: stage.stored.get(int(candidates.rows[at])) for at in compared}
     if 0 in compared and compared[0].evidence >= LEAST_EVIDENCE:
-        around = [at for at in _around(candidates) if at not in compared]
+        around = [at for at in _around(candidates, neighborhood_of(map_).radius) if at not in compared]
         there = zip(around, map_.keypoints_at(candidates.rows[around].tolist()), strict=True)
         more = {at: keypoints for at, keypoints in there if keypoints is not None}
         stored |= more
@@ -302,13 +302,12 @@ def sightings(
     return found
 
 
-def _around(candidates: Candidates) -> list[int]:
-    """The candidates nearest to the best match that do not stand where it does, at most NEIGHBOURS."""
+def _around(candidates: Candidates, reach: float) -> list[int]:
+    """The candidates around the best match that tell how far the query is, at most NEIGHBOURS, the nearest ones."""
     places = candidates.whereabouts
     distances = np.linalg.norm(places.position - places.position[0], axis=1)
-    usable = (places.kind == places.kind[0]) & (distances >= APART) & (distances <= BUNDLE_REACH)
-    order = np.argsort(np.where(usable, distances, np.inf), kind="stable")[:NEIGHBOURS]
-    return order[usable[order]].tolist()
+    order = np.argsort(np.where(places.kind == places.kind[0], distances, np.inf), kind="stable").tolist()
+    return places_apart(places, reach, order, NEIGHBOURS)
 
 
 def verified(candidates: Candidates, found: Mapping[int, Verification]) -> Candidates:

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
+from pydantic.json_schema import JsonSchemaValue
 
 from core.judgement.change import ChangeVerdict, WorldChange
 from core.judgement.position import PoseSource
@@ -183,7 +191,8 @@ class EstimatedPose(BaseModel):
     heading: float | None = Field(default=None, description="Degrees, counted as the places' headings are.")
     spread: float = Field(
         description="Standard deviation of the position in metres. With the source `places`: of the poses that it is "
-        "the mean of, and half the distance from the best match to its nearest neighbour."
+        "the mean of, and half the distance from the best match to its neighbour in its traverse: at most 8 m, or half "
+        "of `same_place_radius` if that is more."
     )
     heading_spread: float | None = Field(
         description="Degrees: the standard deviation of the heading. With the source `places`: of the headings of "
@@ -218,6 +227,12 @@ class EstimatedPose(BaseModel):
         """Leave out the coordinates that are not given: a pose is either metric or geographic."""
         shown: dict[str, Any] = handler(self)
         return {name: value for name, value in shown.items() if value is not None or name == "heading_spread"}
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """The schema of the fields, which the serializer above would hide."""
+        fields: Any = {name: value for name, value in core_schema.items() if name != "serialization"}
+        return handler(fields)
 
 
 class RivalGroup(BaseModel):

@@ -201,8 +201,10 @@ class ChangeView(Model):
     new: float
 
 
-class EstimatedPose(Model, extra="allow"):
-    """The schema EstimatedPose of the interface."""
+class EstimatedPose(Model):
+    """Where the frame was taken, from the poses of the best match and of the matches within its `same_place_radius`,
+    and from how the camera stood to theirs where places were verified.
+    """
 
     x: float | None = None
     y: float | None = None
@@ -210,14 +212,14 @@ class EstimatedPose(Model, extra="allow"):
     latitude: float | None = None
     longitude: float | None = None
     heading: float | None = None
-    spread: float | None = None
+    spread: float
     heading_spread: float | None = None
+    places: int
     heading_offset: float | None = None
     offset_spread: float | None = None
-    places: int | None = None
-    source: str | None = None
+    source: Known[Literal["places", "intrinsics", "field-of-view"]] = "places"
     note: str | None = None
-    covariance: list[float] | None = None
+    covariance: list[float]
 
 
 class Pose(Model):

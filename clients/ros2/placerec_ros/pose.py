@@ -18,6 +18,10 @@ UNKNOWN_ANGLE = math.pi**2 / 3
 HEADING_VARIANCE = math.radians(20) ** 2
 """A frame may be turned by so much and still match its place."""
 
+MOST_BESIDE = 8.0
+"""Metres by which a frame's pose may be beside the place that the session believes in, beyond ``same_place_radius``:
+half the distance of places so far apart that the service knows no more of a frame than this."""
+
 
 @dataclass(frozen=True)
 class PoseEstimate:
@@ -59,7 +63,7 @@ def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimat
     single = answer["single"]
     measured = single.get("pose")
     if single["verdict"] == "recognized" and metric(measured) and measured.get("covariance"):
-        reach = same_place_radius + 3 * (measured.get("spread") or 0.0)
+        reach = same_place_radius + min(3 * (measured.get("spread") or 0.0), MOST_BESIDE)
         if math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"]) <= reach:
             return PoseEstimate(_planar(measured), tuple(map(float, measured["covariance"])), "frame")
     return _of_belief(answer["candidates"], same_place_radius)

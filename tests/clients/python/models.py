@@ -33,12 +33,6 @@ LISTS |= {"bbox": "float", "odometry_covariance": "float"}
 OBJECTS = {"where", "metadata", "cameras"}
 """Parameters of the query string that hold lists and JSON objects; the client takes them as such, too."""
 
-COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading", "spread", "heading_spread")
-POSE = dict.fromkeys((*COORDINATES, "heading_offset", "offset_spread"), "float | None")
-POSE |= {"places": "int | None", "source": "str | None", "note": "str | None", "covariance": "list[float] | None"}
-BY_HAND = {"EstimatedPose": POSE}
-"""Fields that ``openapi.json`` leaves open, as docs/reference/queries.md describes them."""
-
 BY_CALL = ("cursor", "wait", "background", "with")
 """Parameters that a call sets itself, or takes otherwise."""
 
@@ -118,9 +112,7 @@ def models() -> str:
         lines += ["", f"class {name}({bases}):"]
         lines.append(text(schema.get("description") or f"The schema {name} of the interface."))
         required = schema.get("required", ())
-        fields = [
-            model_field(field, one, field in required) for field, one in schema.get("properties", {}).items()
-        ] or [f"    {field}: {kind} = None" for field, kind in BY_HAND[name].items()]
+        fields = [model_field(field, one, field in required) for field, one in schema["properties"].items()]
         lines += ["", *fields, ""]
     return "\n".join(lines)
 

@@ -60,8 +60,9 @@ def test_nothing_is_said_while_not_localized(fields: dict[str, Any]) -> None:
     [
         {"verdict": "ambiguous", "pose": None},
         {"verdict": "recognized", "pose": {"x": 40.0, "y": 2.0, "spread": 0.3, "covariance": [0.0] * 36}},
+        {"verdict": "recognized", "pose": {"x": 15.0, "y": 2.0, "spread": 8.0, "covariance": [0.0] * 36}},
     ],
-    ids=["the frame alone is not", "the frame alone is elsewhere"],
+    ids=["the frame alone is not", "the frame alone is elsewhere", "is elsewhere in a map of places far apart"],
 )
 def test_the_belief_gives_the_pose_where_the_frame_alone_does_not(single: dict[str, Any]) -> None:
     near = {"id": "p1", "pose": {"x": 1.0, "y": 2.0, "heading": 10.0}}

@@ -130,6 +130,22 @@ def test_headings_that_are_off_make_the_query_less_certain() -> None:
     assert deviations[1] > 3 * deviations[0]
 
 
+def test_positions_that_are_off_make_the_query_less_certain() -> None:
+    """Half a metre aside, ten times the error that is thought usual."""
+    normalized = []
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        query = stand((1.2, 0.2, 0), -3)
+        true = [stand((x, 0, 0), 0) for x in (0.0, 3.0, -3.0)]
+        shared = sightings(query, true, random)
+        told = [replace(one, position=one.position + np.append(random.normal(0, 0.5, 2), 0)) for one in true]
+        found = bundle_stand(replace(told[0], covariance=LOOSE), told, shared, begun(query, told[0]))
+        if found is not None:
+            missed = (found.position - query.position)[:2]
+            normalized.append(missed @ np.linalg.solve(found.covariance[3:5, 3:5], missed) / 2)
+    assert len(normalized) >= 6 and np.median(normalized) < 3, "it is 7 if they count as right within 5 cm"
+
+
 def test_nothing_is_told_by_one_place_or_by_few_points() -> None:
     random = np.random.default_rng(6)
     query, places = stand((1, 0, 0)), [stand((0, 0, 0)), stand((3, 0, 0))]

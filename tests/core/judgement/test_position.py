@@ -11,16 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from core.geometry.bundle import DECLINE
 from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import (
+    BUNDLE_REACH,
     UNKNOWN_ANGLE,
     UNKNOWN_HEIGHT,
     WIDEST_GAP,
     PoseEstimate,
     circular_mean,
     estimate_pose,
+    gap_around,
+    places_apart,
 )
-from core.places import EARTH_RADIUS, Pose
+from core.places import EARTH_RADIUS, Pose, Whereabouts
 from tests.core.geometry.test_bundle import sightings, stand
 from tests.core.judgement.test_priors import places
 
@@ -78,6 +82,29 @@ def test_places_beyond_the_reach_say_how_far_a_place_stands_for_all_around() -> 
         found = estimate([Pose(x=0, y=0), Pose(x=apart, y=0)], [0.0, -30.0])
         assert found.pose.x == pytest.approx(0, abs=1e-6) and found.spread == pytest.approx(gap / 2)
         assert found.covariance[0, 0] == pytest.approx(gap**2 / 8, rel=0.01)
+
+
+def beside(second: float) -> Whereabouts:
+    """A traverse with a place every 5 m, and another one beside it, which begins 0.3 m aside and some way ahead."""
+    poses = [Pose(x=5.0 * number, y=0) for number in (2, 0, 1, 3, 4)]
+    poses += [Pose(x=5.0 * number + second, y=0.3) for number in range(5)]
+    return replace(places(list(poses)), sequence=np.repeat([0, 1], 5).astype(np.int32))
+
+
+@pytest.mark.parametrize("second", [0.0, 0.001, 2.0])
+def test_a_traverse_beside_it_does_not_say_where_between_its_places_a_frame_was_taken(second: float) -> None:
+    found = estimate_pose(beside(second), [0] + [-30] * 9, REACH)
+    assert found is not None and found.spread == pytest.approx(2.5)
+    alone = places([Pose(x=0, y=0), Pose(x=0.001, y=0), Pose(x=3, y=0)])
+    assert gap_around(alone, REACH) == pytest.approx(3), "looks whose poses differ a little are at one place"
+    assert gap_around(places([Pose(x=0, y=0), Pose(x=0, y=0)]), REACH) == WIDEST_GAP
+
+
+def test_places_that_tell_how_far_stand_apart() -> None:
+    assert places_apart(beside(0.0), REACH, range(10), 4) == [1, 2, 3, 4]
+    assert places_apart(beside(0.0), REACH, [7, 6, 2, 8], 2) == [6, 8], "7 is beside the best match, 2 beside 6"
+    far = places([Pose(x=0, y=0), Pose(x=BUNDLE_REACH + 1, y=0), None, Pose(latitude=0, longitude=0)])
+    assert places_apart(far, REACH, range(4), 3) == []
 
 
 def test_no_better_than_the_distance_of_the_places() -> None:
@@ -197,20 +224,43 @@ def test_far_from_all_places_the_distance_of_the_scene_is_open(distance: float) 
     assert abs(found.pose.y) < 0.6 and math.sqrt(found.covariance[1, 1]) < 0.7
 
 
-def test_fewer_points_are_shared_from_farther_away() -> None:
-    """The query stands between two places: the nearer it is to the second one, the more points it shares with that."""
+def test_a_view_of_few_matches_moves_the_position_little() -> None:
+    """From far away most of them are wrong; the turn is mostly right all the same."""
+    place = Pose(x=0, y=0, heading=0)
+    view = view_from(place, 5, 0, 10, 8)
+    found = [
+        estimate_pose(places([place]), [0], REACH, views=[replace(view, share=share)]) for share in (0.08, 0.115, 0.3)
+    ]
+    far, half, near = (one for one in found if one is not None)
+    assert 0 < far.pose.x < half.pose.x < near.pose.x  # type: ignore[operator]
+    assert half.pose.x == pytest.approx(near.pose.x / 2, rel=0.01)  # type: ignore[operator]
+    assert far.covariance[1, 1] > half.covariance[1, 1] > 4 * near.covariance[1, 1]
+    assert far.pose.heading == pytest.approx(near.pose.heading) and far.heading_spread == near.heading_spread
+    assert all(np.linalg.eigvalsh(one.covariance).min() > 0 for one in (far, half, near))
+
+
+@pytest.mark.parametrize("count", [30, 60, 90])
+def test_fewer_points_are_shared_from_farther_away(count: int) -> None:
+    """Where the ratio of distances from two places is that of their counts to the power of 1.5."""
+    poses: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=14, y=0, heading=0)]
+    ratio = (count / 100) ** DECLINE
+    there = 14 * ratio / (1 + ratio)
+    view = view_from(Pose(x=0, y=0, heading=0), there, 0, 0, 24)
+    alone = estimate_pose(places(poses), [0, -3], REACH, views=[view])
+    found = estimate_pose(places(poses), [0, -3], REACH, views=[view], sightings=[sharing(100), sharing(count)])
+    assert alone is not None and found is not None and alone.pose.x is not None and found.pose.x is not None
+    assert found.pose.x == pytest.approx(there, abs=0.8) and found.spread < alone.spread
+
+
+def test_places_that_share_no_point_take_no_part() -> None:
     poses: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=14, y=0, heading=0)]
     view = view_from(Pose(x=0, y=0, heading=0), 5, 0, 0, 24)
-    found = []
-    for count in (30, 60, 90):
-        seen = [sharing(100), sharing(count)]
-        estimated = estimate_pose(places(poses), [0, -3], REACH, views=[view], sightings=seen)
-        assert estimated is not None and estimated.pose.x is not None
-        found.append(estimated)
-    assert found[0].pose.x < found[1].pose.x - 0.3 < found[2].pose.x - 0.6  # type: ignore[operator]
     alone = estimate_pose(places(poses), [0, -3], REACH, views=[view])
-    assert alone is not None and alone.pose.x is not None
-    assert abs(found[2].pose.x - 5) < 0.5 < abs(alone.pose.x - 5)  # type: ignore[operator]
+    assert alone is not None
+    none = replace(sharing(20), fitting=np.zeros(20, np.bool_))
+    for seen in ([sharing(50), none], [none, sharing(50)], [sharing(50), sharing(0)]):
+        found = estimate_pose(places(poses), [0, -3], REACH, views=[view], sightings=seen)
+        assert found is not None and found.pose == alone.pose and found.spread == alone.spread
 
 
 def sharing(count: int) -> SharedPoints:

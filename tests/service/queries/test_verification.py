@@ -234,6 +234,19 @@ def test_a_frame_of_another_shape_is_answered_without_the_intrinsics(server: Ser
         assert pose["source"] != "intrinsics" and "320 x 240" in pose["note"]
 
 
+def test_a_pose_says_why_the_intrinsics_were_not_used(server: Server, posed: str) -> None:
+    assert "compared" in server.query(posed, jpeg(2), verify="never", camera="front")["pose"]["note"]
+    assert "note" not in server.query(posed, jpeg(2), verify="never")["pose"]
+    for name, fields, reason in (("plain", {"heading": 90}, "camera of the place"), ("bare", {}, "no heading")):
+        server.create_map(name)
+        server.client.put(f"/v1/maps/{name}/cameras/front", json={"intrinsics": INTRINSICS}).raise_for_status()
+        camera = {} if fields else {"camera": "front"}
+        for seed in range(4):
+            server.enrol(name, f"p{seed}", jpeg(seed), x=20 * seed, y=0, **fields, **camera)
+        pose = server.query(name, jpeg(2), verify="always", camera="front")["pose"]
+        assert pose["source"] != "intrinsics" and "'p2'" in pose["note"] and reason in pose["note"]
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("fx", 0.0), ("cx", 1000.0), ("distortion", [0.1, 0.2, 0.3]), ("width", 0), ("fy", -300.0)]
 )
