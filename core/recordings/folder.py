@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -34,6 +35,14 @@ class _Row(BaseModel):
     timestamp: Timestamp | None = None
 
 
+class _Found(NamedTuple):
+    """A picture of the folder with its frame, and the line of ``places.csv`` that lists it; None without a list."""
+
+    path: Path
+    frame: RecordedFrame
+    line: int | None = None
+
+
 def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame], list[str]]:
     """The frames of a directory, and remarks on them; a frame has its name as its id if no id can be made of it.
 
@@ -50,23 +59,44 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame
         found = list(_listed_frames(listed, prefix))
         if not found:
             raise InvalidTraverse(f"{listed} lists no frame.")
-        left_out = len({path.resolve() for path in find_images(directory)} - {path.resolve() for path, _ in found})
+        left_out = len({path.resolve() for path in find_images(directory)} - {one.path.resolve() for one in found})
         if left_out:
             remarks.append(f"{left_out} images of {directory} are not listed in {FILE_NAME} and are left out.")
     else:
         found = [
-            (path, RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
+            _Found(path, RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
             for path in find_images(directory)
         ]
-    first: dict[str, Path] = {}
-    for path, frame in found:
-        if frame.id in first:
+    _check_ids(found)
+    return [one.frame for one in found], remarks
+
+
+def _check_ids(found: list[_Found]) -> None:
+    """Check that no two frames have the same id.
+
+    Raises:
+        InvalidTraverse: two have it; the message has their lines if a list names them.
+    """
+    first: dict[str, _Found] = {}
+    for one in found:
+        earlier = first.setdefault(one.frame.id, one)
+        if earlier is one:
+            continue
+        if one.line is None:
             raise InvalidTraverse(
-                f"{first[frame.id].name} and {path.name} would both have the id {frame.id!r}; "
+                f"{earlier.path.name} and {one.path.name} would both have the id {one.frame.id!r}; "
                 f"give their ids in {FILE_NAME}."
             )
-        first[frame.id] = path
-    return [frame for _, frame in found], remarks
+        where = f"{FILE_NAME}, line {one.line}"
+        if one.path == earlier.path:
+            raise InvalidTraverse(
+                f"{where}: {one.path.name} is listed in line {earlier.line} already, with the same id "
+                f"{one.frame.id!r}; remove one of the lines, or give them different ids."
+            )
+        raise InvalidTraverse(
+            f"{where}: {earlier.path.name} and {one.path.name} would both have the id {one.frame.id!r}, which line "
+            f"{earlier.line} has already; give them different ids."
+        )
 
 
 def picture_frame(path: Path) -> RecordedFrame:
@@ -92,7 +122,7 @@ def _id(path: Path, prefix: str) -> str:
         return prefix + path.stem
 
 
-def _listed_frames(path: Path, prefix: str) -> Iterator[tuple[Path, RecordedFrame]]:
+def _listed_frames(path: Path, prefix: str) -> Iterator[_Found]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True, strict=True)
@@ -116,7 +146,7 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         )
 
 
-def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> tuple[Path, RecordedFrame]:
+def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> _Found:
     where = f"{path.name}, line {line}"
     if None in cells or None in cells.values():
         raise InvalidTraverse(f"{where}: the row has more or fewer cells than the first line.")
@@ -135,4 +165,4 @@ def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> 
     chosen = check_place_id(given["id"]) if "id" in given else _id(image, prefix)
     taken = None if fields.timestamp is None else 1000 * microseconds(fields.timestamp)
     load = partial(read_picture, image)
-    return image, RecordedFrame(chosen, image.name, load, fields.pose, fields.timestamp, taken)
+    return _Found(image, RecordedFrame(chosen, image.name, load, fields.pose, fields.timestamp, taken), line)

@@ -202,7 +202,7 @@ async def _enrol(
     report = Report()
     async with open_service(target) as service:
         given = {key: value for key, value in wanted.items() if value is not None}
-        used = await _ready_map(service, map_id, create, given)
+        used = await _ready_map(service, map_id, camera, create, given)
         mask = None if camera is None else await _mask(service, map_id, camera, intrinsics)
         frames = await asyncio.to_thread(choose, used, mask)
         known = await _check_ids(service, map_id, frames)
@@ -223,8 +223,15 @@ async def _enrol(
     return report, len(frames)
 
 
-async def _ready_map(service: Service, map_id: str, create: bool, settings: dict[str, str]) -> str | None:
-    """Check that the map exists, or create it; the identity of its encoder."""
+async def _ready_map(
+    service: Service, map_id: str, camera: str | None, create: bool, settings: dict[str, str]
+) -> str | None:
+    """Check that the map exists, or create it; the identity of its encoder.
+
+    Raises:
+        Failure: the map does not exist, and is not to be created.
+        typer.BadParameter: it is to be created, and could not have the ``camera``.
+    """
     try:
         found = await service.get(path_of("maps", map_id))
     except Refused as refused:
@@ -232,20 +239,39 @@ async def _ready_map(service: Service, map_id: str, create: bool, settings: dict
             raise
         if not create:
             raise Failure(f"There is no map {map_id!r}. Give --create to create it.") from refused
+        if camera is not None:
+            raise typer.BadParameter(_without_camera(map_id, camera)) from refused
         found = (await service.request("POST", path_of("maps"), json={"id": map_id, **settings})).json()
     encoder = found.get("encoder")
     return None if encoder is None else str(encoder)
+
+
+def _without_camera(map_id: str, camera: str) -> str:
+    """Sentences on a map that does not exist yet, and so has no camera."""
+    return (
+        f"There is no map {map_id!r}, and a map that --create makes has no camera yet. Make both before: "
+        f"'placerec maps create {map_id}', then 'placerec maps cameras put {map_id} {camera}', with --mask and "
+        "--intrinsics where they are known."
+    )
 
 
 async def _mask(service: Service, map_id: str, camera: str, intrinsics: Intrinsics | None) -> Mask | None:
     """The mask of a camera's frames; a camera that the map does not have is refused, as each frame would be.
 
     A camera without intrinsics gets those of the recording.
+
+    Raises:
+        Failure: the map has no such camera.
     """
     from core.frames.masks import Mask  # here because it takes a moment
 
     path = path_of("maps", map_id, "cameras", camera)
-    known = await service.get(path)
+    try:
+        known = await service.get(path)
+    except Refused as refused:
+        if refused.slug != "unknown-camera":
+            raise
+        raise Failure(f"{refused} 'placerec maps cameras put {map_id} {camera}' creates it.") from refused
     found = known["mask"]
     if intrinsics is not None and known["intrinsics"] is None:
         await service.request("PUT", path, json={"mask": found, "intrinsics": intrinsics.model_dump(mode="json")})

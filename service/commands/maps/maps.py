@@ -19,6 +19,7 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, number, remark, say, show, show_json, table, words
 from service.commands.maps.backup import export, import_
+from service.commands.maps.cameras import cameras
 from service.commands.maps.coverage import coverage
 from service.commands.maps.places import places, sequences
 from service.commands.maps.stretches import stretches
@@ -27,6 +28,7 @@ from service.commands.maps.upkeep import align, erase, health, keypoints, merge,
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
 maps.add_typer(places, name="places")
 maps.add_typer(sequences, name="sequences")
+maps.add_typer(cameras, name="cameras")
 for name, command in (
     ("health", health),
     ("coverage", coverage),

@@ -213,7 +213,9 @@ def _show_place(place: dict[str, Any], as_json: bool) -> None:
         return
     shown = table("field", "value", title=f"Place {place['id']}")
     _, sequence, pose, timestamp, regions = _cells(place)
-    for name, value in {"sequence": sequence, "pose": pose, "timestamp": timestamp, "regions": regions}.items():
+    shown.add_row("sequence", sequence)
+    shown.add_row("camera", place["camera"] or "–")
+    for name, value in {"pose": pose, "timestamp": timestamp, "regions": regions}.items():
         shown.add_row(name, value)
     for name in ("metadata", "picture", "created_at", "updated_at"):
         shown.add_row(name, json.dumps(place[name], ensure_ascii=False) if name == "metadata" else str(place[name]))

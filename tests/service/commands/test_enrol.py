@@ -124,6 +124,25 @@ def test_a_map_is_made_only_on_request(placerec: Placerec, monday: Path) -> None
     assert "0 of 4 frames are enrolled" in wrong.stderr
 
 
+def test_a_camera_that_is_not_there_is_refused_before_a_map_is_made(
+    placerec: Placerec, monday: Path, server: Server, map_id: str
+) -> None:
+    there = ("--camera", "front", "--url", server.client.base_url)
+    refused = placerec("enrol", monday, "--map", "fresh", "--create", *there, status=2).stderr
+    said = " ".join(refused.replace("│", " ").split())
+    assert "There is no map 'fresh', and a map that --create makes has no camera yet." in said
+    assert "'placerec maps create fresh', then 'placerec maps cameras put fresh front'" in said
+    assert server.client.get("/v1/maps/fresh").status_code == 404
+
+    for words in ((), ("--create",)):
+        missing = placerec("enrol", monday, "--map", map_id, *words, *there, status=1).stderr
+        assert f"has no camera 'front'. 'placerec maps cameras put {map_id} front' creates it." in missing
+    placerec("maps", "cameras", "put", map_id, "front", *there[2:])
+    assert "4 of 4 frames" in placerec("enrol", monday, "--map", map_id, "--create", *there).stdout
+    shown = placerec("maps", "places", "show", map_id, "1", *there[2:]).stdout
+    assert ["camera", "front"] in [line.split() for line in shown.splitlines()]
+
+
 @pytest.mark.thorough
 def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Placerec, monday: Path) -> None:
     placerec("enrol", monday, "--map", "lab", "--create")
@@ -168,7 +187,8 @@ def test_file_names_become_ids(placerec: Placerec, tmp_path: Path) -> None:
         ("file,x,y,latitude,longitude\n1.jpg,1,2,3,4\n", "line 2: a pose is either"),
         ("file,timestamp\n1.jpg,yesterday\n", "line 2: timestamp: "),
         ("file,id\n1.jpg,-p\n", "'-p' cannot name a place"),
-        ("file,id\n1.jpg,p\n2.jpg,p\n", "1.jpg and 2.jpg would both have the id 'p'"),
+        ("file,id\n1.jpg,p\n2.jpg,p\n", "line 3: 1.jpg and 2.jpg would both have the id 'p', which line 2 has"),
+        ("file\n1.jpg\n2.jpg\n1.jpg\n", "line 4: 1.jpg is listed in line 2 already, with the same id '1'"),
         ('file\n"1.jpg\n', "is not a CSV file in UTF-8"),
     ],
 )

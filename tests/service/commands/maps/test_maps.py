@@ -9,16 +9,6 @@ import pytest
 
 from core.disk.reserve import FILE as RESERVE
 from tests.service.commands.conftest import Placerec
-from tests.service.server import Server
-
-
-@pytest.fixture(params=["here", "over HTTP"])
-def where(request: pytest.FixtureRequest) -> list[str]:
-    """The words that choose the mode."""
-    if request.param == "here":
-        return []
-    running: Server = request.getfixturevalue("server")
-    return ["--url", str(running.client.base_url)]
 
 
 @pytest.mark.thorough
@@ -85,6 +75,7 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     assert picture.read_bytes().startswith(b"\xff\xd8")
     shown = placerec("maps", "places", "show", name, "9", *where).stdout
     assert "monday" in shown
+    assert ["camera", "–"] in [line.split() for line in shown.splitlines()]
 
     delete = ("maps", "places", "delete", name, "1", "2")
     told = placerec(*delete, "11", "1\u200b", "--yes", *where, status=1).stderr
