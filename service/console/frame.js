@@ -95,11 +95,13 @@ function View() {
   const { name, entry, map, rest } = viewOf(route.value);
   const [loaded, setLoaded] = useState({ name: null });
   useEffect(() => {
-    if (!entry) return;
-    entry[1]().then(
-      (module) => setLoaded({ name, component: module.default }),
-      async (error) => setLoaded({ name, error, there: await checkConnection() }),
+    let left = false; // for another view, whose code may have come first
+    const load = (found) => left || setLoaded({ name, ...found });
+    entry?.[1]().then(
+      (module) => load({ component: module.default }),
+      async (error) => load({ error, there: await checkConnection() }),
     );
+    return () => (left = true);
   }, [name, epoch.value]);
   useEffect(() => {
     menuOpen.value = false;

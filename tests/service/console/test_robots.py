@@ -12,7 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.service.console import world
 from tests.service.console.conftest import Operator, Visit
@@ -62,6 +62,21 @@ def test_home_shows_robots_answers_and_what_waits(admin: Operator, keyed: Server
     page.get_by_role("heading", name="Home").wait_for()
     robot_key.delete(f"/v1/maps/{LAB}/sessions/{session}")
     robot_key.close()
+
+
+def test_a_view_that_was_left_before_its_code_came_stays_away(admin: Operator) -> None:
+    held: list[Route] = []
+    admin.page.route("**/views/plan.js", lambda route: held.append(route))
+    page = admin.go("home")
+    with page.expect_request("**/views/plan.js") as asked:
+        page.evaluate(f"location.hash = '#/maps/{LAB}/plan'")
+    page.evaluate("location.hash = '#/home'")
+    page.get_by_role("heading", name="Home").wait_for()
+    held[0].continue_()
+    page.evaluate("address => import(address)", asked.value.url)
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    expect(page.get_by_role("heading", name="Home")).to_be_visible()
+    assert admin.unforeseen() == []
 
 
 def test_a_robot_that_is_lost_is_an_alarm_after_thirty_seconds(admin: Operator) -> None:

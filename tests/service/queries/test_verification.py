@@ -237,7 +237,7 @@ def test_a_frame_of_another_shape_is_answered_without_the_intrinsics(server: Ser
 def test_a_pose_says_why_the_intrinsics_were_not_used(server: Server, posed: str) -> None:
     assert "compared" in server.query(posed, jpeg(2), verify="never", camera="front")["pose"]["note"]
     assert "note" not in server.query(posed, jpeg(2), verify="never")["pose"]
-    for name, fields, reason in (("plain", {"heading": 90}, "camera of the place"), ("bare", {}, "no heading")):
+    for name, fields, reason in (("no-lens", {"heading": 90}, "camera of the place"), ("no-heading", {}, "no heading")):
         server.create_map(name)
         server.client.put(f"/v1/maps/{name}/cameras/front", json={"intrinsics": INTRINSICS}).raise_for_status()
         camera = {} if fields else {"camera": "front"}
