@@ -362,7 +362,8 @@ def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
     assert made["intrinsics"]["fx"] == 300.0
     assert made["mask"]["polygons"] == mask["polygons"], "the mask stays"
     robot.peer.take("answer")
-    assert robot.asked(1)["answer"]["single"]["pose"].get("note") is None
+    note = robot.asked(1)["answer"]["single"]["pose"]["note"]
+    assert "camera of the place 'p01'" in note, "the frame's own are known, and fit it"
     camera_info(robot, fx=310.0)
     until(
         lambda: robot.asked(2) and server.client.get("/v1/maps/walk/cameras/front").json()["intrinsics"]["fx"] == 310.0
