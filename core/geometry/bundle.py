@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, SharedPoints
+from core.geometry.pose import BODY, NOISE, NOISE_LIMITS, SharedPoints, mixture_moments
 from core.kernels import bundle as kernels
 
 Array = NDArray[np.float64]
@@ -412,12 +412,10 @@ def _stand(bundle: _Bundle, state: _State) -> Stand:
 
 
 def _mixture(minima: Sequence[tuple[float, Stand]]) -> Stand:
-    """Mean and covariance of the minima: their disagreement adds to the uncertainty of each."""
+    """The minima as one."""
     least, first = minima[0]
     weights = np.array([np.exp((least - cost) / (2 * TEMPERATURE)) for cost, _ in minima])
     weights = np.where(weights > NEGLIGIBLE, weights, 0) / weights[weights > NEGLIGIBLE].sum()
     at = np.array([np.r_[cv2.Rodrigues(one.attitude @ first.attitude.T)[0][:, 0], one.position] for _, one in minima])
-    mean = weights @ at
-    within = np.einsum("k,kij->ij", weights, [one.covariance for _, one in minima])
-    covariance = within + (at - mean).T @ (weights[:, np.newaxis] * (at - mean))
+    mean, covariance = mixture_moments(weights, at, np.array([one.covariance for _, one in minima]))
     return Stand(mean[3:], np.asarray(cv2.Rodrigues(mean[:3])[0] @ first.attitude), covariance)

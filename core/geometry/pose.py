@@ -503,15 +503,26 @@ def _view(p: Array, q: Array, model: _Model, noise: float) -> RelativeView:
     return RelativeView(turn, BODY @ centre, change @ covariance @ change.T, inliers, "intrinsics")
 
 
+def mixture_moments(weights: Array, means: Array, covariances: Array) -> tuple[Array, Array]:
+    """Mean and covariance of a mixture: how far its parts are apart adds to the covariance of each.
+
+    Args:
+        weights: float64 [k], which sum to 1.
+        means, covariances: of the parts, float64 [k, m] and [k, m, m].
+    """
+    mean = weights @ means
+    apart = means - mean
+    within = np.einsum("k,kij->ij", weights, covariances)
+    return mean, within + apart.T @ (weights[:, np.newaxis] * apart)
+
+
 def _mixture(views: Sequence[tuple[float, RelativeView]]) -> RelativeView:
-    """Mean and covariance of a mixture: the disagreement of the views adds to the uncertainty of each."""
+    """The views as one."""
     _, first = views[0]
     at = np.array([np.r_[_vector(view.turn @ first.turn.T), view.shift] for _, view in views])
     weights = np.array([weight for weight, _ in views])
     weights /= weights.sum()
-    mean = weights @ at
-    within = np.einsum("k,kij->ij", weights, [view.covariance for _, view in views])
-    covariance = within + (at - mean).T @ (weights[:, np.newaxis] * (at - mean))
+    mean, covariance = mixture_moments(weights, at, np.array([view.covariance for _, view in views]))
     turn = _rotation(mean[:3]) @ first.turn
     return RelativeView(turn, mean[3:], covariance, min(view.inliers for _, view in views), first.source)
 

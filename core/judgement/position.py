@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.geometry.bundle import Stand, bundle_stand, decline_misses
-from core.geometry.pose import RelativeView, SharedPoints
+from core.geometry.pose import RelativeView, SharedPoints, mixture_moments
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
@@ -313,25 +313,26 @@ def _fused(
         normal, gradient, cost = information.copy(), np.zeros(4), float(deviations**2)
         for number in retained:
             residual, jacobian, noise = _missed(at, place_views, number)
-            weighed = jacobian[:, :4].T @ np.linalg.inv(noise * len(retained))
+            precision = np.linalg.inv(noise * len(retained))
+            weighed = jacobian[:, :4].T @ precision
             normal, gradient = normal + weighed @ jacobian[:, :4], gradient + weighed @ residual
-            cost += float(residual @ np.linalg.solve(noise * len(retained), residual) + np.linalg.slogdet(noise)[1])
+            cost += float(residual @ precision @ residual + np.linalg.slogdet(noise)[1])
         covariance = np.linalg.inv(normal)
         states.append(begin[:4] - covariance @ gradient)
         covariances.append(covariance)
         costs.append(cost - float(gradient @ covariance @ gradient + np.linalg.slogdet(covariance[:2, :2])[1]))
+    total = np.array(costs)
     if shared is not None:
         missed, _ = decline_misses(np.array(states)[:, :3], shared.positions, shared.counts)
-        costs = np.array(costs) + np.square(missed / SHARING_DEVIATION).mean(axis=1)
-    state, posterior = _mixed(np.array(states), np.array(covariances), np.array(costs))
+        total += np.square(missed / SHARING_DEVIATION).mean(axis=1)
+    weights = np.exp((total.min() - total) / 2)
+    state, posterior = mixture_moments(weights / weights.sum(), np.array(states), np.array(covariances))
     # A wrong view, whose turn is mostly right all the same, leaves the position where the places put it.
     wrong = float(np.prod([_wrong(place_views.views[number]) for number in retained]))
-    shift = state[:3] - begin[:3]
-    state[:3] -= wrong * shift
+    positions, spreads = np.array([state[:3], begin[:3]]), np.array([posterior[:3, :3], prior[:3, :3]])
+    state[:3], posterior[:3, :3] = mixture_moments(np.array([1 - wrong, wrong]), positions, spreads)
     posterior[:3, 3] *= 1 - wrong
     posterior[3, :3] *= 1 - wrong
-    posterior[:3, :3] *= 1 - wrong
-    posterior[:3, :3] += wrong * prior[:3, :3] + wrong * (1 - wrong) * np.outer(shift, shift)
     covariance = found.covariance.copy()
     which = [0, 1, 2, 5]
     covariance[np.ix_(which, which)] = posterior
@@ -350,20 +351,6 @@ def _fused(
 def _wrong(view: RelativeView) -> float:
     """The probability that the shift of a view is wrong, by the share of keypoints that fit."""
     return float(1 / (1 + np.exp((view.share - WRONG_SHARE) / WRONG_SLOPE)))
-
-
-def _mixed(states: Vectors, covariances: Vectors, costs: Vectors) -> tuple[Vectors, Vectors]:
-    """Mean and covariance of a mixture of normal distributions, with weights by costs, twice a negative logarithm.
-
-    Args:
-        states: means of the parts, [n, m].
-        covariances: [n, m, m].
-    """
-    weights = np.exp((costs.min() - costs) / 2)
-    weights /= weights.sum()
-    mean = weights @ states
-    apart = states - mean
-    return mean, np.einsum("n,nij->ij", weights, covariances) + apart.T @ (weights[:, np.newaxis] * apart)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 frame so few that they would say nothing."""
 
 MOST_VIEWS = 1
-"""The most places whose turn and shift give the pose, or where a search for it begins; each takes some 20 ms."""
+"""The most places whose turn and shift give the pose, or where a search for it begins; each takes some 10 ms."""
 
 NEIGHBOURS = 3
 """The places around the best match that are compared for the sake of the pose if they were not verified."""
