@@ -191,3 +191,13 @@ def each(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> l
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]
     return list(_pool(threads).map(work, items))
+
+
+def begun(work: Callable[[], Made]) -> Callable[[], Made]:
+    """Begin some work in another thread that computes alone, if the calling thread may use one; what is returned waits
+    for the result.  Otherwise the work is done when the result is first wanted.
+
+    The work should release the interpreter lock, and must not call :func:`each`.
+    """
+    threads = allowed_threads()
+    return cache(work) if threads < 2 else _pool(threads).submit(work).result

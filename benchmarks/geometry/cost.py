@@ -23,14 +23,16 @@ from core.frames.preprocessing import Pixels, second_look
 from core.frames.traverses import SUPPORTED_SUFFIXES
 from core.geometry.detection import find_keypoints, shown_size
 from core.geometry.keypoints import MOST, record_bytes
-from core.geometry.matching import mutual_matches
-from core.geometry.verification import fitting_plane, fitting_scene, verify
+from core.geometry.matching import neighbors_among
+from core.geometry.verification import CERTAINTY, THRESHOLD, fitting, points_of, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
 from core.threads import allowed_threads, cores, each, share_cores
 from service.commands.timing.samples import sample_frame
 
 CANDIDATES = 10
+ATTEMPTS = 100
+"""Of MAGSAC++, beside which ours stands."""
 MILLISECONDS = 60
 """At most, for the keypoints of a query and its candidates."""
 FRAMES = 25
@@ -74,18 +76,20 @@ def main(
     network, encoder, frames = load_xfeat(), EncoderCatalogue().get(DEFAULT_ENCODER), pictures(images)
     query, *candidates = [find_keypoints(network, frame) for frame in frames]
     shown = np.asarray(cv2.resize(frames[0], shown_size(*SIZE)), np.uint8)
-    ours, theirs = (keypoints.descriptors.astype(np.float32) for keypoints in (query, candidates[0]))
-    matches = mutual_matches(ours, theirs)
-    points = query.pixels()[matches[:, 0]], candidates[0].pixels()[matches[:, 1]]
+    (there,) = neighbors_among(query, candidates[:1])
+    matches = np.flatnonzero(there >= 0)
+    points = points_of(query)[matches], points_of(candidates[0])[there[matches]]
     used = allowed_threads()
 
     times = measured(
         {
             "forward pass of XFeat": lambda: network(shown),
             "keypoints of a frame": lambda: find_keypoints(network, frames[0]),
-            "matches of one candidate": lambda: mutual_matches(ours, theirs),
-            "fundamental matrix of one candidate": lambda: fitting_scene(*points),
-            "homography of one candidate": lambda: fitting_plane(*points),
+            "matches of one candidate": lambda: neighbors_among(query, candidates[:1]),
+            "fundamental matrix of one candidate": lambda: fitting(*points),
+            "the same by MAGSAC++ of OpenCV": lambda: cv2.findFundamentalMat(
+                *points, cv2.USAC_MAGSAC, THRESHOLD, CERTAINTY, ATTEMPTS
+            ),
             f"verification of {len(candidates)} candidates": lambda: verify(query, candidates),
             "all in": lambda: verify(find_keypoints(network, frames[0]), candidates),
             "encoding of the frames": lambda: encoder.encode_batch(frames),

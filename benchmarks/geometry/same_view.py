@@ -8,13 +8,14 @@ camera that only turns; its new parts are black.  A comparison fails if it has `
 of which fewer than half are inliers.  At most ``FAILURES`` may fail, and each that does is listed.
 
 Strangers are frames of one traverse more than ``FAR`` frames from where the other was there, and frames of two sets of
-pictures.  Beside what ``core.geometry.verification`` finds stands what a fundamental matrix alone would give.
+pictures.  Beside what ``core.geometry.verification`` finds stands what MAGSAC++ of OpenCV finds.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,15 @@ from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.geometry.pose import FOCAL
-from core.geometry.verification import LEAST_MATCHES, chance_of, evidence, fitting_scene, points_of, verify
+from core.geometry.verification import (
+    CERTAINTY,
+    LEAST_MATCHES,
+    THRESHOLD,
+    chance_of,
+    evidence,
+    points_of,
+    verify,
+)
 from core.networks.xfeat import XFeat, load_xfeat
 from core.threads import cores, each, share_cores
 from lab.training.photographs import find_photographs, read
@@ -43,6 +52,8 @@ SETS = ("roads", "scenes15", "tower", "camvid", "facades", "day_night")
 ENOUGH_MATCHES = 50
 FAILURES = 0.001
 """Of all comparisons at most."""
+ATTEMPTS = 100
+"""Of MAGSAC++."""
 FAR = 8
 """Frames from every true reference beyond which a frame of a traverse is a stranger."""
 REFERENCES = 3
@@ -122,17 +133,17 @@ class ComparedPictures:
 
     kind: the view, or the group of strangers.
     picture: which, below the folder of data sets.
-    inliers, before: as verification counts them, and of a fundamental matrix alone.
-    evidence, evidence_before: likewise.
+    inliers, by_opencv: as verification counts them, and as OpenCV does.
+    evidence, evidence_by_opencv: likewise.
     """
 
     kind: str
     picture: str
     matches: int
     inliers: int
-    before: int
+    by_opencv: int
     evidence: float
-    evidence_before: float
+    evidence_by_opencv: float
 
     @property
     def counts(self) -> bool:
@@ -145,14 +156,22 @@ class ComparedPictures:
 
 
 def compared(kind: str, picture: str, query: Keypoints, place: Keypoints) -> ComparedPictures:
-    """Verify a place, and by a fundamental matrix alone."""
+    """Verify a place, and by OpenCV."""
     (found,) = verify(query, [place])
-    matches, before = len(found.matches), 0
+    matches, theirs = len(found.matches), 0
     if matches >= LEAST_MATCHES:
-        ours, theirs = points_of(query)[found.matches[:, 0]], points_of(place)[found.matches[:, 1]]
-        before = int(fitting_scene(ours, theirs).sum())
-    evidence_before = evidence(matches, before, max(chance_of(query), chance_of(place)))
-    return ComparedPictures(kind, picture, matches, found.inlier_count, before, found.evidence, evidence_before)
+        points = points_of(query)[found.matches[:, 0]], points_of(place)[found.matches[:, 1]]
+        theirs = inliers_by_opencv(*points)
+    rated = evidence(matches, theirs, max(chance_of(query), chance_of(place)))
+    return ComparedPictures(kind, picture, matches, found.inlier_count, theirs, found.evidence, rated)
+
+
+def inliers_by_opencv(query: Array, place: Array) -> int:
+    """How many matches, [m, 2] each, fit the fundamental matrix that MAGSAC++ of OpenCV finds."""
+    flags = None
+    with suppress(cv2.error):  # of some degenerate matches
+        _, flags = cv2.findFundamentalMat(query, place, cv2.USAC_MAGSAC, THRESHOLD, CERTAINTY, ATTEMPTS)
+    return 0 if flags is None else int(np.asarray(flags).sum())
 
 
 def pictures(datasets: Path, most: int = 0) -> list[Path]:
@@ -253,13 +272,13 @@ def report_views(made: Sequence[ComparedPictures], count: int) -> None:
     for name in [*VIEWS, ""]:
         counted = [one for one in made if one.counts and name in ("", one.kind)]
         failed = sum(one.fails(one.inliers) for one in counted)
-        before = sum(one.fails(one.before) for one in counted)
+        theirs = sum(one.fails(one.by_opencv) for one in counted)
         bar = "" if name else verdict(failed / max(1, len(counted)), FAILURES)
         share = float(np.mean([one.inliers / one.matches for one in counted])) if counted else 0.0
-        rows.append((name or "all", len(counted), share, before, failed, bar))
+        rows.append((name or "all", len(counted), share, theirs, failed, bar))
     failures = [one for one in made if one.fails(one.inliers)]
     title = f"{count} pictures; comparisons with {ENOUGH_MATCHES} matches or more, of which fewer than half are inliers"
-    columns = ["", "comparisons", "mean share", "matrix alone", "fail", ""]
+    columns = ["", "comparisons", "mean share", "OpenCV", "fail", ""]
     stored = {"pictures": count, "rows": rows, "failures": [asdict(one) for one in failures]}
     report("geometry_same_view", title, columns, rows, stored)
     for one in failures:
@@ -271,10 +290,10 @@ def report_strangers(made: Sequence[ComparedPictures]) -> None:
     rows: list[tuple[object, ...]] = []
     for name in [*dict.fromkeys(one.kind for one in made), ""]:
         counted = [one for one in made if name in ("", one.kind)]
-        found, before = (np.array([getattr(one, part) for one in counted]) for part in ("evidence", "evidence_before"))
-        at = [float(np.quantile(values, 0.99)) for values in (before, found)]
-        rows.append((name or "all", len(counted), *at, int((found != before).sum()), verdict(at[1], at[0])))
-    columns = ["", "pairs", "matrix alone", "evidence", "differ", ""]
+        found, theirs = np.array([(one.evidence, one.evidence_by_opencv) for one in counted]).T
+        at = [float(np.quantile(values, 0.99)) for values in (theirs, found)]
+        rows.append((name or "all", len(counted), *at, int((found != theirs).sum()), verdict(at[1], at[0])))
+    columns = ["", "pairs", "OpenCV", "evidence", "differ", ""]
     report("geometry_strangers", "99th percentile of the evidence of strangers", columns, rows, {"rows": rows})
 
 

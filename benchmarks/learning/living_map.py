@@ -17,7 +17,7 @@ from core.belief import Evidence, PlaceGraph, evidence, place_graph, sighted
 from core.belief.evidence import believable_score
 from core.geometry.keypoints import LENGTH, Keypoints
 from core.geometry.matching import GLANCED, count_matches, glance_at
-from core.geometry.verification import LEAST_MATCHES, Verification, verify_promising
+from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.background import GUARD_FACTOR
 from core.judgement.verdict import Judgement, judge
 from core.maps import MapSettings
@@ -226,11 +226,10 @@ class RowComparison:
     def agreements(self, rows: Sequence[int]) -> NDArray[np.float32]:
         return self.encoder.agreement(self.frame.local, self.local[list(rows)])
 
-    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
+    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
         ours = self.frame.keypoints
-        there = {row: share for row, share in zip(rows, least, strict=True) if self.keypoints[row] is not None}
+        there = {row: one for row in rows if (one := self.keypoints[row]) is not None}
         if ours is None or len(ours) < LEAST_MATCHES or not there:
             return [None] * len(rows)
-        theirs = [one for row in there if (one := self.keypoints[row]) is not None]
-        found = dict(zip(there, verify_promising(ours, theirs, list(there.values())), strict=True))
+        found = dict(zip(there, verify(ours, list(there.values())), strict=True))
         return [found.get(row) for row in rows]

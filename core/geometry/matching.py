@@ -6,6 +6,8 @@ places are worth more than a glance; compiled loops (``core.kernels.matching``) 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,22 +22,23 @@ GLANCED = 64
 _LEAST_PRODUCT = LEAST_COSINE * RESOLUTION**2
 
 
-def mutual_matches(query: NDArray[np.float32], candidate: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The mutual nearest neighbours of quantized descriptors whose cosine is over LEAST_COSINE.
+def neighbors_among(query: Keypoints, candidates: Sequence[Keypoints]) -> NDArray[np.int32]:
+    """The keypoints of candidates that match those of a query.
 
     Products of whole numbers are exact in float32 here: 64 · 127² < 2^24.  So every processor finds the same matches.
 
-    Args:
-        query, candidate: float32 [n, 64] and [m, 64], whole numbers from -127 to 127.
-
     Returns:
-        int64 [k, 2], numbers of the query's and of the candidate's, ascending in the query's; ties to the lower one.
+        int32 [k, n], the number in each candidate of each of the query's n keypoints; -1: none matches; ties to the
+        lower one.
     """
-    if not len(query) or not len(candidate):
-        return np.zeros((0, 2), np.int64)
-    (there,) = mutual_neighbors(query @ candidate.T, len(candidate), _LEAST_PRODUCT)
-    matched = np.flatnonzero(there >= 0)
-    return np.stack([matched, there[matched]], axis=1)
+    width = max((len(one) for one in candidates), default=0)
+    if not len(query) or not width:
+        return np.full((len(candidates), len(query)), -1, np.int32)
+    theirs = np.zeros((len(candidates), width, LENGTH), np.float32)  # rows of zeros match nothing
+    for made, one in zip(theirs, candidates, strict=True):
+        made[: len(one)] = one.descriptors
+    products = query.descriptors.astype(np.float32) @ theirs.reshape(-1, LENGTH).T
+    return np.asarray(mutual_neighbors(products, width, _LEAST_PRODUCT), np.int32)
 
 
 def glance_at(keypoints: Keypoints) -> NDArray[np.int8]:

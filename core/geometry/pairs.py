@@ -57,6 +57,5 @@ class PairComparison:
     def matches_at_a_glance(self, rows: Sequence[int]) -> NDArray[np.int64]:
         return count_matches(self.pairs.queries[self.query], self.pairs.glances[list(rows)])
 
-    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
-        found = self.pairs.verified(self.query, rows)
-        return [one if one.match_share >= share else None for one, share in zip(found, least, strict=True)]
+    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
+        return [*self.pairs.verified(self.query, rows)]

@@ -34,12 +34,14 @@ from numpy.typing import NDArray
 from core.frames.intrinsics import Intrinsics
 from core.geometry.detection import shown_scale
 from core.geometry.keypoints import RESOLUTION, Keypoints
-from core.geometry.verification import CONFIDENCE, ITERATIONS, THRESHOLD, Verification
+from core.geometry.verification import CERTAINTY, THRESHOLD, Verification
 from core.kernels import views as kernels
 
 Array = NDArray[np.float64]
 Source = Literal["intrinsics", "field-of-view"]
 
+ATTEMPTS = 100
+"""Of MAGSAC++, to find a matrix that begins the search."""
 LEAST_INLIERS = 12
 """Eight values are estimated; fewer matches than this hardly say how well."""
 LEAST_EVIDENCE = 25.0
@@ -369,12 +371,12 @@ def _starts(p: Array, q: Array, pixel: float) -> list[_Model]:
         return found
     images = p[ahead, :2] / p[ahead, 2:], q[ahead, :2] / q[ahead, 2:]
     with suppress(cv2.error):  # of some degenerate matches
-        matrix, _ = cv2.findHomography(*images, cv2.USAC_MAGSAC, 2 * THRESHOLD * pixel, None, ITERATIONS, CONFIDENCE)
+        matrix, _ = cv2.findHomography(*images, cv2.USAC_MAGSAC, 2 * THRESHOLD * pixel, None, ATTEMPTS, CERTAINTY)
         if matrix is not None:
             found += _planes_of(np.asarray(matrix, np.float64), p)
     with suppress(cv2.error):
         essential, inliers = cv2.findEssentialMat(
-            images[0], images[1], np.eye(3), cv2.USAC_MAGSAC, CONFIDENCE, THRESHOLD * pixel, ITERATIONS
+            images[0], images[1], np.eye(3), cv2.USAC_MAGSAC, CERTAINTY, THRESHOLD * pixel, ATTEMPTS
         )
         if essential is not None and essential.shape == (3, 3):
             _, rotation, translation, _ = cv2.recoverPose(essential, *images, np.eye(3), mask=inliers)

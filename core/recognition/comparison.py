@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.errors import UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.geometry.matching import count_matches
-from core.geometry.verification import LEAST_MATCHES, Verification, verify_promising
+from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.maps import Map
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
@@ -28,12 +28,8 @@ class Comparison(Protocol):
     def agreements(self, rows: Sequence[int]) -> NDArray[np.float32]:
         """The gains of the second stage, float32 [n]."""
 
-    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
-        """The geometric evidence; None for a place without keypoints, and of a query that has hardly any.
-
-        Args:
-            least: the share of matches of each place under which it is None as well.
-        """
+    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
+        """The geometric evidence; None for a place without keypoints, and of a query that has hardly any."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +58,10 @@ class MapComparison:
             return np.zeros(len(rows), np.float32)
         return self.encoder.agreement(self.local, cells)
 
-    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
+    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
         kept = {row: one for row, one in zip(rows, self.map_.keypoints_at(rows), strict=True) if one is not None}
         if not kept or len(self.verifier.keypoints) < LEAST_MATCHES:
             return [None] * len(rows)
         self.stored.update(kept)
-        shares = [share for row, share in zip(rows, least, strict=True) if row in kept]
-        results = verify_promising(self.verifier.keypoints, list(kept.values()), shares)
-        found = dict(zip(kept, results, strict=True))
+        found = dict(zip(kept, verify(self.verifier.keypoints, list(kept.values())), strict=True))
         return [found.get(row) for row in rows]

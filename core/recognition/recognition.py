@@ -43,6 +43,7 @@ from core.recognition.stages import (
     rank_places,
 )
 from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, sightings, third_stage
+from core.threads import begun
 
 ATTEMPTS = 3
 """How often a query is searched for if places that it finds are deleted in the meantime."""
@@ -128,12 +129,22 @@ def recognize(map_: Map, picture: bytes, encoder: Encoder, question: Question | 
     pixels = decode(picture)  # uint8 [H, W, 3]
     question = question or Question()
     mask = _mask(map_, question.camera)
+
+    def find() -> Keypoints:
+        return find_keypoints(packaged_xfeat(), pixels, mask)
+
+    wanted = begun(find) if needs_keypoints(map_, question) else find  # while the frame is encoded and searched for
     encoding = encoder.encode(pixels, mask)  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
         return answer_to_blank(map_, encoder, encoding)
-    query = Query(encoding, question, lambda: find_keypoints(packaged_xfeat(), pixels, mask))
+    query = Query(encoding, question, wanted)
     (answer,) = locate(map_, encoder, [query])
     return answer
+
+
+def needs_keypoints(map_: Map, question: Question) -> bool:
+    """Whether the keypoints of a frame will be needed to answer a question, whatever its scores are."""
+    return question.verify == "always" and map_.record.verification
 
 
 def enrol(

@@ -10,7 +10,7 @@ of a map that stores none, stays where the first two stages have put it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -23,7 +23,7 @@ from core.geometry.keypoints import Keypoints
 from core.geometry.matching import GLANCED
 from core.geometry.pose import LEAST_EVIDENCE, RelativeView, SharedPoints, relative_view, sighting_of
 from core.geometry.verification import Verification, verify
-from core.judgement.geometry import INLIERS, Geometry, final_gains, final_order
+from core.judgement.geometry import Geometry, final_gains, final_order
 from core.judgement.position import places_apart
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
@@ -51,13 +51,10 @@ GLANCES = 100
 """Among how many places the matches of few keypoints choose."""
 OF_A_GLANCE, BESIDE = 0.5, 0.07
 """A place has at most so many inliers, as a share of keypoints: half of the matches at a glance, and some more.  One
-that would stay behind the best all the same is left out."""
-OF_MATCHES = 0.6
-"""At most this part of a place's matches are inliers: where even these would not bring it to the front, its geometry is
-not estimated.  Both bounds hold for 97 of 100 places of the tasks to fit on (``benchmarks.geometry.verification``).
-Their recall@1 is 0.001 lower than if all candidates were estimated, and half as many are."""
-AT_ONCE = 2
-"""How many places are verified before it is asked again which may still win."""
+that would stay behind the best all the same is left out.  The bound holds for 97 of 100 places of the tasks to fit on
+(``benchmarks.geometry.verification``)."""
+AT_FIRST = 4
+"""How many places are verified before it is asked which others may still win."""
 
 
 @dataclass(frozen=True)
@@ -159,17 +156,11 @@ class _Trial:
         self.found: dict[int, Verification] = {}
         self._tried: set[int] = set()
 
-    def verify(self, positions: Positions, least: Sequence[float] = ()) -> None:
-        """Verify the candidates at some positions, int64 [k], that were not yet.
-
-        Args:
-            least: shares of matches of these candidates, with fewer of which they are not; none: any are enough.
-        """
-        shares = dict(zip(positions.tolist(), least or [0.0] * len(positions), strict=True))
-        missing = [position for position in shares if position not in self._tried]
+    def verify(self, positions: Positions) -> None:
+        """Verify the candidates at some positions, int64 [k], that were not yet."""
+        missing = [position for position in positions.tolist() if position not in self._tried]
         self._tried.update(missing)
-        rows = self.candidates.rows[missing].tolist()
-        results = self.comparison.verifications(rows, [shares[position] for position in missing])
+        results = self.comparison.verifications(self.candidates.rows[missing].tolist())
         self.found |= {at: one for at, one in zip(missing, results, strict=True) if one is not None}
 
     def ranked(self) -> Candidates:
@@ -179,18 +170,11 @@ class _Trial:
     def verify_chosen(self) -> None:
         """Verify those that are chosen as far as they can still win, and whatever comes first then."""
         chosen, shares = self._choose()
-        promised = _values(self.candidates, OF_A_GLANCE * shares + BESIDE)
-        without = _values(self.candidates, np.zeros(len(promised)))
-        waiting = [at for at in chosen[np.argsort(-promised[chosen], kind="stable")].tolist() if at not in self._tried]
-        while waiting:
-            values = _values(self.candidates, self._shares())
-            best = max(values[at] for at in self.found) if len(self.found) > 1 else -np.inf
-            hopeful = [at for at in waiting if promised[at] >= best][:AT_ONCE]
-            if not hopeful:
-                break
-            self.verify(np.array(hopeful), [float(best - without[at]) / (INLIERS * OF_MATCHES) for at in hopeful])
-            waiting = [at for at in waiting if at not in self._tried]
-        while (first := int(np.argmax(_values(self.candidates, self._shares())))) not in self._tried:
+        promised = self._values(OF_A_GLANCE * shares + BESIDE)
+        self.verify(chosen[np.argsort(-promised[chosen], kind="stable")][:AT_FIRST])
+        best = self._values(self._shares())[[*self.found]].max() if len(self.found) > 1 else -np.inf
+        self.verify(chosen[promised[chosen] >= best])
+        while (first := int(np.argmax(self._values(self._shares())))) not in self._tried:
             self.verify(np.array([first]))
 
     def _choose(self) -> tuple[Positions, NDArray[np.float64]]:
@@ -215,16 +199,16 @@ class _Trial:
         return chosen, shares
 
     def _shares(self) -> NDArray[np.float64]:
-        """The share of inliers of all candidates; 0 where none were found."""
+        """The share of inliers of all candidates, float64 [n]; 0 where none were found."""
         shares = np.zeros(len(self.candidates.rows))
         for at, one in self.found.items():
             shares[at] = one.inlier_share
         return shares
 
-
-def _values(candidates: Candidates, shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The values by which three stages order candidates, float64 [n], if these had so many inliers."""
-    return candidates.ordered + final_gains(shares, candidates.first, candidates.agreement)
+    def _values(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values by which three stages order the candidates, float64 [n], if these had so many inliers."""
+        gains = final_gains(shares, self.candidates.first, self.candidates.agreement)
+        return np.asarray(self.candidates.ordered + gains, np.float64)
 
 
 def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifier: Verifier) -> bool:

@@ -15,9 +15,12 @@ from dataclasses import replace
 
 from core.errors import InvalidImage
 from core.frames.images import Limits, decode
+from core.frames.masks import Mask
+from core.frames.preprocessing import Pixels
 from core.geometry.detection import ScaledFrame, keypoints_in
+from core.geometry.keypoints import Keypoints
 from core.networks.xfeat import packaged_xfeat
-from core.threads import allowed_threads, cores, keep_to, processors, use_threads
+from core.threads import allowed_threads, begun, cores, keep_to, processors, use_threads
 from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import DeadlineExceeded
 
@@ -132,26 +135,34 @@ class EncoderThreads:
             if frame.deadline <= time.monotonic():
                 raise deadline_exceeded()
             pixels = decode(frame.data, self._limits)
-            decoded = time.perf_counter()
+            times = {"wait": 1e3 * (began - frame.queued), "decode": 1e3 * (time.perf_counter() - began)}
+            find = begun(lambda: _keypoints(pixels, frame.mask, times)) if frame.keypoints else None
             encoding = frame.encoder.encode(pixels, frame.mask)
             if not frame.features:
                 encoding = replace(encoding, regions=encoding.regions.without_features())
-            encoded_at = time.perf_counter()
-            wanted = frame.keypoints and len(encoding.regions) > 0
-            keypoints = keypoints_in(packaged_xfeat(), ScaledFrame.of(pixels, frame.mask)) if wanted else None
+            if not len(encoding.regions):
+                find = None
+            times |= encoding.milliseconds
+            encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, begun=find)
+            if frame.after_encoding is not None:
+                with suppress(Exception):  # Searches repeats the search and reports the error
+                    encoded = replace(encoded, search_result=frame.after_encoding(encoded))
+            if find is not None:
+                encoded = replace(encoded, keypoints=find())
         except Exception as error:
             if not isinstance(error, InvalidImage | DeadlineExceeded):
                 log.exception("a frame could not be encoded")
             frame.result.set_exception(error)
             return
-        times = {"wait": 1e3 * (began - frame.queued), "decode": 1e3 * (decoded - began), **encoding.milliseconds}
-        if wanted:
-            times["keypoints"] = 1e3 * (time.perf_counter() - encoded_at)
-        encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, keypoints)
-        if frame.after_encoding is not None:
-            with suppress(Exception):  # Searches repeats the search and reports the error
-                encoded = replace(encoded, search_result=frame.after_encoding(encoded))
         frame.result.set_result(encoded)
+
+
+def _keypoints(pixels: Pixels, mask: Mask | None, times: dict[str, float]) -> Keypoints:
+    """The keypoints of a frame; how long it took is noted among its times."""
+    began = time.perf_counter()
+    found = keypoints_in(packaged_xfeat(), ScaledFrame.of(pixels, mask))
+    times["keypoints"] = 1e3 * (time.perf_counter() - began)
+    return found
 
 
 def _counted(frame: QueuedFrame) -> int:

@@ -29,6 +29,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
+from core.recognition.recognition import needs_keypoints
 from service.engine.encoders import Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.engine.rehearsal import rehearse
@@ -247,7 +248,8 @@ class Engine:
         mask = await camera_mask(map_, question.camera)
         ahead = search_ahead(map_, question)
         with self.queue.place():
-            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, features=question.explain)
+            wanted = needs_keypoints(map_, question), question.explain
+            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, *wanted)
         (answered,) = await self.searches.answer(map_, [frame], question)
         return answered
 

@@ -43,15 +43,15 @@ def test_a_drawn_picture_is_recognized_in_every_view(network: XFeat) -> None:
     made = same_views(network, scene(37), "scene 37")
     assert [one.kind for one in made] == list(VIEWS)
     assert all(one.counts for one in made) and not failed(made)
-    assert not any(one.evidence < one.evidence_before for one in made)
+    assert not any(2 * one.inliers < one.by_opencv for one in made)
     assert made[0].inliers == made[0].matches
 
 
-def test_strangers_have_no_more_evidence(network: XFeat) -> None:
+def test_strangers_have_little_evidence(network: XFeat) -> None:
     shown = find_keypoints(network, scene(37))
     for seed in range(60, 66):
         one = compared("stranger", str(seed), find_keypoints(network, stranger(seed)), shown)
-        assert one.evidence == one.evidence_before < 40
+        assert max(one.evidence, one.evidence_by_opencv) < 40
 
 
 @pytest.mark.thorough

@@ -25,7 +25,7 @@ from core.places import PlaceFields, Whereabouts
 from core.recognition.question import Query, Question, Verifier, Verify
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
 from core.recognition.stages import Candidates
-from core.recognition.verification import CANDIDATES, OF_MATCHES, verify_candidates
+from core.recognition.verification import AT_FIRST, CANDIDATES, verify_candidates
 from core.storage import Atlas, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -111,7 +111,6 @@ class KnownComparison:
     matches: list[int]
     inliers: list[float]
     asked: list[int] = field(default_factory=list)
-    least: dict[int, float] = field(default_factory=dict)
 
     def matches_at_a_glance(self, rows: Sequence[int]) -> NDArray[np.int64]:
         return np.array([self.matches[row] for row in rows], np.int64)
@@ -119,9 +118,8 @@ class KnownComparison:
     def agreements(self, rows: Sequence[int]) -> NDArray[np.float32]:
         return np.zeros(len(rows), np.float32)
 
-    def verifications(self, rows: Sequence[int], least: Sequence[float]) -> list[Verification | None]:
+    def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
         self.asked += rows
-        self.least.update(zip(rows, least, strict=True))
         inliers = [round(100 * self.inliers[row]) for row in rows]
         pairs, flags = np.zeros((100, 2), np.int64), np.arange(100)
         return [Verification((100, 100), pairs, flags < count, float(count), 0.5) for count in inliers]
@@ -156,14 +154,14 @@ def test_what_matches_at_a_glance_is_verified_however_two_stages_rank_it() -> No
     assert found.rows[0] == 60 and len(set(comparison.asked)) == len(comparison.asked) <= CANDIDATES
 
 
-def test_geometry_is_estimated_where_the_matches_let_a_place_still_win() -> None:
-    """Place 2 fits so well that another needs many matches; the first two are compared whatever they have."""
-    comparison = KnownComparison([20] * 8, [0.05, 0.04, 0.3] + [0.05] * 5)
+def test_a_place_that_a_glance_leaves_no_chance_is_not_compared() -> None:
+    """Place 2 fits so well that the last ones, of which few keypoints match at a glance, cannot come before it."""
+    comparison = KnownComparison([30] * AT_FIRST + [2] * 4, [0.05, 0.04, 0.3] + [0.05] * 5)
     found = compare([0.2, 0.19, 0.18, 0.17, 0.16, 0.15, 0.14, 0.13], [0.0] * 8, comparison)
-    assert found.rows[0] == 2
-    assert comparison.least[0] == comparison.least[1] == -np.inf
-    behind = 2 * (0.2 - 0.18) + INLIERS * 0.05
-    assert comparison.least[2] * OF_MATCHES * INLIERS == pytest.approx(behind, rel=1e-5)
+    assert found.rows[0] == 2 and comparison.asked == list(range(AT_FIRST))
+    comparison = KnownComparison([60] * 8, [0.05, 0.04, 0.3] + [0.05] * 5)
+    compare([0.2, 0.19, 0.18, 0.17, 0.16, 0.15, 0.14, 0.13], [0.0] * 8, comparison)
+    assert sorted(comparison.asked) == list(range(8)), "many matches at a glance may be many inliers"
 
 
 def test_the_best_of_the_first_stage_are_never_lost() -> None:
