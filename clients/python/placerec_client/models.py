@@ -481,6 +481,7 @@ class GeometryTerms(Model):
     support: float
     slope: float
     intercept: float
+    lead: float = 0.0
 
 
 class Calibration(Model):
