@@ -126,39 +126,55 @@ class ThreeStages:
         object.__setattr__(self, "local", local_of(self.references))  # int8 [R, C, L]
 
     def score(self, queries: Sequence[Description]) -> Array:
-        products = InnerProducts(self.vectors).score(queries)
-        scores, cells = np.empty_like(products), local_of(queries)
         pairs = Pairs([keypoints_in(one) for one in queries], [keypoints_in(one) for one in self.references])
-        ranked = traverse_candidates(self.encoder, products, cells, self.local)
-        for number, candidates in enumerate(ranked):
+        products, cells = InnerProducts(self.vectors).score(queries), local_of(queries)
+        return scores_of_three_stages(self.encoder, products, cells, self.vectors, self.local, pairs, self.verify)
 
-            def agreements(rows: Sequence[int], number: int = number) -> Array:
-                return self.encoder.agreement(cells[number], self.local[list(rows)])
 
-            found, _, _ = verify_candidates(
-                candidates,
-                self._judged,
-                Verifier(self.verify, partial(pairs.queries.__getitem__, number)),
-                self.encoder.calibration,
-                pairs.comparison(number, agreements),
-            )
-            scores[number, found.rows] = found.values
-        return scores
+def scores_of_three_stages(
+    encoder: Encoder,
+    products: Array,
+    cells: NDArray[np.int8],
+    vectors: Array,
+    local: NDArray[np.int8],
+    pairs: Pairs,
+    verify: Verify,
+) -> Array:
+    """The values by which the service orders the places of a traverse for Q queries, float32 [Q, R].
 
-    def _judged(self, candidates: Candidates) -> Judgement:
+    Args:
+        products: float32 [Q, R], inner products of the descriptors.
+        cells: int8 [Q, C, L], the queries' local descriptors.
+        vectors, local: float32 [R, D] and int8 [R, C, L], of the references.
+        pairs: of the keypoints of both.
+    """
+
+    def judged(candidates: Candidates) -> Judgement:
         def likeness(positions: Positions) -> Array:
             rows = candidates.rows[np.concatenate([[0], positions])]
-            return likeness_of_first(self.encoder, self.vectors[rows], self.local[rows])
+            return likeness_of_first(encoder, vectors[rows], local[rows])
 
         return judge(
             candidates.ordered,
             candidates.whereabouts,
-            self.encoder.calibration,
+            encoder.calibration,
             traverse_neighborhood(),
             candidates.examined,
             likeness,
             candidates.geometry,
         )
+
+    scores = np.empty_like(products)
+    for number, candidates in enumerate(traverse_candidates(encoder, products, cells, local)):
+
+        def agreements(rows: Sequence[int], number: int = number) -> Array:
+            return encoder.agreement(cells[number], local[list(rows)])
+
+        verifier = Verifier(verify, partial(pairs.queries.__getitem__, number))
+        comparison = pairs.comparison(number, agreements)
+        found, _, _ = verify_candidates(candidates, judged, verifier, encoder.calibration, comparison)
+        scores[number, found.rows] = found.values
+    return scores
 
 
 def verified_gains(query: Keypoints, places: Sequence[Keypoints]) -> NDArray[np.float32]:

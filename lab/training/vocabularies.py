@@ -4,8 +4,8 @@
 
 The packaged vocabulary has the seed 0.  The others are trained on photographs, features and starts of k-means that
 other seeds draw (``lab.training.packaging``); network, projections and constants stay as they are.  The tasks are
-corridor and those of ``lab.training.validation``.  A third stage verifies the best ten places, as ``placerec evaluate``
-does for ``m-region-vlad.verified``.
+corridor and those of ``lab.training.validation``.  On corridor and lip6 the third stage is asked as the service asks
+it, where two stages leave doubt and always; of the fixed cameras the best places are verified.
 
 Prints a Markdown table: of each number that of the packaged vocabulary, and the mean over all with half the largest
 difference between two.  The cache keeps the encoders, which ``--models-dir`` of other commands takes, and what was
@@ -28,6 +28,7 @@ from core.disk.files import replacing
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
+from core.geometry.pairs import Pairs
 from core.judgement.curves import auc_pr
 from core.method.catalogue import (
     DEFAULT_ENCODER,
@@ -42,7 +43,7 @@ from core.method.presets import NETWORK
 from core.method.vocabulary import pool_features, train_vocabulary
 from core.networks.xfeat import XFeat, load_xfeat
 from core.recognition.verification import CANDIDATES
-from lab.baselines.stages import verified_gains
+from lab.baselines.stages import scores_of_three_stages, verified_gains
 from lab.training.packaging import VOCABULARY_IMAGES, vocabulary_pictures
 from lab.training.validation import (
     DISTRACTORS,
@@ -61,7 +62,7 @@ Array = NDArray[np.float32]
 Figures = dict[str, list[float]]
 """By the names of STAGES, one number for each of COLUMNS."""
 
-STAGES = ("first stage alone", "with local agreement", "with local agreement and verification")
+STAGES = ("first stage alone", "with local agreement", "with verification, auto", "with verification, always")
 COLUMNS = ("corridor recall@1", "corridor AUC-PR", "lip6 recall@1", "lip6 AUC-PR", "webcams recall@1", "night recall@1")
 
 
@@ -89,18 +90,18 @@ class VerifiedPairs:
 class TraverseEvaluation:
     """Two traverses, their keypoints, and the figures of an encoder on them."""
 
-    def __init__(self, name: str, task: TraverseTask, network: XFeat, cache: Path) -> None:
+    def __init__(self, name: str, task: TraverseTask, network: XFeat) -> None:
         self.task = task
         self.references = found(network, task.references, name)
-        self.geometry = VerifiedPairs(found(network, task.queries, name), self.references, cache / f"{name}.npy")
+        self.pairs = Pairs(found(network, task.queries, name), self.references)
 
     def figures(self, encoder: Encoder, references: Encodings) -> list[tuple[float, float]]:
-        """Recall@1 and AUC-PR by one, two and three stages."""
+        """Recall@1 and AUC-PR by one and two stages, and by three where two leave doubt, and always."""
         queries = describe(encoder, self.task.queries)
         first = queries.descriptors @ references.descriptors.T
-        second = scores(encoder, queries, references)
-        third = self.geometry.raised(second, best_of(second))
-        return [self._figures(answers) for answers in (first, second, third)]
+        asked = queries.local, references.descriptors, references.local, self.pairs
+        third = [scores_of_three_stages(encoder, first, *asked, when) for when in ("auto", "always")]
+        return [self._figures(answers) for answers in (first, scores(encoder, queries, references), *third)]
 
     def _figures(self, answers: Array) -> tuple[float, float]:
         best = answers.argmax(axis=1)
@@ -118,7 +119,7 @@ class CameraEvaluation:
         self.far = VerifiedPairs(pictures, distractors, cache / f"{name}-far.npy")
 
     def figures(self, encoder: Encoder, distractors: Encodings) -> list[float]:
-        """Recall@1 by one, two and three stages.
+        """Recall@1 by one and two stages, and by three, which count as ``auto`` and as ``always``.
 
         As in ``camera_scores``, a picture gains from a stage where fewer distractors than it has candidates are ahead.
         """
@@ -127,7 +128,7 @@ class CameraEvaluation:
         among, far = camera_scores(encoder, pictures, distractors)
         ahead = np.stack([(row[None, :] > ours[:, None]).sum(axis=1) for row, ours in zip(far, among, strict=True)])
         third = self.among.raised(among, ahead < CANDIDATES), self.far.raised(far, best_of(far))
-        return [camera_recall(self.task, *answers) for answers in (first, (among, far), third)]
+        return [camera_recall(self.task, *answers) for answers in (first, (among, far), third, third)]
 
 
 def found(network: XFeat, pictures: list[Pixels], name: str) -> list[Keypoints]:
@@ -181,10 +182,8 @@ def main(
     others = [with_vocabulary(packaged, seed, vocabulary_pictures(datasets, images, seed), cache) for seed in further]
     encoders = [packaged, *others]
     network, tasks = load_xfeat(), load_tasks(datasets)
-    corridor = TraverseEvaluation(
-        "corridor", load_traverses(datasets / "eval/corridor", "query", "ref"), network, cache
-    )
-    lip6 = TraverseEvaluation("lip6", tasks.lip6, network, cache)
+    corridor = TraverseEvaluation("corridor", load_traverses(datasets / "eval/corridor", "query", "ref"), network)
+    lip6 = TraverseEvaluation("lip6", tasks.lip6, network)
     distractors = lip6.references[:DISTRACTORS]
     cameras = [
         CameraEvaluation(name, task, network, distractors, cache)
