@@ -80,12 +80,11 @@ def verify(query: Keypoints, candidates: Sequence[Keypoints]) -> list[Verificati
 
     The candidates are shared out among as many threads as the calling thread may use.
     """
-    threads = allowed_threads()
-    shares = [candidates[first::threads] for first in range(min(threads, len(candidates)))]
-    found: list[Verification] = [None] * len(candidates)  # type: ignore[list-item]
-    for first, some in enumerate(each(lambda share: _verified(query, share), shares, threads)):
-        found[first::threads] = some
-    return found
+    if not candidates:
+        return []
+    parts = min(allowed_threads(), len(candidates))
+    found = each(lambda part: _verified(query, candidates[part::parts]), range(parts), parts)
+    return [found[number % parts][number // parts] for number in range(len(candidates))]
 
 
 def fitting(query: NDArray[np.float64], candidate: NDArray[np.float64]) -> NDArray[np.bool_]:

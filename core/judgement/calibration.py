@@ -26,7 +26,7 @@ from core.judgement.geometry import TERMS, GeometryTerms
 from core.judgement.probability import Curve, fit_curve, moved_curve, movement
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.trials import Flags, StagedTrials, Trial, Trials, Values, gathered, joined
-from core.judgement.verdict import Calibration, Judgement, judge, share_of_leads, with_leads
+from core.judgement.verdict import Calibration, Judgement, judge, share_of_leads
 from core.places import Neighborhood, Whereabouts
 
 Scores = NDArray[np.float32]
@@ -206,7 +206,7 @@ def effect_of(trials: Trials, calibration: Calibration) -> Effect:
         verdicts=Mix(
             recognized=int(recognized.sum()),
             ambiguous=int((believed & ~recognized).sum()),
-            unknown=int((~believed & ~recognized).sum()),
+            unknown=int((~believed).sum()),
         ),
         precision=wilson(int(passed.sum()), int(recognized.sum())),
         recall=wilson(int(passed.sum()), int(known.sum())),
@@ -342,14 +342,12 @@ def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve) -> Geometry
     if base.geometry is None or not verified.any():
         return base.geometry
     some = trials.take(verified)
-    found = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence)
-    odds, shares = with_leads(found, some.margin, base, some.imagined, some.evidence)
-    stretch, shift = movement(odds, some.right, shares)
+    odds = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence)
+    stretch, shift = movement(odds, some.right, share_of_leads(some.margin, base))
     return GeometryTerms(
         support=stretch * base.geometry.support,
         slope=stretch * base.geometry.slope,
         intercept=stretch * base.geometry.intercept + shift,
-        lead=stretch * base.geometry.lead,
     )
 
 

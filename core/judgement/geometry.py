@@ -16,14 +16,9 @@ Evidence needs no other place to be compared with, so it says in a map of one pl
 two stages say next to nothing, as in a small map, the evidence decides.  As keypoints are the same for every encoder,
 and L is a log odds whatever the encoder's scores are, so are the three numbers.
 
-A rival takes away from the certainty of an answer as far as it fits as well: its lead m is measured in the final order.
-Places of one scene share keypoints, and one that leads all others is right far oftener than its evidence alone says:
-
-    P = σ(log odds + lead · (1 - u)) · (ℓ + (1 - ℓ) · min(1, m / LEAD)),
-
-with the share u of other places that were imagined, since the map does not have them.  Two places of one picture are so
-``ambiguous``, however much evidence both have, and a best match that fits, of whose rivals none does, is ``recognized``
-even if its lead in score is small.
+A rival takes away from the certainty of an answer as far as it fits as well: its lead is measured in the final order.
+Two places of one picture are so ``ambiguous``, however much evidence both have, and a best match that fits, of whose
+rivals none does, is ``recognized`` even if its lead in score is small.
 """
 
 from __future__ import annotations
@@ -34,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["INLIERS", "TERMS", "Geometry", "GeometryTerms", "final_gains", "final_order", "share_of_verified_leads"]
+__all__ = ["INLIERS", "TERMS", "Geometry", "GeometryTerms", "final_gains", "final_order"]
 
 Values = NDArray[np.float64]
 
@@ -80,14 +75,6 @@ class GeometryTerms(BaseModel):
     support: float = Field(ge=0, allow_inf_nan=False, description="Weight of the log odds of the first two stages.")
     slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by an evidence e times greater.")
     intercept: float = Field(allow_inf_nan=False, description="Log odds where neither says anything.")
-    lead: float = Field(
-        default=0.0,
-        ge=0,
-        allow_inf_nan=False,
-        exclude_if=lambda lead: lead == 0,
-        description="Log odds gained where other places are known and the best match leads them; 0: a lead counts as "
-        "where nothing was verified.",
-    )
 
     def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike) -> Values:
         """The log odds of three stages, from those of two and from the evidence; all of one shape."""
@@ -95,24 +82,8 @@ class GeometryTerms(BaseModel):
         return np.asarray(self.support * before + self.slope * np.log1p(found) + self.intercept, np.float64)
 
 
-LEAD, WITHOUT_A_LEAD = 0.05, 0.1
-"""The lead from which on a rival takes nothing away, in the units of the order of three stages; and the part of the
-probability that is left without any, ℓ."""
-
-TERMS = GeometryTerms(support=0.5, slope=1.411, intercept=-4.613, lead=2.0)
-"""Slope and intercept are fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m
-lab.training.map_sizes``).  LEAD, WITHOUT_A_LEAD and the lead's log odds were chosen by calibration error and likelihood
-on halved maps of tasks made of training photographs (``benchmarks.geometry.verification``)."""
-
-
-def share_of_verified_leads(margin: ArrayLike) -> Values:
-    """The part of a probability that a lead leaves where the best match was verified; float64 of any shape.
-
-    Args:
-        margin: the leads, at least 0; infinite without a rival.
-    """
-    leads = np.maximum(0.0, np.asarray(margin, np.float64))
-    return np.asarray(WITHOUT_A_LEAD + (1 - WITHOUT_A_LEAD) * np.minimum(1.0, leads / LEAD), np.float64)
+TERMS = GeometryTerms(support=0.5, slope=1.411, intercept=-4.613)
+"""Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m lab.training.map_sizes``)."""
 
 
 def final_gains(

@@ -14,7 +14,6 @@ from core.judgement.verdict import (
     MOSTLY_IMAGINED,
     Calibration,
     Judgement,
-    is_believed,
     most_doubtful,
     probability_of,
     stands_out,
@@ -77,7 +76,7 @@ class Trials:
 
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
-        return is_believed(self.decision, self.margin, calibration, self.imagined, self.evidence)
+        return self.standing_out(calibration) & (self.margin >= calibration.margin)
 
     def probabilities(self, calibration: Calibration) -> Values:
         """The probability that each is right, by a calibration with a curve, float64 [n]."""

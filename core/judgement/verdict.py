@@ -24,8 +24,7 @@ same.  They are left out of the background one after the other.  If the best mat
 verdict is ``ambiguous`` and names them; it would be wrong to call such a frame unknown and to enrol it once more.
 
 Where candidates were verified geometrically, the evidence of the best match joins the decision value in one probability
-(``geometry.py``), which takes the threshold's place, and the margin is a lead in the final order of three stages.  Such
-an answer is ``ambiguous``, too, if its rivals leave a probability of less than a half.
+(``geometry.py``), which takes the threshold's place, and the margin is a lead in the final order of three stages.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.background import FULL, GUARD_FACTOR, TOP_PLACES, Background, Environment, background, unrelated
-from core.judgement.geometry import Geometry, GeometryTerms, share_of_verified_leads
+from core.judgement.geometry import Geometry, GeometryTerms
 from core.judgement.probability import Curve, sigmoid
 from core.places import Neighborhood, Whereabouts
 
@@ -58,9 +57,6 @@ than 0.05."""
 
 MOST_RIVALS = 8
 """The largest number of rivals, the best ones, that are examined, each with its neighbours."""
-
-EVEN = 0.5
-"""The probability of a match that is as likely right as wrong."""
 
 MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
@@ -189,28 +185,6 @@ def share_of_leads(margin: ArrayLike, calibration: Calibration) -> Values:
     return (1 + (np.minimum(1.0, leads / calibration.margin) if calibration.margin else leads > 0)) / 2
 
 
-def with_leads(
-    odds: ArrayLike,
-    margin: ArrayLike,
-    calibration: Calibration,
-    imagined: ArrayLike = 0.0,
-    evidence: ArrayLike | None = None,
-) -> tuple[Values, Values]:
-    """The log odds of best matches with what a lead adds, and the part of the probabilities that the leads leave.
-
-    Args:
-        odds: of :func:`log_odds_of`, as are ``imagined`` and ``evidence``.
-        margin: as of :func:`share_of_leads`.
-    """
-    before, shares = np.asarray(odds, np.float64), share_of_leads(margin, calibration)
-    terms = calibration.geometry
-    if evidence is None or terms is None or not terms.lead:
-        return before, shares
-    verified = ~np.isnan(np.asarray(evidence, np.float64))
-    gained = terms.lead * (1 - np.asarray(imagined, np.float64))
-    return np.where(verified, before + gained, before), np.where(verified, share_of_verified_leads(margin), shares)
-
-
 def probability_of(
     decision: ArrayLike,
     margin: ArrayLike,
@@ -227,11 +201,8 @@ def probability_of(
     Returns:
         Float64 of any shape, each in (0, 1); None if the calibration has no curve.
     """
-    found = log_odds_of(decision, calibration, imagined, evidence)
-    if found is None:
-        return None
-    odds, shares = with_leads(found, margin, calibration, imagined, evidence)
-    return np.asarray(sigmoid(odds) * shares, np.float64)
+    odds = log_odds_of(decision, calibration, imagined, evidence)
+    return None if odds is None else np.asarray(sigmoid(odds) * share_of_leads(margin, calibration), np.float64)
 
 
 def stands_out(
@@ -239,36 +210,14 @@ def stands_out(
 ) -> NDArray[np.bool_]:
     """Whether best matches are believed if their leads are large enough, bool of any shape.
 
-    By the decision value; or, where one was verified, by the probability of three stages without its lead, which has to
-    be a half at least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
+    By the decision value; or, where one was verified, by the probability of three stages, which has to be a half at
+    least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
     """
     believed = np.asarray(decision, np.float64) >= calibration.threshold
     odds = log_odds_of(decision, calibration, imagined, evidence)
     if odds is None or evidence is None or calibration.geometry is None or calibration.curve is None:
         return np.asarray(believed)
     surely = odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
-    return np.where(np.isnan(np.asarray(evidence, np.float64)), believed, surely)
-
-
-def is_believed(
-    decision: ArrayLike,
-    margin: ArrayLike,
-    calibration: Calibration,
-    imagined: ArrayLike = 0.0,
-    evidence: ArrayLike | None = None,
-) -> NDArray[np.bool_]:
-    """Whether best matches are recognized, bool of any shape: they stand out, and their lead reaches the margin.
-
-    One that was verified is, if it is rather right than wrong, and as probable as two stages have to be at the
-    threshold.  The arguments are those of :func:`probability_of`.
-    """
-    leads = np.asarray(margin, np.float64)
-    believed = stands_out(decision, calibration, imagined, evidence) & (leads >= calibration.margin)
-    stated = probability_of(decision, leads, calibration, imagined, evidence)
-    if stated is None or evidence is None or calibration.geometry is None or not calibration.geometry.lead:
-        return np.asarray(believed)
-    assert calibration.curve is not None  # without one nothing is stated
-    surely = stated >= max(EVEN, calibration.curve.probability(calibration.threshold))
     return np.where(np.isnan(np.asarray(evidence, np.float64)), believed, surely)
 
 
@@ -325,8 +274,8 @@ def judge(
 
     Returns:
         ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
-        ``ambiguous`` where they do, and where it stands out but is not to be believed beside its best rival
-        (:func:`is_believed`); else ``recognized``.
+        ``ambiguous`` where they do, and for a lead over the best rival under the margin; else ``recognized``.  A best
+        match stands out by its decision value, or by the probability of three stages if it was verified.
     """
     if len(scores) == 0:
         return Judgement("unknown", None, None, None, None)
@@ -337,17 +286,16 @@ def judge(
     leads = ranking.leads(others)
     rival = int(others[leads.argmin()]) if len(others) else None
     margin = None if rival is None else float(leads.min())
-    lead = np.inf if margin is None else margin
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
-    if not is_believed(decision, lead, calibration, behind.imagined, evidence):
-        if stands_out(decision, calibration, behind.imagined, evidence):
-            heads = ranking.heads()
-            rivals = ranking.grouped(heads, ranking.alike(heads, likeness), lead)
-            verdict = "ambiguous"
-        else:
-            rivals = ranking.explaining_rivals(likeness)
-            verdict = "ambiguous" if rivals else "unknown"
+    if not stands_out(decision, calibration, behind.imagined, evidence):
+        rivals = ranking.explaining_rivals(likeness)
+        verdict = "ambiguous" if rivals else "unknown"
+    elif margin is not None and margin < calibration.margin:
+        heads = ranking.heads()
+        rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
+        verdict = "ambiguous"
+    lead = np.inf if margin is None else margin
     stated = probability_of(decision, lead, calibration, behind.imagined, evidence)
     probability = None if stated is None else float(stated)
     return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence)
@@ -454,15 +402,8 @@ class _Ranking:
         calm, wanted = self.calm(), ALIKE * self.calibration.threshold
         return np.array([calm.decision(float(score)) >= wanted for score in likeness(heads)], np.bool_)
 
-    def grouped(self, heads: Positions, alike: NDArray[np.bool_], lead: float = 0.0) -> tuple[Rivals, ...]:
-        """The rivals that show the same place as the best match, and each other one that scores nearly as well.
-
-        Args:
-            lead: the best match's lead over its best rival, if that makes the verdict.
-        """
-        leads, terms = self.leads(heads), self.calibration.geometry
-        near = (leads < self.calibration.margin) | (leads <= lead)
-        if self.evidence is not None and terms is not None and terms.lead:
-            near |= share_of_verified_leads(leads) < EVEN
+    def grouped(self, heads: Positions, alike: NDArray[np.bool_]) -> tuple[Rivals, ...]:
+        """The rivals that show the same place as the best match, and each other one that scores nearly as well."""
+        near = self.leads(heads) < self.calibration.margin
         same = (Rivals(tuple(heads[alike].tolist()), True),) if alike.any() else ()
         return same + tuple(Rivals((head,), False) for head in heads[near & ~alike].tolist())

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.geometry import leads
-from benchmarks.geometry.leads import VerifiedAnswers, lead_figures
 from benchmarks.geometry.tasks import Pictures, Task, from_elsewhere, relit
 from benchmarks.geometry.verification import BEFORE, OURS, SHIPPED, WAYS, Ranked, Weights, best_weights, recall
 from lab.training.validation import Encodings
@@ -54,17 +52,6 @@ def test_the_best_weights_are_those_of_the_tasks_to_fit_on() -> None:
     best, reached, ours = best_weights([(TASK, [ranked(2)] * 3)])
     assert reached == ours == 1.0 and best[2] > 0
     assert WAYS["three stages"] == (SHIPPED, OURS) and BEFORE != SHIPPED
-
-
-def test_the_numbers_of_leads_are_rated_by_what_was_right() -> None:
-    """Where only leads tell right from wrong, numbers that believe them have the least loss; each kind counts alike."""
-    lead = np.tile([0.001, 0.06], 50)
-    telling = VerifiedAnswers(np.zeros(100), np.zeros(100), lead, lead > 0.05)
-    found = lead_figures({"one": [telling] * 3, "other": [telling]})
-    assert found[0][0] == (4.0, 0.05, 0.05) and found[0][1] < 0.1
-    assert [row[1] for row in found] == sorted(row[1] for row in found) and leads.SHIPPED in [row[0] for row in found]
-    blind = next(row for row in found if row[0] == (0.0, 0.5, 0.003))
-    assert blind[1] > 0.5 and blind[2] > 0.3
 
 
 def test_photographs_are_seen_from_elsewhere_in_other_light() -> None:

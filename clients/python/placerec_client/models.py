@@ -481,7 +481,6 @@ class GeometryTerms(Model):
     support: float
     slope: float
     intercept: float
-    lead: float = 0.0
 
 
 class Calibration(Model):
