@@ -20,6 +20,7 @@ from core.networks.torch_network import follow_threads
 from core.threads import (
     SPINS,
     allowed_threads,
+    begun,
     compute_alone,
     cores,
     each,
@@ -94,6 +95,28 @@ def test_several_threads_work_each_alone_and_the_caller_keeps_its_own() -> None:
     assert [threads for _, threads in found] == [1, 1]
     assert allowed_threads() == before
     assert each(lambda _: threading.current_thread(), [0, 1], 1) == [threading.current_thread()] * 2
+
+
+def test_begun_work_is_done_once_beside_the_caller_or_when_it_is_wanted() -> None:
+    done: list[str] = []
+
+    def work() -> int:
+        done.append(threading.current_thread().name)
+        return len(done)
+
+    before = allowed_threads()
+    try:
+        use_threads(2)
+        wait = begun(work)
+        assert wait() == wait() == 1 and done[0] != threading.current_thread().name
+        with pytest.raises(ZeroDivisionError):
+            begun(lambda: 1 // 0)()
+        use_threads(1)
+        wait = begun(work)
+        assert len(done) == 1, "nobody has asked for it"
+        assert wait() == wait() == 2 and done[1] == threading.current_thread().name
+    finally:
+        use_threads(before)
 
 
 @pytest.mark.parametrize(

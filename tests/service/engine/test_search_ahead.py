@@ -8,12 +8,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from core.frames.images import Limits, decode
 from core.frames.preprocessing import Pixels
+from core.geometry.detection import find_keypoints
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
 from core.storage import Map
 from core.threads import allowed_threads
@@ -23,7 +26,8 @@ from service.engine.encoders import AfterEncoding, Encoded, QueuedFrame
 from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes
-from tests.service.scenes import jpeg, scene, seen_again
+from tests.service.scenes import blank, jpeg, scene, seen_again
+from tests.service.scenes import encoded as written
 
 pytestmark = pytest.mark.anyio
 
@@ -105,3 +109,29 @@ def test_a_callback_may_fail(threads: EncoderThreads, encoder: Encoder) -> None:
         raise ArithmeticError
 
     assert search_results(threads, encoder, 3, breaks) == [None] * 3
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_keypoints_are_there_for_the_search_and_in_the_result(
+    threads: EncoderThreads, encoder: Encoder, count: int
+) -> None:
+    """Of a frame alone they are found while it is encoded; of several frames when they are wanted."""
+    frames = [
+        QueuedFrame(
+            encoder, jpeg(seed), None, time.monotonic() + 60, keypoints=True, after_encoding=Encoded.find_keypoints
+        )
+        for seed in range(count)
+    ]
+    threads.put(frames)
+    for seed, frame in enumerate(frames):
+        made = frame.result.result(60)
+        alone = find_keypoints(packaged_xfeat(), decode(jpeg(seed)))
+        assert made.keypoints is not None and made.search_result is made.keypoints is made.find_keypoints()
+        np.testing.assert_array_equal(made.keypoints.positions, alone.positions)
+        assert made.milliseconds["keypoints"] > 0 and made.without_pixels().keypoints is made.keypoints
+
+
+def test_a_blank_frame_has_no_keypoints(threads: EncoderThreads, encoder: Encoder) -> None:
+    frame = QueuedFrame(encoder, written(blank()), None, time.monotonic() + 60, keypoints=True)
+    threads.put([frame])
+    assert frame.result.result(60).keypoints is None
