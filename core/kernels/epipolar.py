@@ -23,7 +23,7 @@ REFINEMENTS, WIDTH = 3, 2.0
 """Steps of least squares.  The first sees matches to WIDTH² times the squared threshold, the second to WIDTH times it,
 for a matrix of seven rounded points is hardly exact."""
 UNIT = 256
-"""What a match that fits exactly counts in a rating."""
+"""The rating of one match that fits exactly."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
