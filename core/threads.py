@@ -11,7 +11,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, MutableMapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
 from math import ceil
@@ -188,9 +188,17 @@ def each(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> l
 
     The work should release the interpreter lock, and must not call this function itself.
     """
-    if threads < 2 or len(items) < 2:
-        return [work(item) for item in items]
-    return list(_pool(threads).map(work, items))
+    waiting = None if threads < 2 or len(items) < 2 else _in_pool(work, items, threads)
+    return [work(item) for item in items] if waiting is None else [one.result() for one in waiting]
+
+
+def _in_pool(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> list[Future[Made]] | None:
+    """Begin ``work`` with every item; None once the process ends, when no thread begins anything any more."""
+    pool = _pool(threads)
+    try:
+        return [pool.submit(work, item) for item in items]
+    except RuntimeError:  # what the work itself raises is in the futures
+        return None
 
 
 def begun(work: Callable[[], Made]) -> Callable[[], Made]:
@@ -200,4 +208,5 @@ def begun(work: Callable[[], Made]) -> Callable[[], Made]:
     The work should release the interpreter lock, and must not call :func:`each`.
     """
     threads = allowed_threads()
-    return cache(work) if threads < 2 else _pool(threads).submit(work).result
+    waiting = None if threads < 2 else _in_pool(lambda _: work(), [None], threads)
+    return cache(work) if waiting is None else waiting[0].result

@@ -3,8 +3,8 @@
 ``always`` verifies the best places of two stages, the best of the first alone, and those that match at a glance best of
 the best hundred: where the view has moved far, cells on a grid mislead the second stage.  The most promising come
 first, and a place that cannot win any more is left out.  ``auto`` does the same where two stages leave doubt.  It does
-not stop at a best match with evidence, for the places beside the true one have as much.  A place without keypoints, as
-of a map that stores none, stays where the first two stages have put it.
+not stop at a best match with evidence, for the places beside the true one have as much.  Where the best match of two
+stages has no keypoints, as in a map that stores none, the answer stays that of two stages.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from core.recognition.question import Query, Verifier
 from core.recognition.stages import Candidates, Positions, calibration_of, neighborhood_of
 
 VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
-"""Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if no candidate has any, or the
-frame so few that they would say nothing."""
+"""Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if the best match of two stages
+has none, or the frame so few that they would say nothing."""
 
 MOST_VIEWS = 1
 """The most places whose turn and shift give the pose, or where a search for it begins; each takes some 10 ms."""
@@ -53,6 +53,8 @@ OF_A_GLANCE, BESIDE = 0.5, 0.07
 """A place has at most so many inliers, as a share of keypoints: half of the matches at a glance, and some more.  One
 that would stay behind the best all the same is left out.  The bound holds for 97 of 100 places of the tasks to fit on
 (``benchmarks.geometry.verification``)."""
+BEST = np.zeros(1, np.int64)
+"""The position of the best match of two stages."""
 AT_FIRST = 4
 """How many places are verified before it is asked which others may still win."""
 
@@ -131,16 +133,16 @@ def verify_candidates(
         return candidates, judgement, ThirdStage("not-needed")
     began, ranked, trial = time.perf_counter(), candidates, _Trial(candidates, comparison)
     if not doubtful:
-        trial.verify(np.zeros(1, np.int64))
+        trial.verify(BEST)
         ranked = trial.ranked()
         judgement = judged(ranked)
-        doubtful = not trial.found or worth_verifying(judgement, calibration)
+        doubtful = trial.weighs_the_best and worth_verifying(judgement, calibration)
     if doubtful:
         trial.verify_chosen()
         ranked = trial.ranked()
         judgement = judged(ranked)
     milliseconds = 1e3 * (time.perf_counter() - began)
-    if not trial.found:
+    if not trial.weighs_the_best:
         return candidates, before, ThirdStage("no-keypoints", milliseconds=milliseconds)
     return ranked, judgement, ThirdStage("verified", verifier.keypoints, milliseconds=milliseconds)
 
@@ -163,6 +165,14 @@ class _Trial:
         results = self.comparison.verifications(self.candidates.rows[missing].tolist())
         self.found |= {at: one for at, one in zip(missing, results, strict=True) if one is not None}
 
+    @property
+    def weighs_the_best(self) -> bool:
+        """Whether the best match of two stages was verified.
+
+        If it has no keypoints, those of other places say nothing against it.
+        """
+        return 0 in self.found
+
     def ranked(self) -> Candidates:
         """The candidates in their final order, with the results."""
         return verified(self.candidates, self.found)
@@ -171,7 +181,9 @@ class _Trial:
         """Verify those that are chosen as far as they can still win, and whatever comes first then."""
         chosen, shares = self._choose()
         promised = self._values(OF_A_GLANCE * shares + BESIDE)
-        self.verify(chosen[np.argsort(-promised[chosen], kind="stable")][:AT_FIRST])
+        self.verify(np.union1d(BEST, chosen[np.argsort(-promised[chosen], kind="stable")][:AT_FIRST]))
+        if not self.weighs_the_best:
+            return
         best = self._values(self._shares())[[*self.found]].max() if len(self.found) > 1 else -np.inf
         self.verify(chosen[promised[chosen] >= best])
         while (first := int(np.argmax(self._values(self._shares())))) not in self._tried:

@@ -144,9 +144,9 @@ class VerificationView(BaseModel):
     """Whether the geometry of the best candidates was verified."""
 
     state: VerificationState = Field(
-        description="verified; not-needed: with `auto`, the scores settle the answer; no-keypoints: none of the "
-        "candidates has any, or the frame too few to say anything, so the scores decide alone; never: it was not "
-        "requested."
+        description="verified; not-needed: with `auto`, the scores settle the answer; no-keypoints: the best "
+        "match by the scores has none, or the frame too few to say anything, so the scores decide alone; never: it was "
+        "not requested."
     )
     candidates: int = Field(description="How many places were verified.")
     keypoints: int | None = Field(description="Keypoints of the frame; null if they were not needed.")

@@ -1,7 +1,7 @@
 """The job that finds the keypoints of places that have none, in the pictures that the map keeps of them.
 
-Places lack keypoints if they were enrolled while the map did not verify.  A thumbnail serves as
-well as an image, with fewer pixels.  Each commit stands by itself, so an attempt after a restart goes on with the
+Places lack keypoints if they were enrolled while the map did not verify.  A thumbnail serves, too,
+if less well than an image.  Each commit stands by itself, so an attempt after a restart goes on with the
 places that are still without.
 """
 

@@ -119,6 +119,16 @@ def test_begun_work_is_done_once_beside_the_caller_or_when_it_is_wanted() -> Non
         use_threads(before)
 
 
+def test_work_that_the_end_of_a_process_meets_is_done_all_the_same() -> None:
+    """Threads begin nothing any more once the interpreter ends, as while a service that is stopped still rehearses."""
+    code = (
+        "import atexit\nfrom core.threads import begun, each, use_threads\nuse_threads(2)\n"
+        "atexit.register(lambda: print(each(lambda n: n * n, [1, 2, 3], 2), begun(lambda: 7)()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[1, 4, 9] 7\n", "")
+
+
 @pytest.mark.parametrize(
     ("said", "wanted"),
     [("50000 100000", 1), ("100000 100000", 1), ("110000 100000", 2), ("99900000 100000", None), ("max 100000", None)],

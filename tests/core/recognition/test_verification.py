@@ -25,7 +25,7 @@ from core.places import PlaceFields, Whereabouts
 from core.recognition.question import Query, Question, Verifier, Verify
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
 from core.recognition.stages import Candidates
-from core.recognition.verification import AT_FIRST, CANDIDATES, verify_candidates
+from core.recognition.verification import AT_FIRST, CANDIDATES, VerificationState, verify_candidates
 from core.storage import Atlas, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -106,7 +106,10 @@ def test_a_place_that_cannot_win_any_more_is_left_out(lab: Map, encoder: Encoder
 
 @dataclass
 class KnownComparison:
-    """A comparison whose outcome is known: the shares of matches and of inliers of the places, by their rows."""
+    """A comparison whose outcome is known: the shares of matches and of inliers of the places, by their rows.
+
+    inliers: NaN for a place without keypoints.
+    """
 
     matches: list[int]
     inliers: list[float]
@@ -120,13 +123,20 @@ class KnownComparison:
 
     def verifications(self, rows: Sequence[int]) -> list[Verification | None]:
         self.asked += rows
-        inliers = [round(100 * self.inliers[row]) for row in rows]
+        inliers = [None if np.isnan(self.inliers[row]) else round(100 * self.inliers[row]) for row in rows]
         pairs, flags = np.zeros((100, 2), np.int64), np.arange(100)
-        return [Verification((100, 100), pairs, flags < count, float(count), 0.5) for count in inliers]
+        return [
+            None if count is None else Verification((100, 100), pairs, flags < count, float(count), 0.5)
+            for count in inliers
+        ]
 
 
 def compare(
-    first: list[float], gains: list[float], comparison: KnownComparison, examined: int | None = None
+    first: list[float],
+    gains: list[float],
+    comparison: KnownComparison,
+    examined: int | None = None,
+    state: VerificationState = "verified",
 ) -> Candidates:
     """The candidates of a query with known scores after all three stages; rows are numbers in ``first``."""
     similarity, gain = np.array(first, np.float32), np.array(gains, np.float32)
@@ -142,7 +152,7 @@ def compare(
 
     calibration = EncoderCatalogue().get(DEFAULT_ENCODER).calibration
     found, _, stage = verify_candidates(candidates, judged, Verifier("always", lambda: query), calibration, comparison)
-    assert stage.state == "verified"
+    assert stage.state == state
     return found
 
 
@@ -162,6 +172,15 @@ def test_a_place_that_a_glance_leaves_no_chance_is_not_compared() -> None:
     comparison = KnownComparison([60] * 8, [0.05, 0.04, 0.3] + [0.05] * 5)
     compare([0.2, 0.19, 0.18, 0.17, 0.16, 0.15, 0.14, 0.13], [0.0] * 8, comparison)
     assert sorted(comparison.asked) == list(range(8)), "many matches at a glance may be many inliers"
+
+
+def test_keypoints_of_others_say_nothing_against_a_best_match_that_has_none() -> None:
+    """Place 1 fits, as places beside the true one do, and comes first only if place 0 has keypoints that do not."""
+    first, gains = [0.2, 0.19, 0.18], [0.0] * 3
+    bare = KnownComparison([0, 30, 30], [np.nan, 0.3, 0.2])
+    assert compare(first, gains, bare, state="no-keypoints").rows.tolist() == [0, 1, 2]
+    assert compare(first, gains, KnownComparison([0, 30, 30], [0.0, 0.3, 0.2])).rows[0] == 1
+    assert compare(first, gains, KnownComparison([30, 0, 30], [0.1, np.nan, 0.3])).rows[0] == 2
 
 
 def test_the_best_of_the_first_stage_are_never_lost() -> None:
@@ -210,6 +229,29 @@ def test_places_without_keypoints_are_left_where_two_stages_put_them(atlas: Atla
     answer = ask(bare, encoder, 3, "always", looked)
     assert answer.third_stage.state == "verified" and looked == [3]
     assert [one is not None for one in answer.candidates.verifications] == [True], "the others have none"
+
+
+@pytest.mark.parametrize("verify", ["auto", "always"])
+def test_a_best_match_without_keypoints_loses_nothing_to_places_that_have_some(
+    atlas: Atlas, encoder: Encoder, verify: Verify
+) -> None:
+    """As in a map whose setting was changed: what places beside it share with the frame says nothing against it."""
+    mixed = atlas.create(
+        f"mixed-{verify}",
+        encoder.identity,
+        encoder.dimension,
+        MapSettings(keep="none", verification=False),
+        encoder.local_shape,
+    )
+    enrol(mixed, "p3", jpeg(3), encoder)
+    mixed.edit({"verification": True})
+    for seed in (0, 1, 2, 4):
+        enrol(mixed, f"p{seed}", jpeg(seed), encoder)
+    answer, without = ask(mixed, encoder, 3, verify), ask(mixed, encoder, 3, "never")
+    assert without.matches[0][1].id == "p3"
+    assert answer.third_stage.state == "no-keypoints" and answer.judgement == without.judgement
+    assert [place.id for _, place in answer.matches] == [place.id for _, place in without.matches]
+    assert ask(mixed, encoder, 1, "always").third_stage.state == "verified"
 
 
 def test_a_frame_with_hardly_any_keypoints_is_judged_by_its_scores(lab: Map, encoder: Encoder) -> None:
