@@ -61,7 +61,7 @@ PARTS = {
     ),
     "maps": Part("benchmarks.maps.map_sizes", "--datasets {data} --repeats 3", "data sets"),
     "stages": Part("lab.training.default_calibration", "--dry-run", "data sets"),
-    "vocabularies": Part("lab.training.vocabularies", "--datasets {data} --cache {results}/vocabularies", "data sets"),
+    "vocabularies": Part("lab.training.vocabularies", "--datasets {data}", "data sets"),
     "looks": Part("benchmarks.maps.looks", "--datasets {data}", "data sets"),
     "strangers": Part("benchmarks.learning.strangers", "--datasets {data}", "data sets"),
     "change": Part("benchmarks.learning.change", "--datasets {data}", "data sets"),

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import typer
 
+from benchmarks.geometry.same_view import inliers_by_opencv
 from benchmarks.report import report, verdict
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, second_look
@@ -24,15 +25,13 @@ from core.frames.traverses import SUPPORTED_SUFFIXES
 from core.geometry.detection import find_keypoints, shown_size
 from core.geometry.keypoints import MOST, record_bytes
 from core.geometry.matching import neighbors_among
-from core.geometry.verification import CERTAINTY, THRESHOLD, fitting, points_of, verify
+from core.geometry.verification import fitting, points_of, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
 from core.threads import allowed_threads, cores, each, share_cores
 from service.commands.timing.samples import sample_frame
 
 CANDIDATES = 10
-ATTEMPTS = 100
-"""Of MAGSAC++, beside which ours stands."""
 MILLISECONDS = 60
 """At most, for the keypoints of a query and its candidates."""
 FRAMES = 25
@@ -87,9 +86,7 @@ def main(
             "keypoints of a frame": lambda: find_keypoints(network, frames[0]),
             "matches of one candidate": lambda: neighbors_among(query, candidates[:1]),
             "fundamental matrix of one candidate": lambda: fitting(*points),
-            "the same by MAGSAC++ of OpenCV": lambda: cv2.findFundamentalMat(
-                *points, cv2.USAC_MAGSAC, THRESHOLD, CERTAINTY, ATTEMPTS
-            ),
+            "the same by MAGSAC++ of OpenCV": lambda: inliers_by_opencv(*points),
             f"verification of {len(candidates)} candidates": lambda: verify(query, candidates),
             "all in": lambda: verify(find_keypoints(network, frames[0]), candidates),
             "encoding of the frames": lambda: encoder.encode_batch(frames),

@@ -160,7 +160,8 @@ class _Trial:
 
     def verify(self, positions: Positions) -> None:
         """Verify the candidates at some positions, int64 [k], that were not yet."""
-        missing = [position for position in positions.tolist() if position not in self._tried]
+        if not (missing := [position for position in positions.tolist() if position not in self._tried]):
+            return
         self._tried.update(missing)
         results = self.comparison.verifications(self.candidates.rows[missing].tolist())
         self.found |= {at: one for at, one in zip(missing, results, strict=True) if one is not None}

@@ -1,6 +1,6 @@
 """How much of the figures is luck: the default encoder with vocabularies of other seeds, by one, two and three stages.
 
-    python -m lab.training.vocabularies --cache FOLDER
+    python -m lab.training.vocabularies [--cache FOLDER]
 
 The packaged vocabulary has the seed 0.  The others are trained on photographs, features and starts of k-means that
 other seeds draw (``lab.training.packaging``); network, projections and constants stay as they are.  The tasks are
@@ -8,13 +8,14 @@ corridor and those of ``lab.training.validation``.  On corridor and lip6 the thi
 it, where two stages leave doubt and always; of the fixed cameras the best places are verified.
 
 Prints a Markdown table: of each number that of the packaged vocabulary, and the mean over all with half the largest
-difference between two.  The cache keeps the encoders, which ``--models-dir`` of other commands takes, and what was
-measured; a run that was broken off goes on from there.
+difference between two.  A cache keeps the encoders, which ``--models-dir`` of other commands takes, and what was
+measured; a run of the same code that was broken off goes on from there.
 """
 
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -169,12 +170,18 @@ def table(measured: dict[str, Figures]) -> str:
 
 
 def main(
-    cache: Annotated[Path, typer.Option(help="Folder that keeps encoders and figures.")] = Path("runs/vocabularies"),
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps encoders and figures.")] = None,
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     seeds: Annotated[int, typer.Option(min=1, help="Vocabularies, the packaged one included.")] = 3,
     images: Annotated[int, typer.Option(min=1, help="Photographs for each vocabulary.")] = VOCABULARY_IMAGES,
 ) -> None:
     """Measure the packaged vocabulary and others on all tasks."""
+    with tempfile.TemporaryDirectory() as nothing_kept:
+        typer.echo(compared(cache or Path(nothing_kept), datasets, seeds, images))
+
+
+def compared(cache: Path, datasets: Path, seeds: int, images: int) -> str:
+    """The table of the packaged vocabulary and others; the arguments are those of :func:`main`."""
     torch.manual_seed(0)
     cache.mkdir(parents=True, exist_ok=True)
     packaged = load_encoder(PACKAGED / f"{DEFAULT_ENCODER}{ENCODER_SUFFIX}", PACKAGED / f"{NETWORK}{NETWORK_SUFFIX}")
@@ -200,7 +207,7 @@ def main(
             rows = zip(STAGES, indoors, outdoors, *apart, strict=True)
             measured[encoder.identity] = {stage: [*one, *two, *rest] for stage, one, two, *rest in rows}
             store.write_text(json.dumps(measured, indent=1))
-    typer.echo(table({encoder.identity: measured[encoder.identity] for encoder in encoders}))
+    return table({encoder.identity: measured[encoder.identity] for encoder in encoders})
 
 
 if __name__ == "__main__":

@@ -136,7 +136,8 @@ class EncoderThreads:
                 raise deadline_exceeded()
             pixels = decode(frame.data, self._limits)
             times = {"wait": 1e3 * (began - frame.queued), "decode": 1e3 * (time.perf_counter() - began)}
-            find = begun(lambda: _keypoints(pixels, frame.mask, times)) if frame.keypoints else None
+            spent: dict[str, float] = {}  # by another thread, which may end after a frame without regions is done
+            find = begun(lambda: _keypoints(pixels, frame.mask, spent)) if frame.keypoints else None
             encoding = frame.encoder.encode(pixels, frame.mask)
             if not frame.features:
                 encoding = replace(encoding, regions=encoding.regions.without_features())
@@ -148,7 +149,7 @@ class EncoderThreads:
                 with suppress(Exception):  # Searches repeats the search and reports the error
                     encoded = replace(encoded, search_result=frame.after_encoding(encoded))
             if find is not None:
-                encoded = replace(encoded, keypoints=find())
+                encoded = replace(encoded, keypoints=find(), milliseconds=times | spent)
         except Exception as error:
             if not isinstance(error, InvalidImage | DeadlineExceeded):
                 log.exception("a frame could not be encoded")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.geometry.verification import fitting
 from core.kernels.epipolar import (
     _make_singular,
     _matrices,
@@ -31,11 +32,6 @@ def scene(count: int, seed: int, plane: bool = False) -> Points:
     random = np.random.default_rng(seed)
     depths = np.full(count, 6.0) if plane else random.uniform(3, 12, count)
     return np.column_stack([random.uniform(-0.5, 0.5, (count, 2)) * depths[:, None], depths])
-
-
-def fitting(query: Points, candidate: Points) -> NDArray[np.bool_]:
-    neighbors = np.arange(len(query), dtype=np.int32)[None]
-    return fitting_neighbors(neighbors, query, candidate[None], 1.0, 250, 0.999)[0]
 
 
 MOVES = {
