@@ -315,6 +315,17 @@ class Robot:
             self.peer.do("sleep", seconds=0.15)
             quiet = 0 if self.peer.take("answer") else quiet + 1
 
+    def enrol_here(self, show: Callable[[], object]) -> dict[str, Any]:
+        """Show the node something and have it enrolled; show it again if it was no longer present when it was to be."""
+
+        def told() -> dict[str, Any] | None:
+            show()
+            done = self.peer.do("call", service="enrol_here")
+            return None if "No image has come" in done["message"] else done
+
+        done: dict[str, Any] = until(told)
+        return done
+
     def asked(self, number: int) -> dict[str, Any]:
         """Publish a frame of the walk, and wait for its answer."""
         self.look(number=number)

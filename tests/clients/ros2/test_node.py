@@ -454,14 +454,17 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     again = robot.peer.do("call", service="create_map")
     assert not again["success"] and "map-exists" in again["message"]
     robot.frame += 10
-    robot.look(number=0)
-    refused = robot.peer.do("call", service="enrol_here")
+    robot.answers_settled()
+    refused = robot.enrol_here(lambda: robot.asked(0))
     assert not refused["success"] and "no odometry" in refused["message"]
+
+    def show(picture: bytes, x: float, y: float, heading: float) -> None:
+        robot.odometry(x, y, heading)
+        robot.answers_to([picture])
+
     for number in (0, 6, 12):
-        robot.odometry(float(number), 1.0, 30.0)
-        robot.look(encoded(robot.site.frames[number]))
-        robot.peer.do("sleep", seconds=0.1)
-        done = robot.peer.do("call", service="enrol_here")
+        picture = encoded(robot.site.frames[number])
+        done = robot.enrol_here(partial(show, picture, float(number), 1.0, 30.0))
         assert done["success"], done["message"]
     places = list(server.places("made").values())
     assert [(one["pose"]["x"], one["pose"]["y"], round(one["pose"]["heading"])) for one in places] == [
@@ -474,10 +477,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     robot.begin(map="made", role="enrol")
     robot.connected()
     robot.connected("/odom")
-    robot.odometry(50.0, 50.0, 0.0)
-    robot.look(encoded(stranger(77)))
-    robot.answers_settled()
-    refused = robot.peer.do("call", service="enrol_here")
+    refused = robot.enrol_here(partial(show, encoded(stranger(77)), 50.0, 50.0, 0.0))
     assert not refused["success"] and "not localized" in refused["message"]
 
 

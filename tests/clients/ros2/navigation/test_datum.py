@@ -87,6 +87,11 @@ def test_a_map_in_degrees_is_driven_by_a_datum(robot: Robot) -> None:
     peer.do("advertise", topic="/odom", kind="Odometry")
     for topic in ("filtered_pose", "fix"):
         peer.do("listen", topic=topic)
+
+    def seen(number: int) -> dict[str, Any]:
+        robot.odometry(number, 0, 0)
+        return robot.asked(number)
+
     robot.begin(map="earth")
     robot.connected()
     robot.connected("/odom")
@@ -99,8 +104,7 @@ def test_a_map_in_degrees_is_driven_by_a_datum(robot: Robot) -> None:
     robot.connected()
     robot.connected("/odom")
     for number in range(8):
-        robot.odometry(number, 0, 0)
-        answer = robot.asked(number)
+        answer = seen(number)
     assert answer["verdict"] == "recognized"
     pose = until(lambda: peer.take("pose"))[-1]
     assert pose["frame"] == "map" and (pose["x"], pose["y"]) == pytest.approx((7, 0), abs=1.5)
@@ -112,7 +116,7 @@ def test_a_map_in_degrees_is_driven_by_a_datum(robot: Robot) -> None:
     assert fix["altitude"] is None and fix["covariance"][0] == pose["covariance"][0]
     assert until(lambda: peer.take("filtered_pose"))[-1]["x"] == pytest.approx(7, abs=1.5)
     until(lambda: peer.take("map_to_odom"))
-    enrolled = peer.do("call", service="enrol_here")
+    enrolled = robot.enrol_here(lambda: seen(7))
     assert enrolled["success"], enrolled
     made = site.server.places("earth")[enrolled["message"].split()[0]]["pose"]
     assert DATUM.planar(made["latitude"], made["longitude"], made["heading"]).x == pytest.approx(7, abs=1.5)
@@ -125,12 +129,11 @@ def test_a_map_in_degrees_is_driven_by_a_datum(robot: Robot) -> None:
     for topic in ("pose", "fix"):
         peer.take(topic)
     for number in range(5):  # not as far as the place without a height
-        robot.odometry(number, 0, 0)
-        robot.asked(number)
+        seen(number)
     assert until(lambda: peer.take("fix"))[-1]["altitude"] == pytest.approx(35.0)
     assert until(lambda: peer.take("pose"))[-1]["z"] == pytest.approx(1.5), "above the datum"
     until(lambda: peer.take("map_to_odom"))
-    enrolled = peer.do("call", service="enrol_here")
+    enrolled = robot.enrol_here(lambda: seen(4))
     assert enrolled["success"], enrolled
     made = site.server.places("earth")[enrolled["message"].split()[0]]["pose"]
     assert made["z"] == pytest.approx(35.0, abs=0.1)

@@ -114,11 +114,14 @@ def test_a_place_is_enrolled_by_every_camera(robot: Robot, rig: dict[str, list[b
     for camera in rig:
         mount(robot, camera)
     robot.frame = 1
-    robot.odometry(3, 4, 30)
-    for camera in rig:
-        look(robot, camera, rig[camera][0], 0.3)
-    robot.answers(2)
-    done = robot.peer.do("call", service="enrol_here")
+
+    def show() -> None:
+        robot.odometry(3, 4, 30)
+        for camera in rig:
+            look(robot, camera, rig[camera][0])
+        robot.answers(2)
+
+    done = robot.enrol_here(show)
     assert done["success"], done
     places = robot.site.server.places("rig-made").values()
     assert sorted(place["pose"]["heading"] for place in places) == pytest.approx([30, 120], abs=1e-6)
