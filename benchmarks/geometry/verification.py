@@ -10,7 +10,7 @@ the tasks to fit on, in which each kind of change counts alike.
 
 The second table asks whether the best match is right: of every task one half of the references is left out, then the
 other.  It compares the probability of three stages with plain measures of doubt, by the area under their precision and
-recall.
+recall.  The third fits how much a lead over rivals says (``benchmarks.geometry.leads``).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from benchmarks.geometry.leads import VerifiedAnswers, lead_figures
 from benchmarks.geometry.tasks import PictureEncoder, Task, tasks
 from benchmarks.report import report
 from core.geometry.matching import GLANCED, count_matches, glance_at
@@ -204,7 +205,7 @@ MEASURES: dict[str, Callable[[Candidates, Judgement, Neighborhood], float]] = {
     "probability": lambda _, judgement, __: judgement.probability or 0.0,
     "score of two stages": lambda candidates, _, __: float(candidates.scores[0]),
     "ratio to the second place": lambda candidates, _, neighborhood: _over_second(candidates, neighborhood),
-    "lead over it": lambda _, judgement, __: np.inf if judgement.margin is None else judgement.margin,
+    "lead over it": lambda _, judgement, __: judgement.lead,
     "inliers": lambda candidates, _, __: float(_inliers(candidates)),
     "evidence": lambda _, judgement, __: judgement.evidence or 0.0,
     "spread of the best five": lambda candidates, _, __: -_spread(candidates),
@@ -230,13 +231,14 @@ def _spread(candidates: Candidates) -> float:
     return float(np.sqrt(np.average((where - np.average(where, weights=weights)) ** 2, weights=weights)))
 
 
-def doubts(asked: Asked) -> dict[str, float]:
-    """The figures of one task, with halves of its references left out."""
+def doubts(asked: Asked) -> tuple[dict[str, float], VerifiedAnswers]:
+    """The figures of one task, with halves of its references left out, and its answers."""
     measured: dict[str, list[float]] = {name: [] for name in MEASURES}
     right: list[bool] = []
     known: list[bool] = []
     recognized: list[bool] = []
     by_auto: list[tuple[float, bool]] = []
+    judged: list[tuple[Judgement, bool]] = []
     for retained in asked.halves():
         for query in asked.queries:
             candidates, judgement = asked.judged(query, retained)
@@ -245,13 +247,14 @@ def doubts(asked: Asked) -> dict[str, float]:
             right.append(bool(asked.task.truth[query, candidates.rows[0]]))
             known.append(bool(asked.task.truth[query, retained].any()))
             recognized.append(judgement.verdict == "recognized")
+            judged.append((judgement, right[-1]))
             automatic, doubted = asked.judged(query, retained, "auto")
             by_auto.append((doubted.probability or 0.0, bool(asked.task.truth[query, automatic.rows[0]])))
     hits, there, believed = (np.array(flags, np.bool_) for flags in (right, known, recognized))
     areas = {name: auc_pr(np.array(values), hits) for name, values in measured.items()}
     probability = np.array(measured["probability"])
     stated, found = (np.array(column) for column in zip(*by_auto, strict=True))
-    return areas | {
+    figures = areas | {
         "AUC-ROC": auc_roc(probability, hits) or 0.0,
         "AUC-ROC of auto": auc_roc(stated, found.astype(np.bool_)) or 0.0,
         "calibration error": reliability(probability, hits).ece,
@@ -259,18 +262,20 @@ def doubts(asked: Asked) -> dict[str, float]:
         "right that are recognized": float(believed[hits].mean()) if hits.any() else 0.0,
         "strangers recognized": float(believed[~there].mean()) if (~there).any() else 0.0,
     }
+    return figures, VerifiedAnswers.of(judged, asked.encoder.calibration)
 
 
 def main(
     datasets: Annotated[Path, typer.Option(help="The folder with train and eval.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
 ) -> None:
-    """Two tables: orders, and measures of doubt."""
+    """Three tables: orders, measures of doubt, and how much a lead says."""
     share_cores(cores())
     chosen = EncoderCatalogue().get(encoder)
     found: list[tuple[Task, list[Ranked]]] = []
     orders: dict[str, dict[str, float]] = {}
     doubt: dict[str, dict[str, float]] = {}
+    answered: dict[str, list[VerifiedAnswers]] = {}
     for number, task in enumerate(tasks(PictureEncoder(chosen), datasets)):
         asked = Asked(chosen, task)
         known = [query for query in asked.queries if task.truth[query].any()]
@@ -288,11 +293,14 @@ def main(
         orders[name]["candidates verified"] = float(
             np.mean([sum(one is not None for one in final.verifications) for final in finals])
         )
-        doubt[name] = doubts(asked)
+        doubt[name], answers_of_halves = doubts(asked)
+        if task.fitted:
+            answered.setdefault(task.kind, []).append(answers_of_halves)
         print(name, {key: round(value, 3) for key, value in (orders[name] | doubt[name]).items()}, flush=True)
     for label, title, figures in (
         ("geometry_verification", "recall@1, and how many candidates are verified", orders),
         ("geometry_doubt", "is the best match right? area under precision and recall; the probability", doubt),
+        ("geometry_leads", "how much a lead says, fitted to kinds of tasks, enough from", lead_figures(answered)),
     ):
         columns = list(next(iter(figures.values())))
         rows = [(name, *(f"{values[column]:.3f}" for column in columns)) for name, values in figures.items()]

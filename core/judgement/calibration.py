@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
 from core.judgement.curves import auc_pr, auc_roc, falling
-from core.judgement.geometry import TERMS, GeometryTerms
+from core.judgement.geometry import TERMS, GeometryTerms, share_of_lead
 from core.judgement.probability import Curve, fit_curve, moved_curve, movement
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.trials import Flags, StagedTrials, Trial, Trials, Values, gathered, joined
@@ -342,11 +342,13 @@ def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve) -> Geometry
     if base.geometry is None or not verified.any():
         return base.geometry
     some = trials.take(verified)
-    odds = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence)
+    leads = share_of_lead(some.margin, some.imagined)
+    odds = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence, leads)
     stretch, shift = movement(odds, some.right, share_of_leads(some.margin, base))
     return GeometryTerms(
         support=stretch * base.geometry.support,
         slope=stretch * base.geometry.slope,
+        lead=stretch * base.geometry.lead,
         intercept=stretch * base.geometry.intercept + shift,
     )
 

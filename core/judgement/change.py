@@ -137,7 +137,7 @@ def log_odds_in_map(judgement: Judgement, calibration: Calibration) -> float | N
     """
     if judgement.decision is None or calibration.curve is None:
         return None
-    stated = log_odds_of(judgement.decision, calibration, judgement.imagined, judgement.evidence)
+    stated = log_odds_of(judgement.decision, judgement.lead, calibration, judgement.imagined, judgement.evidence)
     if stated is None:
         return None
     odds = float(stated)

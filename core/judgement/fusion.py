@@ -8,8 +8,9 @@ was taken.  With the probability e it says nothing at all, so that it contribute
     log((1 - e) · exp(x) + e)  >=  log e,
 
 and the log odds of a place are the sum over the cameras.  Where a camera's candidates were verified, x has the evidence
-of the place as well (``geometry.py``), which is 0 of a place that was left out as one that could not win; so the
-candidates of all cameras are verified where those of one are (``core.recognition.rigs``).  Cameras are
+of the place and its lead as well (``geometry.py``).  Leads of cameras that see one scene say nearly the same, so that
+of each counts by its share of the cameras.  The evidence is 0 of a place that could not win any more; so the candidates
+of all cameras are verified where those of one are (``core.recognition.rigs``).  Cameras are
 assumed to be independent given the place, which is not quite true, since they share the light and the weather.  A rig
 of one camera is a plain query.
 
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.background import GUARD_FACTOR
-from core.judgement.geometry import Geometry
+from core.judgement.geometry import Geometry, share_of_lead
 from core.judgement.priors import decision_slope, log_odds
 from core.judgement.probability import FARTHEST
 from core.judgement.verdict import MOST_RIVALS, Calibration, Judgement, Rivals, Verdict
@@ -119,7 +120,10 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     counts = [len(view.rows) for view in views]
     of_place = _added(
         np.stack(
-            [_camera_log_odds(*one, near, beside, calibration) for one in zip(scores, evidence, counts, strict=True)]
+            [
+                _camera_log_odds(*one, near, beside, calibration, len(views))
+                for one in zip(scores, values, evidence, counts, strict=True)
+            ]
         )
     )
     prior = np.concatenate(
@@ -146,20 +150,23 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
 
 def _camera_log_odds(
     scores: Values,
+    values: Values,
     evidence: Values,
     places: int,
     near: NDArray[np.bool_],
     beside: NDArray[np.bool_],
     calibration: Calibration,
+    cameras: int,
 ) -> Values:
     """The log odds of each place by one camera, float64 [n].
 
     Args:
-        scores: float64 [n], -inf for places that the camera does not list.
+        scores, values: float64 [n], of two stages and of all; -inf for places that the camera does not list.
         evidence: float64 [n]; NaN if none of the camera's places was verified.
         places: how many the camera's ranking has.
         near: bool [n, n], which places are the same place.
         beside: bool [n, n], which places may overlap.
+        cameras: how many the rig has.
     """
     found = np.empty(len(scores))
     for place, same in enumerate(near):
@@ -171,7 +178,10 @@ def _camera_log_odds(
         behind = calibration.background(rest, places - int(same.sum()), apart)
         found[place] = log_odds(behind.decision(best), calibration, behind.imagined)
         if calibration.geometry is not None and not np.isnan(evidence[same]).any():
-            found[place] = calibration.geometry.log_odds(found[place], evidence[same].max())
+            ahead = float(values[same].max())
+            lead = ahead - values[~same].max(initial=-np.inf) if np.isfinite(ahead) else 0.0
+            leads = share_of_lead(lead, behind.imagined) / cameras
+            found[place] = calibration.geometry.log_odds(found[place], evidence[same].max(), leads)
     return found
 
 

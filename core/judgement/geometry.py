@@ -10,15 +10,17 @@ the view has moved, and say little that keypoints do not say better.  Without a 
 The value is the score of three stages, in the units of that of two,
 and the evidence of the best match joins the log odds L of the first two stages in one probability,
 
-    log odds = support · L + slope · ln(1 + e) + intercept.
+    log odds = support · L + slope · ln(1 + e) + lead · (1 - u) · min(1, m / LEAD) + intercept,
 
-Evidence needs no other place to be compared with, so it says in a map of one place what it says in a large one.  Where
-two stages say next to nothing, as in a small map, the evidence decides.  As keypoints are the same for every encoder,
-and L is a log odds whatever the encoder's scores are, so are the three numbers.
+with its lead m over the best rival in the final order, and the share u of other places that were imagined.  Evidence
+needs no other place to be compared with, so it says in a map of one place what it says in a large one.  Places of one
+scene share keypoints, though: one that fits better than all others is right far oftener than its evidence alone says.
+Where two stages say next to nothing, as in a small map, the evidence decides.  As keypoints are the same for every
+encoder, and L is a log odds whatever the encoder's scores are, so are the four numbers.
 
-A rival takes away from the certainty of an answer as far as it fits as well: its lead is measured in the final order.
-Two places of one picture are so ``ambiguous``, however much evidence both have, and a best match that fits, of whose
-rivals none does, is ``recognized`` even if its lead in score is small.
+A rival takes away from the certainty of an answer as far as it fits as well.  Two places of one picture are so
+``ambiguous``, however much evidence both have, and a best match that fits, of whose rivals none does, is ``recognized``
+even if its lead in score is small.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["INLIERS", "TERMS", "Geometry", "GeometryTerms", "final_gains", "final_order"]
+__all__ = ["INLIERS", "TERMS", "Geometry", "GeometryTerms", "final_gains", "final_order", "share_of_lead"]
 
 Values = NDArray[np.float64]
 
@@ -74,18 +76,47 @@ class GeometryTerms(BaseModel):
 
     support: float = Field(ge=0, allow_inf_nan=False, description="Weight of the log odds of the first two stages.")
     slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by an evidence e times greater.")
-    intercept: float = Field(allow_inf_nan=False, description="Log odds where neither says anything.")
+    lead: float = Field(
+        default=0.0,
+        ge=0,
+        allow_inf_nan=False,
+        exclude_if=lambda lead: lead == 0,
+        description="Log odds gained where the map has other places and none of them fits nearly as well.",
+    )
+    intercept: float = Field(allow_inf_nan=False, description="Log odds where nothing says anything.")
 
-    def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike) -> Values:
-        """The log odds of three stages, from those of two and from the evidence; all of one shape."""
-        before, found = np.asarray(two_stages, np.float64), np.asarray(evidence, np.float64)
-        return np.asarray(self.support * before + self.slope * np.log1p(found) + self.intercept, np.float64)
+    def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike, leads: ArrayLike) -> Values:
+        """The log odds of three stages, all of one shape.
+
+        Args:
+            two_stages: the log odds of two.
+            evidence: at least 0.
+            leads: of :func:`share_of_lead`.
+        """
+        before, found = np.asarray(two_stages, np.float64), np.log1p(np.asarray(evidence, np.float64))
+        gained = self.lead * np.asarray(leads, np.float64)
+        return np.asarray(self.support * before + self.slope * found + gained + self.intercept, np.float64)
 
 
-TERMS = GeometryTerms(support=0.5, slope=1.463, intercept=-4.954)
-"""Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m lab.training.map_sizes``), with the
-inliers of MAGSAC++.  With ours the same fit gives 1.411 and -4.613, which lets more strangers pass in small maps of
-corridor (0.050 in place of 0.039 at most) and gains nothing else, so the more careful numbers stay."""
+LEAD = 0.05
+"""A lead over the best rival from here on says as much as one can."""
+
+TERMS = GeometryTerms(support=0.5, slope=1.411, lead=2.0, intercept=-5.25)
+"""The slope is fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m lab.training.map_sizes``),
+the lead to halves of nights, hallways and a drive (``benchmarks.geometry.leads``).  These give an intercept of -5.04;
+with -5.25 at most 0.03 of the strangers are recognized in maps of 1 to 30 places of corridor and lip6."""
+
+
+def share_of_lead(margin: ArrayLike, imagined: ArrayLike = 0.0) -> Values:
+    """The part that leads over rivals have of what a lead can say, float64 of any shape, in [0, 1].
+
+    Args:
+        margin: the leads in the final order; infinite without a rival, where there is none to lead.
+        imagined: the shares of other places that were imagined, for the map does not have them either.
+    """
+    leads = np.asarray(margin, np.float64)
+    reached = np.where(np.isinf(leads), 0.0, np.clip(leads / LEAD, 0.0, 1.0))
+    return np.asarray((1 - np.asarray(imagined, np.float64)) * reached, np.float64)
 
 
 def final_gains(

@@ -152,7 +152,7 @@ def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike) -> tuple
     odds little, and even outcomes of one kind only are enough.
 
     Args:
-        log_odds: [n], that an answer is right, its rivals left out of account.
+        log_odds: [n], that an answer is right, before rivals under the margin take from them.
         right: bool [n], whether the best match was right.
         factors: [n], in (0, 1], by which the probability of the log odds is multiplied to be that of the answer.
     """

@@ -72,7 +72,7 @@ class Trials:
 
     def standing_out(self, calibration: Calibration) -> Flags:
         """Which of them are believed by a calibration if their lead is large enough, bool [n]."""
-        return stands_out(self.decision, calibration, self.imagined, self.evidence)
+        return stands_out(self.decision, self.margin, calibration, self.imagined, self.evidence)
 
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
@@ -175,7 +175,7 @@ def gathered(trials: Iterable[Trial]) -> Trials:
     rows = [
         (
             one.judgement.decision,
-            np.inf if one.judgement.margin is None else one.judgement.margin,
+            one.judgement.lead,
             one.known,
             one.right,
             one.frame,

@@ -23,8 +23,8 @@ Rivals can be the reason why nothing stands out: a second traverse of the same p
 same.  They are left out of the background one after the other.  If the best match stands out of what is left, the
 verdict is ``ambiguous`` and names them; it would be wrong to call such a frame unknown and to enrol it once more.
 
-Where candidates were verified geometrically, the evidence of the best match joins the decision value in one probability
-(``geometry.py``), which takes the threshold's place, and the margin is a lead in the final order of three stages.
+Where candidates were verified geometrically, the evidence of the best match and its lead join the decision value in one
+probability (``geometry.py``), which takes the threshold's place, and the lead is that in the final order.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.background import FULL, GUARD_FACTOR, TOP_PLACES, Background, Environment, background, unrelated
-from core.judgement.geometry import Geometry, GeometryTerms
+from core.judgement.geometry import Geometry, GeometryTerms, share_of_lead
 from core.judgement.probability import Curve, sigmoid
 from core.places import Neighborhood, Whereabouts
 
@@ -152,14 +152,24 @@ class Judgement:
     rivals: tuple[Rivals, ...] = ()
     evidence: float | None = None
 
+    @property
+    def lead(self) -> float:
+        """The margin, or infinity without a rival."""
+        return float("inf") if self.margin is None else self.margin
+
 
 def log_odds_of(
-    decision: ArrayLike, calibration: Calibration, imagined: ArrayLike = 0.0, evidence: ArrayLike | None = None
+    decision: ArrayLike,
+    margin: ArrayLike,
+    calibration: Calibration,
+    imagined: ArrayLike = 0.0,
+    evidence: ArrayLike | None = None,
 ) -> Values | None:
-    """The log odds that best matches are right, their rivals left out of account, float64 of any shape.
+    """The log odds that best matches are right, before rivals under the margin take from them; float64 of any shape.
 
     Args:
         decision: the decision values.
+        margin: as of :func:`share_of_leads`; it counts where a best match was verified.
         imagined: the shares of the background that were imagined.
         evidence: of the best matches; NaN for one that was not verified, None: none was.
 
@@ -172,7 +182,8 @@ def log_odds_of(
     if evidence is None or calibration.geometry is None:
         return two_stages
     found = np.asarray(evidence, np.float64)
-    return np.where(np.isnan(found), two_stages, calibration.geometry.log_odds(two_stages, found))
+    three_stages = calibration.geometry.log_odds(two_stages, found, share_of_lead(margin, imagined))
+    return np.where(np.isnan(found), two_stages, three_stages)
 
 
 def share_of_leads(margin: ArrayLike, calibration: Calibration) -> Values:
@@ -195,18 +206,21 @@ def probability_of(
     """The probabilities that best matches are right, by the calibration's curve and the leads over the best rivals.
 
     Args:
-        decision, imagined, evidence: as of :func:`log_odds_of`.
-        margin: as of :func:`share_of_leads`.
+        decision, margin, imagined, evidence: as of :func:`log_odds_of`.
 
     Returns:
         Float64 of any shape, each in (0, 1); None if the calibration has no curve.
     """
-    odds = log_odds_of(decision, calibration, imagined, evidence)
+    odds = log_odds_of(decision, margin, calibration, imagined, evidence)
     return None if odds is None else np.asarray(sigmoid(odds) * share_of_leads(margin, calibration), np.float64)
 
 
 def stands_out(
-    decision: ArrayLike, calibration: Calibration, imagined: ArrayLike = 0.0, evidence: ArrayLike | None = None
+    decision: ArrayLike,
+    margin: ArrayLike,
+    calibration: Calibration,
+    imagined: ArrayLike = 0.0,
+    evidence: ArrayLike | None = None,
 ) -> NDArray[np.bool_]:
     """Whether best matches are believed if their leads are large enough, bool of any shape.
 
@@ -214,7 +228,7 @@ def stands_out(
     least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
     """
     believed = np.asarray(decision, np.float64) >= calibration.threshold
-    odds = log_odds_of(decision, calibration, imagined, evidence)
+    odds = log_odds_of(decision, margin, calibration, imagined, evidence)
     if odds is None or evidence is None or calibration.geometry is None or calibration.curve is None:
         return np.asarray(believed)
     surely = odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
@@ -286,16 +300,16 @@ def judge(
     leads = ranking.leads(others)
     rival = int(others[leads.argmin()]) if len(others) else None
     margin = None if rival is None else float(leads.min())
+    lead = np.inf if margin is None else margin
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
-    if not stands_out(decision, calibration, behind.imagined, evidence):
+    if not stands_out(decision, lead, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
     elif margin is not None and margin < calibration.margin:
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
-    lead = np.inf if margin is None else margin
     stated = probability_of(decision, lead, calibration, behind.imagined, evidence)
     probability = None if stated is None else float(stated)
     return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence)
@@ -355,6 +369,13 @@ class _Ranking:
             values = values + self.geometry.gain
         return np.asarray(values[0] - values[places], np.float64)
 
+    def stands_out_without(self, left_out: NDArray[np.bool_]) -> bool:
+        """Whether the best match would stand out if the map did not have some of the other places, bool [n]."""
+        behind, best = self.background(left_out), float(self.scores[0])
+        lead = self.leads(self.others[~left_out[self.others]]).min(initial=np.inf)
+        decision = behind.decision(best)
+        return bool(stands_out(decision, lead, self.calibration, behind.imagined, self.evidence))
+
     def background(self, left_out: NDArray[np.bool_] | None = None) -> Background:
         """The background without some places, bool [n]."""
         compared, others = self.compared, len(self.others)
@@ -364,27 +385,23 @@ class _Ranking:
         falling = np.sort(self.scores[compared])[::-1]  # verification may have changed the order
         return self.calibration.background(falling, others, self.scores[apart])
 
-    def calm(self) -> Background:
-        """The background without its best few, among which the rivals are."""
-        left_out = np.zeros(len(self.scores), np.bool_)
-        left_out[self.compared[:MOST_RIVALS]] = True
-        return self.background(left_out)
+    @property
+    def best_few(self) -> NDArray[np.bool_]:
+        """The best few of the other places, among which the rivals are, bool [n]."""
+        few = np.zeros(len(self.scores), np.bool_)
+        few[self.compared[:MOST_RIVALS]] = True
+        return few
 
     def explaining_rivals(self, likeness: Likeness | None) -> tuple[Rivals, ...]:
         """The rivals without which the best match would stand out; empty if it would not."""
-        if likeness is None or not self.would_stand_out(self.calm()):
+        if likeness is None or not self.stands_out_without(self.best_few):
             return ()  # whoever its rivals are
         heads = self.heads()
         alike = self.alike(heads, likeness)
         if not alike.any():
             return ()
         near = [self.whereabouts.near(head, self.neighborhood) for head in heads[alike].tolist()]
-        return self.grouped(heads, alike) if self.would_stand_out(self.background(np.logical_or.reduce(near))) else ()
-
-    def would_stand_out(self, behind: Background) -> bool:
-        """Whether the best match would stand out of another background."""
-        decision = behind.decision(float(self.scores[0]))
-        return bool(stands_out(decision, self.calibration, behind.imagined, self.evidence))
+        return self.grouped(heads, alike) if self.stands_out_without(np.logical_or.reduce(near)) else ()
 
     def heads(self) -> Positions:
         """The best few of the other places, without neighbours of a better one; int64 [k]."""
@@ -399,7 +416,7 @@ class _Ranking:
         """Which of the rivals show what the best match shows; bool [k]."""
         if likeness is None or not len(heads):
             return np.zeros(len(heads), np.bool_)
-        calm, wanted = self.calm(), ALIKE * self.calibration.threshold
+        calm, wanted = self.background(self.best_few), ALIKE * self.calibration.threshold
         return np.array([calm.decision(float(score)) >= wanted for score in likeness(heads)], np.bool_)
 
     def grouped(self, heads: Positions, alike: NDArray[np.bool_]) -> tuple[Rivals, ...]:

@@ -38,7 +38,7 @@ from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
-from core.places import NO_POSE, Neighborhood, Whereabouts
+from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 from core.recognition.question import Verifier, Verify
 from core.recognition.stages import Candidates, CellComparison, examine
 from core.recognition.verification import verify_candidates
@@ -134,9 +134,10 @@ class ScoredTraverse:
         order = np.argsort(-self.first[query, retained], kind="stable")
         rows = retained[order]
         count = len(rows)
-        places = Whereabouts(
-            np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), sequence[order].astype(np.int32), rows
-        )
+        codes = sequence[order].astype(np.int32)
+        # Without a sequence, places of one number would be looks of one place.
+        numbers = np.where(codes == NO_SEQUENCE, order, rows)
+        places = Whereabouts(np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), codes, numbers)
 
         def gains(at: Positions) -> Array:
             return np.asarray(self.both[query, rows[at]] - self.first[query, rows[at]])
@@ -423,7 +424,7 @@ def fit_small_maps(
 def fit_geometry(
     calibration: Calibration, traverses: Sequence[tuple[str, ScoredTraverse]], repeats: int = 10
 ) -> GeometryTerms:
-    """The terms of evidence, by maximum likelihood with SUPPORT given.
+    """The terms of evidence where a lead says nothing, by maximum likelihood with SUPPORT given.
 
     Every query runs on maps of SMALL sizes and of 100, runs and drawn ones, and of halves of the references.  Each
     kind and size of map counts alike, and in it frames of known and of unknown places.

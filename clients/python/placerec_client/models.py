@@ -480,6 +480,7 @@ class GeometryTerms(Model):
 
     support: float
     slope: float
+    lead: float = 0.0
     intercept: float
 
 

@@ -89,11 +89,21 @@ def test_the_evidence_of_a_camera_joins_its_log_odds() -> None:
     before = fuse([plain], weighing, NEIGHBORHOOD)
     fits, fails = (fuse([verified(plain, {3: evidence})], weighing, NEIGHBORHOOD) for evidence in (300.0, 0.0))
     assert before.rows[0] == fits.rows[0] == 3
-    assert fits.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 300.0)))
-    assert fails.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 0.0)))
+    assert fits.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 300.0, 1.0)))
+    assert fails.log_odds[0] == pytest.approx(float(TERMS.log_odds(before.log_odds[0], 0.0, 1.0)))
     assert fits.judgement.verdict == "recognized" and fits.judgement.evidence == 300.0
     assert fails.judgement.verdict == "unknown" and before.judgement.evidence is None
     assert fits.scores[0] == pytest.approx(0.62)
+
+
+def test_the_lead_of_a_camera_counts_by_its_share_of_the_cameras() -> None:
+    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
+    one = verified(view({3: 0.32, **BACKGROUND}), {3: 40.0})
+    before = fuse([view({3: 0.32, **BACKGROUND})], weighing, NEIGHBORHOOD).log_odds[0]
+    alone, both = (fuse([one] * cameras, weighing, NEIGHBORHOOD).log_odds[0] for cameras in (1, 2))
+    assert alone == pytest.approx(float(TERMS.log_odds(before, 40.0, 1.0)))
+    each = float(TERMS.log_odds(before, 40.0, 0.5))
+    assert both == pytest.approx(2 * np.log((1 - BLIND) * np.exp(each) + BLIND))
 
 
 def test_geometry_settles_what_two_cameras_disagree_about() -> None:
@@ -109,8 +119,8 @@ def test_geometry_settles_what_two_cameras_disagree_about() -> None:
 def test_of_places_that_fit_one_has_to_be_four_times_as_likely() -> None:
     """Whatever shares the view fits: what stands a little farther is no reason for doubt, but a place as likely is."""
     weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
-    scores = {3: 0.5, 5: 0.48, **BACKGROUND}
-    for evidence, verdict in ((60.0, "recognized"), (280.0, "ambiguous")):
+    scores = {3: 0.5, 5: 0.499, **BACKGROUND}
+    for evidence, verdict in ((60.0, "recognized"), (298.0, "ambiguous")):
         cameras = [verified(view(scores), {3: 300.0, 5: evidence})] * 2
         found = fuse(cameras, weighing, NEIGHBORHOOD)
         assert found.rows.tolist()[:2] == [3, 5] and found.judgement.verdict == verdict
@@ -122,7 +132,7 @@ def test_a_place_that_a_verified_camera_left_out_has_no_evidence() -> None:
     one = view({3: 0.4, 5: 0.39, **BACKGROUND})
     found = fuse([verified(one, {3: 150.0})], weighing, NEIGHBORHOOD)
     assert found.rows.tolist()[:2] == [3, 5]
-    assert found.log_odds[1] < float(TERMS.log_odds(0.0, 0.0)) + 4
+    assert found.log_odds[1] < float(TERMS.log_odds(0.0, 0.0, 0.0)) + 4
 
 
 def test_what_each_takes_for_one_of_two_both_take_for_the_third() -> None:

@@ -8,10 +8,20 @@ from numpy.typing import NDArray
 
 from core.judgement.background import Environment
 from core.judgement.calibration import Target, fit_encoder_calibration, fit_map_calibration
-from core.judgement.geometry import AGREEMENT, INLIERS, SIMILARITY, TERMS, Geometry, final_gains, final_order
+from core.judgement.geometry import (
+    AGREEMENT,
+    INLIERS,
+    LEAD,
+    SIMILARITY,
+    TERMS,
+    Geometry,
+    GeometryTerms,
+    final_gains,
+    final_order,
+)
 from core.judgement.probability import Curve
 from core.judgement.trials import Trials
-from core.judgement.verdict import Calibration, Judgement, Rivals, judge, worth_verifying
+from core.judgement.verdict import Calibration, Judgement, Likeness, Rivals, judge, worth_verifying
 from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 
 WITHOUT = Calibration(
@@ -91,7 +101,7 @@ def test_a_map_of_one_place_believes_evidence() -> None:
     plain, fits, fails = judged(one), judged(one, 150.0), judged(one, 5.0)
     assert (plain.verdict, fits.verdict, fails.verdict) == ("unknown", "recognized", "unknown")
     assert plain.probability is not None and fits.probability is not None and fails.probability is not None
-    assert fails.probability < 0.1 < plain.probability < 0.6 < 0.8 < fits.probability
+    assert fails.probability < 0.1 < plain.probability < 0.6 < 0.7 < fits.probability
     assert fits.evidence == 150.0
 
 
@@ -118,6 +128,58 @@ def test_a_best_match_that_fits_needs_no_lead_in_score_over_rivals_that_do_not()
     assert verified.margin == pytest.approx(0.6 - 0.299, abs=1e-6), "by three stages"
 
 
+def led(lead: float, evidence: float, calibration: Calibration = CALIBRATION) -> Judgement:
+    """Two places of nearly one score in a full map; the first is ahead in the final order by some lead."""
+    scores = full(0.157, 0.156)
+    gain = np.zeros(len(scores))
+    gain[0] = lead - 0.001
+    both = np.where(np.arange(len(scores)) < 2, evidence, NOT)
+    return judge(scores, alone(len(scores)), calibration, NEARBY, geometry=Geometry(both, gain))
+
+
+@pytest.mark.parametrize("evidence", [5.0, 20.0, 80.0])
+def test_a_place_that_fits_better_than_all_others_is_believed_sooner(evidence: float) -> None:
+    """Places of one scene share keypoints: the same evidence means less if a rival has nearly as much."""
+    stated = [led(lead, evidence).probability or 0.0 for lead in (0.01, 0.02, 0.04, LEAD, 2 * LEAD)]
+    assert (np.diff(stated[:4]) > 0).all() and stated[4] == pytest.approx(stated[3])
+    odds = [np.log(one / (1 - one)) for one in stated]
+    assert odds[3] - odds[0] == pytest.approx(TERMS.lead * (1 - 0.01 / LEAD))
+
+
+def test_the_verdict_follows_the_probability_that_a_lead_leaves() -> None:
+    found = [led(lead, evidence) for lead in (0.005, 0.02, LEAD) for evidence in (2.0, 10.0, 20.0, 40.0, 200.0)]
+    assert {one.verdict for one in found} == {"recognized", "unknown"}
+    for one in found:
+        assert (one.verdict == "recognized") == ((one.probability or 0.0) >= 0.5)
+
+
+def test_where_other_places_are_imagined_there_is_none_to_lead() -> None:
+    """A map of one place believes its evidence as if a lead said nothing."""
+    one = np.array([0.2], np.float32)
+    without = CALIBRATION.model_copy(update={"geometry": TERMS.model_copy(update={"lead": 0.0})})
+    for evidence in (5.0, 50.0, 300.0):
+        assert judged(one, evidence).imagined == 1.0
+        assert judged(one, evidence).probability == judged(one, evidence, calibration=without).probability
+    unprepared = CALIBRATION.model_copy(update={"environment": None})  # imagines nothing
+    plain = unprepared.model_copy(update={"geometry": without.geometry})
+    found = judged(one, 3.0, calibration=unprepared)
+    assert (found.imagined, found.margin) == (0.0, None)
+    assert found.probability == judged(one, 3.0, calibration=plain).probability
+
+
+def test_a_rival_that_shows_the_same_place_explains_that_nothing_leads() -> None:
+    """Neighbours in a map that does not know that they are neighbours: the answer names them, and is not unknown."""
+    scores = full(0.157, 0.156)
+    geometry = found(len(scores), 20.0, 19.0)
+
+    def ask(likeness: Likeness | None) -> Judgement:
+        return judge(scores, alone(len(scores)), CALIBRATION, NEARBY, likeness=likeness, geometry=geometry)
+
+    assert ask(None).verdict == "unknown"
+    same = ask(lambda at: np.where(at == 1, 0.9, 0.1).astype(np.float32))
+    assert (same.verdict, same.rivals) == ("ambiguous", (Rivals((1,), True),))
+
+
 def test_another_order_leaves_the_background_the_same() -> None:
     """A place with a lower score may be first after verification; the others are compared by their scores."""
     scores = full(0.2, 0.21, 0.15)
@@ -140,7 +202,7 @@ def test_another_order_leaves_the_background_the_same() -> None:
         (np.array([], np.float32), (), False),
         (full(0.157), (300.0,), False),  # verified for the pose
         (full(0.157), (0.0,), False),
-        (full(0.157), (20.0,), True),
+        (full(0.157), (8.0,), True),
     ],
 )
 def test_auto_looks_where_doubt_is_left(scores: NDArray[np.float32], evidence: tuple[float, ...], worth: bool) -> None:
@@ -190,3 +252,5 @@ def test_calibrations_that_are_fitted_keep_the_terms() -> None:
 def test_old_calibrations_are_written_as_they_were_read() -> None:
     assert "geometry" not in WITHOUT.model_dump(mode="json")
     assert Calibration.model_validate(CALIBRATION.model_dump(mode="json")) == CALIBRATION
+    before_leads = {"support": 0.5, "slope": 1.463, "intercept": -4.954}
+    assert GeometryTerms.model_validate(before_leads).model_dump(mode="json") == before_leads
