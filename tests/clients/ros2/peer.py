@@ -51,6 +51,8 @@ TRANSITIONS = {
     "shutdown inactive": 6,
     "shutdown active": 7,
 }
+GOALS = {"configure": "inactive", "cleanup": "unconfigured", "activate": "active", "deactivate": "inactive"}
+"""The states to which transitions lead."""
 BAG_TYPES = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
     "CameraInfo": "sensor_msgs/msg/CameraInfo",
@@ -238,14 +240,20 @@ class Peer:
         request = ChangeState.Request()
         request.transition.id = TRANSITIONS[name]
         began = time.monotonic()
-        done = self._call(ChangeState, f"/{node}/change_state", request)
+        try:
+            done = self._call(ChangeState, f"/{node}/change_state", request, PATIENCE / 2)
+        except TimeoutError:  # the answer is lost if the node does not know its caller yet
+            told = self.state(node)
+            if told["state"] != GOALS.get(name) or told["seconds"] > PATIENCE / TRIES:
+                raise
+            return {"success": True, "seconds": told["seconds"]}
         return {"success": done.success, "seconds": time.monotonic() - began}
 
     def set(self, values: dict[str, Any]) -> dict[str, Any]:
         """Set parameters of the node; why each was refused, if so."""
         request = SetParameters.Request()
         request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        done = self._call(SetParameters, "/placerec/set_parameters", request)
+        done = self._call(SetParameters, "/placerec/set_parameters", request, tries=TRIES)
         return {"refused": [result.reason for result in done.results if not result.successful]}
 
     def get(self, names: list[str], node: str) -> dict[str, Any]:
