@@ -25,7 +25,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.geometry.leads import VerifiedAnswers, lead_figures
+from benchmarks.geometry.leads import lead_figures
 from benchmarks.geometry.tasks import PictureEncoder, Task, tasks
 from benchmarks.report import report
 from core.geometry.matching import GLANCED, count_matches, glance_at
@@ -34,6 +34,7 @@ from core.judgement import geometry
 from core.judgement.background import TOP_PLACES
 from core.judgement.curves import auc_pr, auc_roc
 from core.judgement.reliability import reliability
+from core.judgement.trials import Trial, Trials, gathered
 from core.judgement.verdict import Judgement, judge
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -231,26 +232,22 @@ def _spread(candidates: Candidates) -> float:
     return float(np.sqrt(np.average((where - np.average(where, weights=weights)) ** 2, weights=weights)))
 
 
-def doubts(asked: Asked) -> tuple[dict[str, float], VerifiedAnswers]:
+def doubts(asked: Asked) -> tuple[dict[str, float], Trials]:
     """The figures of one task, with halves of its references left out, and its answers."""
     measured: dict[str, list[float]] = {name: [] for name in MEASURES}
-    right: list[bool] = []
-    known: list[bool] = []
-    recognized: list[bool] = []
+    answers: list[Trial] = []
     by_auto: list[tuple[float, bool]] = []
-    judged: list[tuple[Judgement, bool]] = []
     for retained in asked.halves():
         for query in asked.queries:
             candidates, judgement = asked.judged(query, retained)
             for name, measure in MEASURES.items():
                 measured[name].append(measure(candidates, judgement, asked.neighborhood))
-            right.append(bool(asked.task.truth[query, candidates.rows[0]]))
-            known.append(bool(asked.task.truth[query, retained].any()))
-            recognized.append(judgement.verdict == "recognized")
-            judged.append((judgement, right[-1]))
+            known, right = asked.task.truth[query, retained].any(), asked.task.truth[query, candidates.rows[0]]
+            answers.append(Trial(judgement, bool(known), bool(right), query))
             automatic, doubted = asked.judged(query, retained, "auto")
             by_auto.append((doubted.probability or 0.0, bool(asked.task.truth[query, automatic.rows[0]])))
-    hits, there, believed = (np.array(flags, np.bool_) for flags in (right, known, recognized))
+    trials = gathered(answers)
+    hits, there, believed = trials.right, trials.known, trials.recognized(asked.encoder.calibration)
     areas = {name: auc_pr(np.array(values), hits) for name, values in measured.items()}
     probability = np.array(measured["probability"])
     stated, found = (np.array(column) for column in zip(*by_auto, strict=True))
@@ -262,7 +259,7 @@ def doubts(asked: Asked) -> tuple[dict[str, float], VerifiedAnswers]:
         "right that are recognized": float(believed[hits].mean()) if hits.any() else 0.0,
         "strangers recognized": float(believed[~there].mean()) if (~there).any() else 0.0,
     }
-    return figures, VerifiedAnswers.of(judged, asked.encoder.calibration)
+    return figures, trials
 
 
 def main(
@@ -275,7 +272,7 @@ def main(
     found: list[tuple[Task, list[Ranked]]] = []
     orders: dict[str, dict[str, float]] = {}
     doubt: dict[str, dict[str, float]] = {}
-    answered: dict[str, list[VerifiedAnswers]] = {}
+    answered: dict[str, list[Trials]] = {}
     for number, task in enumerate(tasks(PictureEncoder(chosen), datasets)):
         asked = Asked(chosen, task)
         known = [query for query in asked.queries if task.truth[query].any()]
@@ -293,14 +290,15 @@ def main(
         orders[name]["candidates verified"] = float(
             np.mean([sum(one is not None for one in final.verifications) for final in finals])
         )
-        doubt[name], answers_of_halves = doubts(asked)
+        doubt[name], trials = doubts(asked)
         if task.fitted:
-            answered.setdefault(task.kind, []).append(answers_of_halves)
+            answered.setdefault(task.kind, []).append(trials)
         print(name, {key: round(value, 3) for key, value in (orders[name] | doubt[name]).items()}, flush=True)
+    leads = lead_figures(answered, chosen.calibration)
     for label, title, figures in (
         ("geometry_verification", "recall@1, and how many candidates are verified", orders),
         ("geometry_doubt", "is the best match right? area under precision and recall; the probability", doubt),
-        ("geometry_leads", "how much a lead says, fitted to kinds of tasks, enough from", lead_figures(answered)),
+        ("geometry_leads", "how much a lead says, fitted to kinds of tasks, enough from", leads),
     ):
         columns = list(next(iter(figures.values())))
         rows = [(name, *(f"{values[column]:.3f}" for column in columns)) for name, values in figures.items()]

@@ -178,8 +178,7 @@ def _camera_log_odds(
         behind = calibration.background(rest, places - int(same.sum()), apart)
         found[place] = log_odds(behind.decision(best), calibration, behind.imagined)
         if calibration.geometry is not None and not np.isnan(evidence[same]).any():
-            ahead = float(values[same].max())
-            lead = ahead - values[~same].max(initial=-np.inf) if np.isfinite(ahead) else 0.0
+            lead = values[same].max() - values[~same].max(initial=-np.inf)
             leads = share_of_lead(lead, behind.imagined) / cameras
             found[place] = calibration.geometry.log_odds(found[place], evidence[same].max(), leads)
     return found

@@ -111,7 +111,8 @@ def share_of_lead(margin: ArrayLike, imagined: ArrayLike = 0.0) -> Values:
     """The part that leads over rivals have of what a lead can say, float64 of any shape, in [0, 1].
 
     Args:
-        margin: the leads in the final order; infinite without a rival, where there is none to lead.
+        margin: the leads in the final order; infinite without a rival, where there is none to lead, and minus infinity
+            of a place that is not listed.
         imagined: the shares of other places that were imagined, for the map does not have them either.
     """
     leads = np.asarray(margin, np.float64)

@@ -299,15 +299,14 @@ def judge(
     behind = ranking.background()
     decision = behind.decision(best)
     leads = ranking.leads(others)
-    rival = int(others[leads.argmin()]) if len(others) else None
-    margin = None if rival is None else float(leads.min())
-    lead = np.inf if margin is None else margin
+    rival, lead = int(others[leads.argmin()]) if len(others) else None, float(leads.min(initial=np.inf))
+    margin = None if rival is None else lead
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
     if not stands_out(decision, lead, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
-    elif margin is not None and margin < calibration.margin:
+    elif lead < calibration.margin:
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
