@@ -61,7 +61,7 @@ MOST_RIVALS = 8
 MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
 
-DOUBT = (0.02, 0.5)
+DOUBT = (0.02, 0.65)
 """Between these probabilities an answer is in doubt, or up to that of the threshold, if that is stricter.  On tasks of
 training photographs ``auto`` has 0.007 less recall@1 than ``always``; with 0.1 to 0.5 it had 0.027 less.  Of the frames
 of corridor and lip6, queried in the whole other traverse, two stages leave 0.06 and 0.25 there.  Up to 0.7 it would be
