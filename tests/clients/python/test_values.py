@@ -77,6 +77,7 @@ def refusing() -> Iterator[tuple[str, Seen]]:
         (lambda one: one.maps["m"].query(FRAME, request_id=b"x"), InvalidParameter, "request_id .* bytes"),
         (lambda one: one.maps["m"].explanation(None), InvalidParameter, "explanation .* NoneType"),
         (lambda one: one.query({None: FRAME}), InvalidParameter, "name of a frame .* NoneType"),
+        (lambda one: one.maps["m"].calibrate("frames", frames=[FRAME]), InvalidParameter, "map the files .* list"),
         (lambda one: one.maps["m"].query("a\0b"), InvalidFrame, "cannot be read"),
         (lambda one: one.maps["m"].enrol([FRAME], known=()), InvalidParameter, "has to be a NewPlace, not a bytes"),
         (lambda one: one.maps["m"].enrol_by_job([NewPlace("..", FRAME)]), InvalidName, r"'\.\.' is no name"),

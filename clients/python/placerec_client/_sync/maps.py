@@ -20,6 +20,7 @@ from placerec_client._sync.sessions import Sessions
 from placerec_client._sync.transfers import Progress, export, upload
 from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
+from placerec_client.errors import InvalidParameter
 from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.renamed import OldNames, Subscripted
@@ -450,6 +451,8 @@ class Map:
         sent: dict[str, Any] = {"headers": _condition(if_match), "deadline": deadline}
         if frames is None:
             sent["json"] = order
+        elif not isinstance(frames, Mapping):
+            raise InvalidParameter(f"frames has to map the files of labels to frames; it is a {type(frames).__name__}.")
         else:
             read = {name: frame_bytes(frame) for name, frame in frames.items()}
             parts = [Part("calibration", dumps(order).encode(), "application/json", is_file=False)]
