@@ -50,7 +50,7 @@ LONGEST = 200
 """Letters of a text in an answer that is recorded whole."""
 
 SECONDS = 60.0
-"""In which a job is to reach the state that it had."""
+"""In which a job is to reach the state that it had, and frames are to be stored."""
 
 
 @dataclass
@@ -73,6 +73,14 @@ class Exchange:
     def waits(self) -> bool:
         """Whether it asks how far a job is."""
         return self.method == "GET" and self.target.startswith("/v1/jobs/") and "events" not in self.target
+
+    def is_over(self, answer: Any) -> bool:
+        """Whether what goes on behind answers is as far as it was: the job, or the frames stored for review."""
+        if self.waits():
+            return answer["state"] in (self.answer["state"], "failed", "cancelled")
+        if self.method == "GET" and self.target.partition("?")[0].endswith("/review"):
+            return [one["id"] for one in answer["items"]] == [one["id"] for one in self.answer["items"]]
+        return True
 
 
 class Recorder(httpx.HTTPTransport):
@@ -162,9 +170,7 @@ class Replay:
         until = time.monotonic() + SECONDS
         while True:
             found = self._send(one)
-            if not one.waits() or found.status != 200 or time.monotonic() > until:
-                return found
-            if found.answer["state"] == one.answer["state"] or found.answer["state"] in ("failed", "cancelled"):
+            if found.status != 200 or one.is_over(found.answer) or time.monotonic() > until:
                 return found
             time.sleep(0.02)
 

@@ -24,7 +24,7 @@ from tests.clients.python.fault_proxy import Fault, FaultProxy
 from tests.clients.python.moments import Moments
 from tests.service.refusing import refusing_server
 from tests.service.scenes import jpeg
-from tests.service.server import Server, free_port
+from tests.service.server import Server, reserved
 
 Result = TypeVar("Result")
 
@@ -262,12 +262,13 @@ def test_whatever_goes_wrong_then_is_only_told(
 
 
 def test_the_service_is_gone(server: Server, lab: Map, caplog: pytest.LogCaptureFixture) -> None:
-    gone = f"http://127.0.0.1:{free_port()}"
-    with pytest.raises(KeyboardInterrupt), Client(gone) as client, client.maps[lab.id].sessions["of-before"]:
-        raise KeyboardInterrupt
-    assert "cannot be reached" in caplog.text
-    with Client(gone, retry=Retry(0)) as client, pytest.raises(ConnectionFailed):
-        client.maps[lab.id].sessions["of-before"].delete()  # who asks for it is told
+    with reserved() as held:
+        gone = f"http://127.0.0.1:{held.getsockname()[1]}"
+        with pytest.raises(KeyboardInterrupt), Client(gone) as client, client.maps[lab.id].sessions["of-before"]:
+            raise KeyboardInterrupt
+        assert "cannot be reached" in caplog.text
+        with Client(gone, retry=Retry(0)) as client, pytest.raises(ConnectionFailed):
+            client.maps[lab.id].sessions["of-before"].delete()  # who asks for it is told
 
 
 NAME = "robot.invalid"

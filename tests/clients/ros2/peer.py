@@ -51,7 +51,15 @@ TRANSITIONS = {
     "shutdown inactive": 6,
     "shutdown active": 7,
 }
-GOALS = {"configure": "inactive", "cleanup": "unconfigured", "activate": "active", "deactivate": "inactive"}
+GOALS = {
+    "configure": "inactive",
+    "cleanup": "unconfigured",
+    "activate": "active",
+    "deactivate": "inactive",
+    "shutdown unconfigured": "finalized",
+    "shutdown inactive": "finalized",
+    "shutdown active": "finalized",
+}
 """The states to which transitions lead."""
 BAG_TYPES = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
@@ -74,6 +82,11 @@ class Peer:
         self._subscriptions: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
         self._playing: threading.Thread | None = None
+        # Made long before they are called: these are called once, and the answer is lost if the node does not know its
+        # caller yet.
+        for service in ("create_map", "enrol_here", "relocalize"):
+            self._client(Trigger, f"/placerec/{service}")
+        self._client(SetBool, "/placerec/enrol_keyframes")
 
     def note(self, topic: str, entry: dict[str, Any]) -> None:
         with self._lock:
@@ -274,10 +287,13 @@ class Peer:
         done = self._call(GetState, f"/{node}/get_state", GetState.Request(), tries=TRIES)
         return {"state": done.current_state.label, "seconds": time.monotonic() - began}
 
-    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE, tries: int = 1) -> Any:
+    def _client(self, kind: Any, name: str) -> Any:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-        client = self._clients[name]
+        return self._clients[name]
+
+    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE, tries: int = 1) -> Any:
+        client = self._client(kind, name)
         if not client.wait_for_service(patience):
             raise TimeoutError(f"no service {name}")
         for _ in range(tries):

@@ -7,8 +7,6 @@ import threading
 import time
 from contextlib import suppress
 
-from tests.service.server import free_port
-
 
 class Door:
     """Forwards connections to a port while it is open.
@@ -21,10 +19,11 @@ class Door:
     """
 
     def __init__(self, target: int) -> None:
-        self.port, self._target, self.delay = free_port(), target, 0.0
+        self._target, self.delay = target, 0.0
         self._open = threading.Event()
         self._open.set()
-        self._listener = socket.create_server(("127.0.0.1", self.port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listener.getsockname()[1])
         self._ended = False
         threading.Thread(target=self._accept, daemon=True).start()
 

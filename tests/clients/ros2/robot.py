@@ -327,9 +327,14 @@ class Robot:
         return done
 
     def asked(self, number: int) -> dict[str, Any]:
-        """Publish a frame of the walk, and wait for its answer."""
-        self.look(number=number)
-        return self.answers()[0]
+        """Publish a frame of the walk, and wait for its answer; answers to frames before it are passed over."""
+        stamp = self.look(number=number)
+
+        def answered() -> dict[str, Any] | None:
+            return next((one for one in self.peer.take("answer") if abs(one["stamp"] - stamp) < 1e-3), None)
+
+        found: dict[str, Any] = until(answered)
+        return found
 
     def drive(self, start: int, stop: int) -> dict[str, Any]:
         """Let the robot see frames of the walk, one after the other; the last answer."""

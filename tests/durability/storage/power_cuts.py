@@ -21,12 +21,12 @@ ATTACHING_SECONDS = 30.0
 def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
     """Attach a tracer to a waiting process, then let the process go on."""
     with log.open("ab") as told:
+        before = told.tell()
         tracing = subprocess.Popen([*tracer, "-p", str(process.number)], stderr=told)
     until = time.monotonic() + ATTACHING_SECONDS
-    while "TracerPid:\t0\n" in Path(f"/proc/{process.number}/status").read_text():
+    while b" attached" not in log.read_bytes()[before:]:  # it has stopped then, and goes on when the tracer lets it
         assert tracing.poll() is None and time.monotonic() < until, log.read_text()[-2000:]
         time.sleep(0.002)
-    time.sleep(0.02)  # it has stopped by now, and goes on when the tracer lets it
     process.connections[0].begin()
     return tracing
 

@@ -106,9 +106,11 @@ def test_closing_waits_for_reads_under_way_and_refuses_others(database: Database
     threads[0].start()
     assert entered.wait(10)
     threads[1].start()
+    with pytest.raises(DatabaseClosed):
+        while True:  # until the other thread has begun to close it
+            with database.reading():
+                pass
     assert not closed.wait(0.1)
-    with pytest.raises(DatabaseClosed), database.reading():
-        pass
     leave.set()
     for thread in threads:
         thread.join(10)
