@@ -16,7 +16,7 @@ export function ExportMap({ map, close }) {
 /** Save every map; the browser may ask once whether the page may save several files. */
 export function ExportAll({ maps, close }) {
   return html`
-    <${Export} maps=${maps} title="Export all maps" button="Export all" saved=${`${integer(maps.length)} maps were saved.`} close=${close}
+    <${Export} maps=${maps} title="Export all maps" button="Export all" saved=${`${integer(maps.length)} maps were given to the browser. If it asks, let it save several files.`} close=${close}
       about=${(number) => `${maps[number]}, ${integer(number + 1)} of ${integer(maps.length)}: `}>
       <p>One file each of ${integer(maps.length)} maps, one after the other. Keys, settings of the service and the audit trail are not in them.</p>
     <//>

@@ -123,7 +123,7 @@ function Drawing({ map, plan, query, changed }) {
             </div>
           `}
           ${may("enrol") && html`<button type="button" aria-pressed=${catching} onClick=${() => setCatching(!catching)}>Lasso</button>`}
-          <${Find} plan=${plan} choose=${(number) => { choose(number); drawing.current.centre(number); }} />
+          <${Find} plan=${plan} choose=${(number) => { choose(number); drawing.current?.centre(number); }} />
         </div>
       </div>
       <div class="stack">

@@ -28,6 +28,9 @@ OUT_OF_PANEL = """[...document.querySelectorAll("main .panel")].flatMap((panel) 
 })"""
 """What a panel does not hold: parts that are wider than it, and not scrolled."""
 
+EFFECTS = "() => new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
+"""Lets the effects of what is drawn take place, by which a view listens, draws its canvases and reads more."""
+
 SIZES = {"phone": (390, 844), "laptop": (1280, 800), "wall": (3840, 2160)}
 
 
@@ -57,10 +60,15 @@ class Operator:
         self.page.goto("about:blank")
 
     def settle(self, view: str | None = None) -> None:
-        """Wait until the view is there and nothing is being read."""
+        """Wait until the view is there, nothing is being read, and it hears the mouse and the keyboard."""
         path = "" if view is None else f"[data-view='{view.partition('?')[0]}']"
         self.page.locator(f"main .view{path} h1").wait_for()
-        expect(self.page.locator("main .loading")).to_have_count(0)
+        loading = self.page.locator("main .loading")
+        while True:
+            expect(loading).to_have_count(0)
+            self.page.evaluate(EFFECTS)
+            if loading.count() == 0:  # what has come may have led to something else being read
+                return
 
     def manage(self, map_id: str, action: str) -> None:
         """Choose an action, such as ``Edit``, from the menu of a map in the list."""
@@ -161,10 +169,15 @@ def visit(browser: Browser, desk: BrowserContext, keyed: Server, keys: dict[str,
     made: list[Operator] = []
 
     def open_page(
-        role: str | None = "admin", *, server: Server = keyed, size: str = "laptop", theme: Theme = "light"
+        role: str | None = "admin",
+        *,
+        server: Server = keyed,
+        size: str = "laptop",
+        theme: Theme = "light",
+        alone: bool = False,
     ) -> Operator:
         context = desk
-        if made:  # somebody else, at another machine
+        if made or alone:  # somebody else, at another machine, or one whose clock is set: it is that of a context
             context = new_context(browser)
             contexts.append(context)
         page = context.new_page()
@@ -179,7 +192,7 @@ def visit(browser: Browser, desk: BrowserContext, keyed: Server, keys: dict[str,
         return operator
 
     yield open_page
-    for operator in made[:1]:
+    for operator in (one for one in made if one.page.context == desk):
         desk.set_offline(False)
         forget = {"origin": operator.root, "storageTypes": "local_storage"}
         desk.new_cdp_session(operator.page).send("Storage.clearDataForOrigin", forget)

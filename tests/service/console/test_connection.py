@@ -26,6 +26,7 @@ class Cable:
     def __init__(self, port: int) -> None:
         self._service, self._whole = port, True
         self._open: list[socket.socket] = []
+        self._cutting = threading.Lock()
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listening.getsockname()[1])
         threading.Thread(target=self._accept, daemon=True).start()
@@ -34,11 +35,12 @@ class Cable:
         with suppress(OSError):
             while True:
                 near, _ = self._listening.accept()
-                if not self._whole:
-                    near.close()
-                    continue
-                far = socket.create_connection(("127.0.0.1", self._service))
-                self._open += [near, far]
+                with self._cutting:  # so that none is opened while it is cut
+                    if not self._whole:
+                        near.close()
+                        continue
+                    far = socket.create_connection(("127.0.0.1", self._service))
+                    self._open += [near, far]
                 for ends in ((near, far), (far, near)):
                     threading.Thread(target=self._pass, args=ends, daemon=True).start()
 
@@ -51,10 +53,11 @@ class Cable:
 
     def cut(self) -> None:
         """Break off what is open."""
-        self._whole = False
-        while self._open:
-            with suppress(OSError):
-                self._open.pop().shutdown(socket.SHUT_RDWR)
+        with self._cutting:
+            self._whole = False
+            while self._open:
+                with suppress(OSError):
+                    self._open.pop().shutdown(socket.SHUT_RDWR)
 
     def mend(self) -> None:
         """Let connections be opened again."""
@@ -161,7 +164,7 @@ def test_live_answers_go_on_after_the_last_one_that_was_heard(
 @pytest.mark.thorough
 def test_a_service_that_hangs_is_noticed_within_ten_seconds(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
-    operator = visit(None, server=server)
+    operator = visit(None, server=server, alone=True)
     operator.page.add_init_script(given_key(key))
     operator.foresee("429")
     page = operator.page

@@ -242,6 +242,7 @@ def test_metadata_that_is_no_json_is_refused_before_it_is_sent(admin: Operator, 
 @pytest.mark.thorough
 def test_one_place_is_deleted_by_its_name(admin: Operator, keyed: Server, spare: str) -> None:
     page = admin.go(f"maps/{spare}/places/p2")
+    admin.foresee(f"{spare}/places/p2/")  # its pictures may still be on their way
     page.get_by_role("button", name="Delete").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("p2")
     page.get_by_role("button", name="Delete the place").click()
@@ -254,6 +255,7 @@ def test_one_place_is_deleted_by_its_name(admin: Operator, keyed: Server, spare:
 def test_many_places_are_deleted_together(visit: Visit, keyed: Server, spare: str, way: str) -> None:
     operator = visit("enrol")
     page = operator.go(f"maps/{spare}/places")
+    expect(page.locator(".picture.waiting")).to_have_count(0)
     if way == "chosen":
         page.get_by_label("Choose p1").check()
         page.get_by_label("Choose p3").check()

@@ -68,6 +68,7 @@ def test_the_grid_coordinates_and_the_picture_of_what_is_pointed_at(admin: Opera
     page = admin.go(f"maps/{LAB}/plan")
     page.get_by_role("img", name="x to the right, y up").wait_for()
     canvas = page.get_by_role("img", name=re.compile("Plan of lab"))
+    assert eventually(lambda: thickness(page) > 0), "before it is drawn, no point of it lies anywhere"
     box = canvas.bounding_box()
     assert box is not None
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -88,6 +89,7 @@ def test_places_are_caught_with_a_lasso_compared_and_deleted(visit: Visit, keyed
     operator = visit("enrol")
     page = operator.go("maps/lassoed/plan")
     canvas = page.get_by_role("img", name=re.compile("Plan of lassoed"))
+    assert eventually(lambda: thickness(page) > 0), "what is not drawn is not caught"
     box = canvas.bounding_box()
     assert box is not None
     page.get_by_role("button", name="Lasso").click()
@@ -102,6 +104,7 @@ def test_places_are_caught_with_a_lasso_compared_and_deleted(visit: Visit, keyed
     wanted = {place for place, told in places.items() if told["pose"]["x"] < -1}
     expect(caught.get_by_role("heading")).to_have_text(re.compile(rf"{len(wanted)}|{len(wanted) + 2} places"))
     expect(caught.get_by_role("link", name=re.compile("Compare"))).to_have_text("Compare tuesday with monday")
+    operator.foresee("lassoed/places/")  # pictures of what is deleted may still be on their way
     caught.get_by_role("button", name="Delete …").click()
     dialog = page.get_by_role("dialog")
     assert keyed.places("lassoed").keys() == places.keys(), "it asks first"

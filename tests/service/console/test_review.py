@@ -305,7 +305,7 @@ def test_a_label_that_is_taken_back_leaves_the_list_of_labels(admin: Operator, k
     expect(panel).to_contain_text("Added to the looks of")
     undo.click()
     expect(panel).not_to_contain_text("Added to the looks of")
-    assert keyed.client.get(f"/v1/maps/{doubtful}/looks").json()["items"] == []
+    assert eventually(lambda: keyed.client.get(f"/v1/maps/{doubtful}/looks").json()["items"] == [])
 
 
 def test_an_admin_says_what_runs_teach(admin: Operator, keyed: Server) -> None:

@@ -228,17 +228,20 @@ def test_a_listener_that_comes_again_goes_on_where_it_was(quick: Server, lab: st
         assert ear.some(2)[1].name == "query"
 
 
+def wait_for_no_listeners(server: Server) -> None:
+    """Listeners that hung up are forgotten, a moment after."""
+    wait_until(lambda: "placerec_event_listeners 0.0" in server.client.get("/metrics").text)
+
+
 def test_listeners_are_bounded(quick: Server, lab: str) -> None:
+    wait_for_no_listeners(quick)  # those of the tests before
     with listening(quick, lab), listening(quick, lab), listening(quick, lab), listening(quick, lab):
         refused = quick.client.get(f"/v1/maps/{lab}/events")
         assert_problem(refused, 503, "too-many-listeners")
         assert int(refused.headers["retry-after"]) > 0
         metrics = quick.client.get("/metrics").text
         assert "placerec_event_listeners 4.0" in metrics
-    until = time.monotonic() + 30
-    while "placerec_event_listeners 0.0" not in quick.client.get("/metrics").text:
-        assert time.monotonic() < until, "listeners that hung up are forgotten"
-        time.sleep(0.05)
+    wait_for_no_listeners(quick)
 
 
 def test_pictures_are_small_and_only_of_maps_that_keep_pictures(quick: Server, lab: str) -> None:

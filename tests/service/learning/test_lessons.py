@@ -19,6 +19,7 @@ from tests.service.commands.conftest import Placerec, placerec
 from tests.service.map_jobs import finished
 from tests.service.scenes import encoded
 from tests.service.server import Server, typed
+from tests.service.wire import eventually
 
 CORRIDOR = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
 DARK = range(25, 40)
@@ -187,11 +188,13 @@ def test_only_robots_whose_keys_say_so_teach(tmp_path: Path) -> None:
     server = Server(tmp_path, {}).wait()
     taught(server, "hall", "propose")
     keys = Keys.of(server.data_dir)
-    _, admin = keys.create("admin", "admin")
     _, query = keys.create("robot", "query")
     _, enrol = keys.create("mapper", "enrol")
     _, teacher = keys.create("teacher", "enrol", learn=True)
+    _, admin = keys.create("admin", "admin")
     server.client.headers["Authorization"] = f"Bearer {admin}"
+    # The service looks at their file now and then; until then everybody teaches, and who knows the last one knows all.
+    assert eventually(lambda: server.client.get("/v1/key").json().get("name") == "admin", every=1)
     few = frames_of("query")[:10]
     for key in (query, enrol):
         drive(server, "hall", key=key, frames=few)

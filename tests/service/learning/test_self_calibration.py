@@ -11,8 +11,9 @@ import pytest
 from service.access.keys import Keys
 from tests.service.commands.conftest import Placerec, placerec
 from tests.service.learning.test_lessons import CORRIDOR, SAME, drive, frames_of, lessons, taught
-from tests.service.map_jobs import finished, wait_until
+from tests.service.map_jobs import finished
 from tests.service.server import Server, assert_problem
+from tests.service.wire import eventually
 
 __all__ = ["placerec"]
 
@@ -27,8 +28,8 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, li
     """A server, and two keys that teach."""
     server = Server(tmp_path_factory.mktemp("weighing"), {}).wait()
     keys = Keys.of(server.data_dir)
-    _, operator = keys.create("operator", "admin")
     made = [keys.create(name, "enrol", learn=True)[1] for name in ("robot-1", "robot-2")]
+    _, operator = keys.create("operator", "admin")  # the last one: who knows it knows all
     server.client.headers["Authorization"] = f"Bearer {operator}"
     until_known(server, "operator")
     yield server, made
@@ -37,7 +38,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, li
 
 def until_known(server: Server, name: str) -> None:
     """Wait until the service asks for keys."""
-    wait_until(lambda: server.client.get("/v1/key").json().get("name") == name)
+    assert eventually(lambda: server.client.get("/v1/key").json().get("name") == name, every=1)
 
 
 def calibration(server: Server, map_id: str) -> dict[str, Any]:
