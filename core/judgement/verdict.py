@@ -63,10 +63,10 @@ MOSTLY_IMAGINED = 0.5
 
 DOUBT = (0.02, 0.65)
 """Between these probabilities an answer is in doubt, or up to that of the threshold, if that is stricter.  On tasks of
-training photographs ``auto`` has 0.007 less recall@1 than ``always``; with 0.1 to 0.5 it had 0.027 less.  The upper end
-was chosen on corridor and lip6, of whose frames, queried in the whole other traverse, two stages leave 0.16 and 0.28
-there.  Up to 0.5 it was 0.06 and 0.25, but the AUC-ROC in halved maps of corridor 0.977 in place of 0.980 (``always``
-has 0.985); up to 0.7 it would be 0.23 and 0.29, and 0.984."""
+training photographs ``auto`` has 0.003 less recall@1 than ``always``; up to 0.5 it had 0.007 less, with 0.1 to 0.5 it
+had 0.027 less.  The upper end was chosen on corridor and lip6, of whose frames, queried in the whole other traverse,
+two stages leave 0.16 and 0.28 there.  Up to 0.5 it was 0.06 and 0.25, but the AUC-ROC in halved maps of corridor 0.977
+in place of 0.980 (``always`` has 0.985); up to 0.7 it would be 0.23 and 0.29, and 0.984."""
 
 
 class Calibration(BaseModel):
