@@ -105,13 +105,13 @@ def run(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
 @pytest.mark.thorough
 def test_who_reads_slowly_and_steadily_gets_all_and_who_stops_is_cut_off(run: Callable[[Any], Any]) -> None:
     async def slow() -> None:
-        async with serving(write_timeout=0.5) as (connections, dial):
+        async with serving(write_timeout=2) as (connections, dial):
             kept, closed, stops = await dial(), await dial(), await dial()
             await kept.send(get("/large"))
             await closed.send(get("/large", CLOSE))
             await stops.send(get("/large", CLOSE))
-            # Longer than the write timeout, and than the time between two requests; all of it is written at once.
-            assert set(await asyncio.gather(kept.answer(0.07), closed.answer(0.07))) == {len(LARGE)}
+            # Longer than twice the write timeout, and than the time between two requests; all of it is written at once.
+            assert set(await asyncio.gather(kept.answer(0.2), closed.answer(0.2))) == {len(LARGE)}
             assert ended(connections, "write-timeout") == 1 and ended(connections, "idle") == 0
             assert await stops.answer() < len(LARGE) and await closed.read(1) == 0
             await kept.send(get("/small"))
