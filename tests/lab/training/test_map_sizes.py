@@ -11,7 +11,7 @@ from core.geometry.pairs import Pairs
 from core.judgement.background import Environment
 from core.judgement.geometry import TERMS
 from core.judgement.probability import Curve
-from core.judgement.verdict import Calibration
+from core.judgement.verdict import Calibration, worth_verifying
 from core.recognition.verification import CANDIDATES
 from lab.training.map_sizes import (
     APART,
@@ -159,9 +159,13 @@ def test_auto_verifies_where_two_stages_leave_doubt() -> None:
     one, calibration = verifiable(0.1, 0), CALIBRATION.model_copy(update={"geometry": TERMS})
     _, small = trials_of_size(one, 2, "run", calibration, 4, verify="auto")
     assert {found.verified for found in small} <= {1, 2}, "two stages know nothing of a map of two places"
-    whole = [one.judged(query, np.arange(COUNT), calibration, np.zeros(COUNT, np.int64), "auto") for query in range(20)]
-    assert any(found.verified == 0 for found in whole)
-    assert max(found.verified for found in whole) <= CANDIDATES
+    retained, sequence = np.arange(COUNT), np.zeros(COUNT, np.int64)
+    by_two, whole = (
+        [one.judged(query, retained, calibration, sequence, how) for query in range(COUNT)] for how in ("never", "auto")
+    )
+    verified = [found.verified for found in whole]
+    assert [count > 0 for count in verified] == [worth_verifying(found.judgement, calibration) for found in by_two]
+    assert min(verified) == 0 < max(verified) <= CANDIDATES
 
 
 @pytest.mark.thorough
