@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.server import ROOT, Server, reserved
+from tests.service.server import ROOT, Server, no_service
 
 
 def run(*words: object) -> subprocess.CompletedProcess[str]:
@@ -74,8 +74,8 @@ def test_it_stops_where_no_frame_will_be_answered(service: Server) -> None:
 
 @pytest.mark.thorough
 def test_it_goes_on_without_a_service(pictures: Path) -> None:
-    with reserved() as held:
-        words = ("--url", f"http://127.0.0.1:{held.getsockname()[1]}", "--map", "tour", "--deadline", 0.3)
+    with no_service() as gone:
+        words = ("--url", gone, "--map", "tour", "--deadline", 0.3)
         done = run("examples/robot.py", *words, "--frames", pictures / "places")
     assert done.returncode == 0, done.stderr
     assert [line.partition(": ")[2][:21] for line in done.stdout.splitlines()] == ["no answer in time: go"] * 3

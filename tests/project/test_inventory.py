@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.project.test_lock import locked, version
-from tests.service.server import reserved
+from tests.service.server import no_service
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "scripts/inventory.py"
@@ -105,9 +105,8 @@ def test_advisories_are_named_over_all_pages_and_change_the_status() -> None:
 
 
 def test_a_database_that_is_not_reached_is_said_to_be() -> None:
-    held = reserved()
-    done = run("advisories", "--source", f"http://127.0.0.1:{held.getsockname()[1]}")
-    held.close()
+    with no_service() as gone:
+        done = run("advisories", "--source", gone)
     assert (done.returncode, done.stdout) == (2, "")
     assert "NOT COMPARED" in done.stderr and "could not be asked" in done.stderr and "Nothing is known" in done.stderr
 

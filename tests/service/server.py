@@ -10,7 +10,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,13 @@ def reserved() -> socket.socket:
     held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     held.bind(("127.0.0.1", 0))
     return held
+
+
+@contextmanager
+def no_service() -> Iterator[str]:
+    """The URL of a port that is held and at which nobody listens."""
+    with reserved() as held:
+        yield f"http://127.0.0.1:{held.getsockname()[1]}"
 
 
 class Server:

@@ -24,7 +24,7 @@ from tests.clients.python.fault_proxy import Fault, FaultProxy
 from tests.clients.python.moments import Moments
 from tests.service.refusing import refusing_server
 from tests.service.scenes import jpeg
-from tests.service.server import Server, reserved
+from tests.service.server import Server, no_service
 
 Result = TypeVar("Result")
 
@@ -262,8 +262,7 @@ def test_whatever_goes_wrong_then_is_only_told(
 
 
 def test_the_service_is_gone(server: Server, lab: Map, caplog: pytest.LogCaptureFixture) -> None:
-    with reserved() as held:
-        gone = f"http://127.0.0.1:{held.getsockname()[1]}"
+    with no_service() as gone:
         with pytest.raises(KeyboardInterrupt), Client(gone) as client, client.maps[lab.id].sessions["of-before"]:
             raise KeyboardInterrupt
         assert "cannot be reached" in caplog.text

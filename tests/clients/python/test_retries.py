@@ -40,7 +40,7 @@ from placerec_client.requests import path_of
 from tests.clients.python.fault_proxy import Fault, FaultProxy
 from tests.clients.python.moments import Moments
 from tests.service.scenes import jpeg
-from tests.service.server import Server, reserved
+from tests.service.server import Server, no_service
 
 PROBLEM = {"content-type": "application/problem+json"}
 Handler = Callable[[httpx.Request], httpx.Response]
@@ -270,8 +270,8 @@ def test_the_service_gets_the_deadline(server: Server) -> None:
 def test_no_answer_before_the_deadline() -> None:
     began = time.monotonic()
     with (
-        reserved() as held,
-        Client(f"http://127.0.0.1:{held.getsockname()[1]}") as client,
+        no_service() as gone,
+        Client(gone) as client,
         pytest.raises(DeadlineExceeded, match=r"within 0\.3 s"),
     ):
         client.maps["lab"].query(b"frame", deadline=0.3)

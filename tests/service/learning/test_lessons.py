@@ -52,6 +52,11 @@ def by_night(number: int, data: bytes) -> bytes:
     return darkened(data, number) if number in DARK else data
 
 
+def until_known(server: Server, name: str) -> None:
+    """Wait until the service, which looks at the file of keys now and then, asks for keys and knows this one."""
+    assert eventually(lambda: server.client.get("/v1/key").json().get("name") == name, every=1)
+
+
 def taught(server: Server, map_id: str, mode: str) -> None:
     """Make a map of the first traverse, which learns in this way."""
     server.create_map(map_id, same_place_radius=SAME, learning={"mode": mode})
@@ -193,8 +198,7 @@ def test_only_robots_whose_keys_say_so_teach(tmp_path: Path) -> None:
     _, teacher = keys.create("teacher", "enrol", learn=True)
     _, admin = keys.create("admin", "admin")
     server.client.headers["Authorization"] = f"Bearer {admin}"
-    # The service looks at their file now and then; until then everybody teaches, and who knows the last one knows all.
-    assert eventually(lambda: server.client.get("/v1/key").json().get("name") == "admin", every=1)
+    until_known(server, "admin")  # before, everybody teaches; and who knows the last one knows all
     few = frames_of("query")[:10]
     for key in (query, enrol):
         drive(server, "hall", key=key, frames=few)

@@ -10,10 +10,9 @@ import pytest
 
 from service.access.keys import Keys
 from tests.service.commands.conftest import Placerec, placerec
-from tests.service.learning.test_lessons import CORRIDOR, SAME, drive, frames_of, lessons, taught
+from tests.service.learning.test_lessons import CORRIDOR, SAME, drive, frames_of, lessons, taught, until_known
 from tests.service.map_jobs import finished
 from tests.service.server import Server, assert_problem
-from tests.service.wire import eventually
 
 __all__ = ["placerec"]
 
@@ -34,11 +33,6 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, li
     until_known(server, "operator")
     yield server, made
     assert server.stop() == 0
-
-
-def until_known(server: Server, name: str) -> None:
-    """Wait until the service asks for keys."""
-    assert eventually(lambda: server.client.get("/v1/key").json().get("name") == name, every=1)
 
 
 def calibration(server: Server, map_id: str) -> dict[str, Any]:
