@@ -199,6 +199,13 @@ class DataDirectoryTooOld(PlacerecError):
     """The data was written before the first release of placerec, in a form that is not read."""
 
 
+# Runs
+
+
+class FrameOutOfOrder(PlacerecError):
+    """A run has already taken in this frame or a later one."""
+
+
 # Maps as files
 
 

@@ -28,6 +28,10 @@ START_UNKNOWN = 0.5
 JUMP = 0.005
 """Probability, at each look, that the robot was carried to any place."""
 
+CARRIED = 0.5
+"""The same at a look before which the robot's clock or counter has jumped: it may only have been set, or the robot may
+have been switched off and carried away, or a recording may be played again."""
+
 LEAVING = 0.08
 """Probability, at each look, that a robot that saw the map no longer does.
 
@@ -89,18 +93,19 @@ def uninformed(places: int) -> Belief:
     return Belief(np.full(places, 1 / places, np.float32), START_UNKNOWN, 1 / places)
 
 
-def predicted(belief: Belief, transition: Transition, share: float = 1.0) -> Belief:
+def predicted(belief: Belief, transition: Transition, share: float = 1.0, carried: float = JUMP) -> Belief:
     """The belief after a motion and before the frame (the sum in Rabiner's equation 20).
 
     Args:
         share: the part of a whole look that the frame counts as, from 0 to 1: what is rare is rarer between two frames
             that show nearly the same.
+        carried: the probability, at a whole look, that the robot was carried to any place.
     """
     n = len(belief.given)
     if not n:
         return belief
     moved, spread, gone = transition.forward(belief.given, ALIKE * belief.floor if n >= MANY else 0.0)
-    jump = share * JUMP
+    jump = share * carried
     anywhere = ((1 - jump) * (spread + gone) + jump) / n
     moved *= np.float32(1 - jump)
     moved += np.float32(anywhere)

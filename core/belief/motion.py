@@ -117,11 +117,13 @@ class Step:
     odometry: None if the robot reports none.
     reach: the metres that the robot can have moved, by its speed limit and the time between; None if not known.
     frames: by how much the run's frame number grew; 1 if every frame arrives.
+    known: whether it is known how long it took; not if the robot's clock or counter has jumped.
     """
 
     odometry: Odometry | None = None
     reach: float | None = None
     frames: int = 1
+    known: bool = True
 
 
 @dataclass

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from core.belief.estimate import Estimate, estimate
 from core.belief.evidence import NOTHING, Evidence, Sighting
 from core.belief.filter import (
+    CARRIED,
+    JUMP,
     Belief,
     Smoother,
     contradicted,
@@ -232,16 +234,17 @@ class Run:
         if not self.frames or stands:
             self._pending_reach = min(self._pending_reach + (step.reach or 0.0), self.graph.spacing)
             ahead = predicted(self.belief, moved, share) if self.frames else self.belief
-        elif self._by_speed(step) and step.frames <= FARTHEST_STEPS:
+        elif self._by_speed(step) and step.known and step.frames <= FARTHEST_STEPS:
             if self.options.lag:
                 kernel = mixture(self.belief.speeds.overall(self.belief.given), step.frames, self.constant)
                 everywhere = np.ones(len(self.graph), np.bool_)
                 moved = Transition(tuple(along_sequences(self.graph, kernel, everywhere)))
             ahead = predicted_by_speed(self.belief, self.graph, step.frames, self.constant, share)
         else:
-            moved = transition(self.graph, self._caught_up(step), self._stride(), self._pending)
+            stride = self._stride() if step.known else None
+            moved = transition(self.graph, self._caught_up(step), stride, self._pending)
             self._pending_reach = 0.0
-            ahead = predicted(self.belief, moved, share)
+            ahead = predicted(self.belief, moved, share, JUMP if step.known else CARRIED)
         if self.frames and share and self._by_speed(step):
             if change is not None:
                 ahead = contradicted(ahead, plausible(change, step.frames, self.constant))
@@ -250,6 +253,8 @@ class Run:
         else:
             self.belief = observed(ahead, seen, self.graph)
         if self.options.lag:
+            if not step.known:
+                self._smoother.clear()
             self._smoother.append(self.belief, moved, seen, share)
 
     def _by_speed(self, step: Step) -> bool:

@@ -166,10 +166,6 @@ class TooManySessions(Fault):
     """Too many sessions are open, or they hold too much memory."""
 
 
-class FrameOutOfOrder(Fault):
-    """The session has already taken in this frame or a later one."""
-
-
 class StreamTaken(Fault):
     """Another connection already streams into the session."""
 

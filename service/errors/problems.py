@@ -133,7 +133,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.UnknownSession: Kind(404, "unknown-session", "The session does not exist"),
     faults.SessionExpired: Kind(410, "session-expired", "The session has ended"),
     faults.TooManySessions: Kind(429, "too-many-sessions", "Too many sessions are open"),
-    faults.FrameOutOfOrder: Kind(409, "frame-out-of-order", "The frame is older than an earlier one of the session"),
+    errors.FrameOutOfOrder: Kind(409, "frame-out-of-order", "The frame is older than an earlier one of the session"),
     faults.SessionOfAnother: Kind(403, "session-of-another", "The session belongs to another key"),
     faults.StreamTaken: Kind(409, "stream-taken", "Another connection streams into the session"),
     # Storage

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, agreement, evidence_of, view_of
+from core.clocks import Interval, interval, is_ahead, time_text
+from core.errors import FrameOutOfOrder
 from core.judgement.change import WorldChange
 from core.learning import RunFrame
 from core.maps import Map
@@ -20,7 +22,7 @@ from service.access.audit import ASKER
 from service.access.roles import ANONYMOUS, Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
-from service.errors.faults import FrameOutOfOrder, InvalidRequest
+from service.errors.faults import InvalidRequest
 from service.events.schemas import SessionEvent
 from service.http.routing import rounded
 from service.learning.run_notes import NotedFrame, new_notes
@@ -75,7 +77,7 @@ async def process_frame(
         principal: who sends it.
 
     Raises:
-        FrameOutOfOrder: a later frame was processed already.
+        FrameOutOfOrder: a later frame was processed already; not if the robot's clock or counter was set meanwhile.
         InvalidRequest: the frame lacks a parameter that the session needs, or has one that it cannot use.
         WrongEncoder: the map is bound to another encoder than ``options.encoder``.
         UnknownSession, SessionExpired: the session ended while the frame waited.
@@ -88,25 +90,29 @@ async def process_frame(
         run = await in_thread(_found_run, sessions, map_, session)
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
+        since = _since_last(session, options)
         session.receive(ASKER.get())
         question = Question(options.k, session.selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
         asked = _question(session, options.k)
-        queried = QueriedFrame(session.options.camera, session.id, options.frame, asked, options.timestamp)
+        distrust = _distrust(options.timestamp)
+        taken = options.timestamp if distrust is None else None
+        queried = QueriedFrame(session.options.camera, session.id, options.frame, asked, taken)
         single = answer_of(map_, answered.frame, answered.answer, statistics.usual(map_))
         try:
             view = await in_thread(view_of, answered.frame.pixels, answered.frame.mask)
             while True:
                 try:
                     answer, seen = await in_thread(
-                        _advance, sessions, map_, session, run, answered.answer, view, single, options, request_id,
-                        began,
+                        _advance, sessions, map_, session, run, answered.answer, view, single, options, since, distrust,
+                        request_id, began,
                     )  # fmt: skip
                     break
                 except SessionMoved:  # the frame comes after the one that another service has processed
                     run = await in_thread(_found_run, sessions, map_, session)
                     if (repeated := _repeated(session, options, request_id)) is not None:
                         return repeated
+                    since = _since_last(session, options)
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
@@ -165,7 +171,7 @@ def _repeated(session: Session, options: FrameParameters, request_id: str | None
     """The stored answer if this frame is the last frame sent again, else None.
 
     Raises:
-        FrameOutOfOrder: the frame comes before the last one.
+        FrameOutOfOrder: it is, and its answer is gone.
     """
     number, last = options.frame, session.number
     again = number == last if number is not None and last is not None else False
@@ -173,13 +179,29 @@ def _repeated(session: Session, options: FrameParameters, request_id: str | None
         again = request_id == session.request
     if again:
         if session.answer is None:
-            raise FrameOutOfOrder("The frame was processed already; its answer is not stored any more.")
+            raise FrameOutOfOrder("The frame was processed already, and its answer is gone: go on with the next one.")
         return SessionAnswer.model_validate_json(session.answer).model_copy(update={"repeated": True})
-    if number is not None and last is not None and number < last:
-        raise FrameOutOfOrder(f"Frame {number} comes after frame {last}.")
-    if options.timestamp is not None and session.moment is not None and options.timestamp.timestamp() < session.moment:
-        raise FrameOutOfOrder("The frame was taken before the last frame that arrived.")
     return None
+
+
+def _since_last(session: Session, options: FrameParameters) -> Interval:
+    """The time since the last frame.
+
+    Raises:
+        FrameOutOfOrder: the frame comes before the last one.
+    """
+    return interval(session.stamp, options.stamp(), session.idle)
+
+
+def _distrust(taken: datetime | None) -> str | None:
+    """What is to be said of a frame's time that is no date, because it is far ahead of this machine's clock."""
+    now = time.time()
+    if taken is None or not is_ahead(taken.timestamp(), now):
+        return None
+    return (
+        f"The frame's time, {time_text(taken.timestamp())}, is more than a day ahead of the service's, "
+        f"{time_text(now)}: it counts within the run alone."
+    )
 
 
 def _advance(
@@ -191,20 +213,25 @@ def _advance(
     view: View,
     single: QueryAnswer,
     options: FrameParameters,
+    since: Interval,
+    distrust: str | None,
     request_id: str | None,
     began: float,
 ) -> tuple[SessionAnswer, Evidence]:
     """Update the belief, save the session, and answer; also with what the frame alone said."""
     started = time.perf_counter()
-    step, motion = _step(session, run, options)
+    step, motion = _step(session, run, options, since)
     seen = NOTHING if answered.blank else evidence_of(answered, neighborhood_of(map_))
     run.advance(seen, step, view, options.odometry_pose())
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
     lost = session.lost
-    if options.frame is not None and session.restored and lost is None and session.number is not None:
-        lost = options.frame - session.number - 1
+    counted = options.frame is not None and session.number is not None and not since.jumps
+    if counted and session.restored and lost is None:
+        lost = since.frames - 1
+    jumped = [*since.jumps, "So the motion since the last frame is not known."] if since.jumps else []
+    notes = [*jumped, *([] if distrust is None else [distrust])]
     answer = SessionAnswer(
         session=session.id,
         frame=options.frame,
@@ -219,6 +246,7 @@ def _advance(
             candidates=_believed(map_, earlier.candidates),
         ),
         motion=motion,
+        note=" ".join(notes) or None,
         view=run.sight,
         restored=session.restored,
         frames_lost=lost,
@@ -232,10 +260,11 @@ def _advance(
     session.answer, session.lost, session.frames = answer.model_dump_json(), lost, run.frames
     session.request = request_id
     session.touch()
-    if options.frame is not None:
-        session.number = options.frame
-    if options.timestamp is not None:
-        session.moment = options.timestamp.timestamp()
+    stamp = options.stamp()
+    if stamp.number is not None:
+        session.number = stamp.number
+    if stamp.moment is not None:
+        session.moment = stamp.moment
     answer.saved = sessions.save(session)
     answer.milliseconds |= rounded({"save": 1e3 * (time.perf_counter() - started) - believed})
     return answer, seen
@@ -272,7 +301,7 @@ def _note(
         seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None, options.odometry_pose(),
         run.sight,
     )  # fmt: skip
-    taken = options.timestamp or given.at
+    taken = given.frame.taken or given.at
     told = given.for_review(given.event(map_.record.id))
     if not notes.add(NotedFrame(frame, data, taken, told)):
         log.warning("session %s teaches its map nothing: the notes of runs have no room", session.id)
@@ -282,24 +311,20 @@ def _note(
         sessions.on_run(session, notes)
 
 
-def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, Motion]:
+def _step(session: Session, run: Run, options: FrameParameters, since: Interval) -> tuple[Step, Motion]:
     """The robot's motion since the last frame, and what it is known from."""
     if not run.frames:
         return Step(), "first"
-    frames = 1
-    if options.frame is not None and session.number is not None:
-        frames = options.frame - session.number
+    if since.jumps:
+        return Step(known=False), "sequence"
     odometry, pose, limit = options.odometry(), options.odometry_pose(), session.options.speed_limit
-    seconds = None
-    if options.timestamp is not None and session.moment is not None:
-        seconds = options.timestamp.timestamp() - session.moment
     if pose is not None:
-        odometry = run.moved_to(pose, seconds, limit)
-    reach = None if limit is None or seconds is None else limit * seconds
+        odometry = run.moved_to(pose, since.seconds, limit)
+    reach = None if limit is None or since.seconds is None else limit * since.seconds
     motion: Motion = "sequence"
     if run.graph.posed.any():
         motion = "odometry" if odometry is not None else "speed-limit" if reach is not None else motion
-    return Step(odometry, reach, frames), motion
+    return Step(odometry, reach, since.frames), motion
 
 
 def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]:

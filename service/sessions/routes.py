@@ -12,7 +12,6 @@ from core.maps.pagination import Listing, decode_name, page_of
 from service.access.roles import Principal, covers
 from service.errors.faults import (
     EncoderNotInstalled,
-    FrameOutOfOrder,
     QueueFull,
     SessionExpired,
     SessionOfAnother,
@@ -135,7 +134,7 @@ async def delete_session(
         errors.UnknownCamera,
         UnknownSession,
         errors.WrongEncoder,
-        FrameOutOfOrder,
+        errors.FrameOutOfOrder,
         errors.TooManyPixels,
         UnsupportedMediaType,
         errors.NotAnImage,

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from core.belief import Odometry, OdometryPose, RunOptions, Sight, Stride
+from core.clocks import Stamp
 from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
@@ -114,10 +115,13 @@ class FrameParameters(Parameters):
         ge=0,
         le=2**53,
         description="The robot's own number of the frame; numbers grow. A missing number is a frame that did not "
-        "arrive; the last number again is the same frame sent again, and gets the same answer.",
+        "arrive; the last number again is the same frame sent again, and gets the same answer. A smaller one is "
+        "refused, unless it is smaller by more than 1000, or the timestamp says that the robot counts anew.",
     )
     timestamp: Timestamp | None = Field(
-        default=None, description="When the frame was taken; never before the last one."
+        default=None,
+        description="When the frame was taken. One up to a second before the last one is refused; where it goes back "
+        "by more, or leaps ahead by more than a day, the robot's clock was set, and the run goes on by it.",
     )
     forward: float | None = Field(
         default=None,
@@ -200,6 +204,10 @@ class FrameParameters(Parameters):
             raise ValueError("the value is not nine numbers of a symmetric matrix without negative variances")
         return text
 
+    def stamp(self) -> Stamp:
+        """When the frame was taken, and its number."""
+        return Stamp(None if self.timestamp is None else self.timestamp.timestamp(), self.frame)
+
     def odometry(self) -> Odometry | None:
         """The odometry of the frame; None if it has none."""
         if self.forward is None:
@@ -281,6 +289,7 @@ class SessionAnswer(BeliefView):
                     "change": {"verdict": "changed", "known": 0.12, "changed": 0.87, "new": 0.01},
                     "earlier": None,
                     "motion": "odometry",
+                    "note": None,
                     "view": None,
                     "repeated": False,
                     "restored": False,
@@ -303,6 +312,12 @@ class SessionAnswer(BeliefView):
     )
     earlier: EarlierBelief | None = Field(description="With a lag, once there are enough frames.")
     motion: Motion = Field(description="How the robot's motion since the last frame was known.")
+    note: str | None = Field(
+        default=None,
+        description="That the robot's clock or its counter of frames has jumped, so that the motion is not known and "
+        "the belief is wide; or that the frame's timestamp is more than a day ahead of the service's clock, so that it "
+        "counts within the run alone. In words; null where time goes on as it should.",
+    )
     view: Sight | None = Field(
         default=None,
         description="Why the frame does not count. covered: it shows hardly anything, as behind a covered lens. "

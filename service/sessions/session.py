@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from core.belief import Run, to_bytes
+from core.clocks import Stamp
 from core.maps import Map
 from core.maps.selection import Conditions, Selection
 from service.access.audit import Asker
@@ -141,6 +142,11 @@ class Session:
     def key(self) -> str | None:
         """The name of the key that began the session; None without one."""
         return key_of(self.begun_by)
+
+    @property
+    def stamp(self) -> Stamp:
+        """What the last frame, or those before it, said of when it was taken."""
+        return Stamp(self.moment, self.number)
 
     @property
     def idle(self) -> float:

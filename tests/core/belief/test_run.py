@@ -87,6 +87,25 @@ def test_a_blocked_view_does_not_lose_the_place() -> None:
     assert told.verdict == "recognized" and abs(told.candidates[0].row - 138) <= 3
 
 
+@pytest.mark.parametrize("stride", [None, Stride()])
+def test_a_clock_that_jumps_leaves_a_wide_belief(stride: Stride | None) -> None:
+    """The robot may go on where it was, for its clock was set, or be anywhere, for a recording is played again."""
+    random, graph = np.random.default_rng(6), graph_of(walk(300), Neighborhood(5, 3))
+    found = {}
+    for known in (True, False):
+        for row in (131, 20):
+            run = Run(RunOptions(stride, lag=2), graph)
+            for number in range(100, 131):
+                run.advance(seen_at(number, 300, random), Step())
+            assert run.earlier(1, alive(graph)) is not None
+            run.advance(shows(row, gain=3.7, unknown=NOWHERE), Step(known=known))
+            assert (run.earlier(1, alive(graph)) is None) == (not known), "the frames before are of another time"
+            told = run.estimate(300, alive(graph))
+            found[known, row] = sum(one.probability for one in told.candidates if abs(one.row - row) <= 3)
+    assert found[False, 131] > 0.5, "where it was"
+    assert found[False, 20] > 10 * found[True, 20], "and anywhere else sooner than without a jump"
+
+
 def test_odometry_tells_two_corridors_apart_that_look_the_same() -> None:
     straight = [(float(i), 0.0) for i in range(20)]
     bent = [(float(min(i, 10)), 50.0 + max(0.0, i - 10.0)) for i in range(20)]

@@ -6,6 +6,7 @@ import asyncio
 import random
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,16 @@ import pytest
 from sqlalchemy import update
 
 from core.errors import StorageFailure
+from core.learning import Witness
 from core.ledger import Statement
 from core.maps import Map, MapSettings
 from core.places import PlaceFields, Pose
+from service.access.audit import ASKER
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import SessionExpired, UnknownSession
+from service.learning.run_notes import RunNotes
 from service.places.enrolment import FrameToEnrol, enrol
 from service.sessions import table as tables
 from service.sessions.frames import process_frame
@@ -95,6 +99,20 @@ async def test_a_frame_whose_answer_fails_does_not_count(runtime: Runtime, monke
     assert not again.repeated and (again.frame, again.frames) == (2, 3)
     assert again.candidates[0].place == expected.candidates[0].place
     assert again.candidates[0].probability == pytest.approx(expected.candidates[0].probability, abs=1e-3)
+
+
+@pytest.mark.parametrize(("ahead", "dated"), [(-timedelta(days=7300), True), (timedelta(days=7300), False)])
+async def test_a_time_that_is_no_date_is_not_learnt(runtime: Runtime, ahead: timedelta, dated: bool) -> None:
+    """A recording of old is of its time; a frame from the future is of the time at which it came."""
+    map_ = await walked(runtime.engine)
+    session = runtime.sessions.create(map_, NewSession())
+    session.notes = RunNotes(session.id, ASKER.get(), Witness("robot", datetime.now(UTC)))
+    session.notable = False
+    taken = datetime.now(UTC) + ahead
+    answer = await send(runtime, map_, session, 0, timestamp=taken)
+    (noted,) = session.notes.frames
+    assert (answer.note is None, noted.taken == taken, "taken" in noted.answer) == (dated, dated, dated)
+    assert noted.taken <= datetime.now(UTC)
 
 
 async def test_a_session_deleted_during_a_frame_stays_deleted(runtime: Runtime) -> None:

@@ -230,7 +230,7 @@ def test_a_speed_limit_needs_timestamps_that_grow(server: Server, traverse: str)
     first = send(server, traverse, session, again(1), timestamp="2026-11-20T10:00:00Z")
     second = send(server, traverse, session, again(2), timestamp="2026-11-20T10:00:01Z")
     assert (first["motion"], second["motion"]) == ("first", "speed-limit")
-    late = post(server, traverse, session, again(2), timestamp="2026-11-20T09:59:00Z")
+    late = post(server, traverse, session, again(2), timestamp="2026-11-20T10:00:00.5Z")
     assert_problem(late, 409, "frame-out-of-order")
 
 
