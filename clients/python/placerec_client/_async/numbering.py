@@ -14,6 +14,9 @@ from placerec_client.answers import OVERLOADED
 from placerec_client.errors import DeadlineExceeded, InvalidParameter, Problem
 from placerec_client.requests import seconds_of
 
+LARGEST = 2**53
+"""The largest number of a frame that the service takes."""
+
 
 class AsyncNumbering:
     """Counts the frames of one session, which are sent one after the other, whoever sends them.
@@ -77,6 +80,8 @@ class AsyncNumbering:
                 report = await self._connection.ask(models.SessionReport, "GET", path, deadline=left())
                 last = report.last_frame
                 self._next = 0 if last is None else last + 1
+            if self._next > LARGEST:
+                self._next = 0  # which the service takes for a counter that begins anew
             given = self._next
         try:
             given = index(given)

@@ -177,8 +177,9 @@ class AsyncSession(OldNames, Begun, end="delete"):
             deadline: seconds after which an answer is of no use.
             request_id: under which the service logs the request; made if left out.
             options: such as ``frame`` (the robot's own number of the frame, growing; counted here if left out),
-                ``timestamp``; and, instead of ``odometry``, ``forward``, ``left``, ``turn`` since the last frame that
-                the service took in: the session's ``last_frame``.
+                ``timestamp`` (a clock that jumps is remarked in the answer's ``note``); and, instead of ``odometry``,
+                ``forward``, ``left``, ``turn`` since the last frame that the service took in: the session's
+                ``last_frame``.
 
         Raises:
             InvalidOdometry: ``odometry`` is no ``Odometry``, or a motion is no finite number. Nothing was sent.
