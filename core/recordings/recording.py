@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
+from core.clocks import is_ahead, time_text
 from core.errors import InvalidRecording, InvalidTrajectory
 from core.frames.intrinsics import Intrinsics
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES
@@ -59,6 +60,19 @@ class Recording:
     continuous: bool = False
     intrinsics: Intrinsics | None = None
     _close: Callable[[], None] = lambda: None
+
+    def leave_out_dates(self, clock: float) -> None:
+        """Leave out the dates of frames that are far ahead of a clock, in seconds since 1970 UTC, and remark it."""
+        dates = [one.timestamp.timestamp() for one in self.frames if one.timestamp is not None]
+        if ahead := [date for date in dates if is_ahead(date, clock)]:
+            self.frames = [
+                replace(one, timestamp=None) if one.timestamp and is_ahead(one.timestamp.timestamp(), clock) else one
+                for one in self.frames
+            ]
+            self.remarks.append(
+                f"{len(ahead)} of {len(self.frames)} frames have dates more than a day ahead of now, up to "
+                f"{time_text(max(ahead))}, which are left out: the clock of the recording was wrong."
+            )
 
     def close(self) -> None:
         """Close its files; frames cannot be loaded after that."""

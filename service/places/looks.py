@@ -37,6 +37,7 @@ from service.http.schemas import (
     Parameters,
 )
 from service.places.enrolment import enrol_look
+from service.places.parameters import check_taken
 from service.places.place_events import tell_change
 from service.places.routes import ENROLMENT_PROBLEMS, THUMBNAIL
 from service.worker_threads import in_thread
@@ -124,6 +125,7 @@ async def add_look(
     a look follows from its frame, so a request can be repeated until it succeeds.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
+    check_taken(options.timestamp)
     fields = PlaceFields(timestamp=options.timestamp, camera=options.camera)
     stored = await enrol_look(engine, map_, place_id, data, fields, deadline)
     look = next((one for one in await in_thread(map_.looks, place_id) if one.name == stored.name), None)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+from datetime import datetime
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from core.clocks import is_ahead, time_text
 from core.names import words
 from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
@@ -25,6 +28,19 @@ def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
     """
     if json_size(metadata, "metadata") > settings.max_metadata_bytes:
         raise InvalidRequest(f"metadata: the value has more than {settings.max_metadata_bytes} bytes.")
+
+
+def check_taken(taken: datetime | None) -> None:
+    """Check that a frame can have been taken at a time.
+
+    Raises:
+        InvalidRequest: it is far ahead of this machine's clock.
+    """
+    if taken is not None and is_ahead(taken.timestamp(), now := time.time()):
+        raise InvalidRequest(
+            f"timestamp: {time_text(taken.timestamp())} is more than a day ahead of the service's clock, "
+            f"{time_text(now)}: correct it, or leave it out."
+        )
 
 
 class PoseParameters(Parameters):
@@ -69,9 +85,11 @@ class PlaceDescription(PoseParameters):
         """The fields of a place with this description.
 
         Raises:
-            InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be stored.
+            InvalidRequest: the pose is incomplete or of both kinds, the time is yet to come, or the metadata cannot be
+                stored.
         """
         check_metadata(metadata, settings)
+        check_taken(self.timestamp)
         pose = self.given_pose()
         return PlaceFields(
             pose=validated(Pose, pose) if pose else None,

@@ -53,7 +53,7 @@ from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
 from service.places.enrolment import FrameToEnrol, enrol
 from service.places.filters import MOST_DELETED, DeletedPlaces, Deletion, PlacePageQuery
-from service.places.parameters import BatchParameters, EnrolParameters, check_metadata
+from service.places.parameters import BatchParameters, EnrolParameters, check_metadata, check_taken
 from service.places.place_events import tell_change, tell_deletion, tell_enrolment
 from service.places.schemas import (
     BatchResult,
@@ -294,6 +294,7 @@ def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView
 )
 def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
     """Edit the fields of a place by a merge patch: `null` clears a field, and fields that are left out stay."""
+    check_taken(changes.timestamp)
     map_ = engine.maps.get(map_id)
     with engine.writing(map_id):
         if changes.metadata is not None:

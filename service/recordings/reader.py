@@ -157,7 +157,9 @@ class Reader:
             RecordedFrame(one.id, one.name, partial(self.load, number), one.pose, utc(one.nanoseconds), one.nanoseconds)
             for number, one in enumerate(told.frames)
         ]
-        return Recording(told.name, frames, list(told.remarks), continuous=True, intrinsics=told.intrinsics)
+        recording = Recording(told.name, frames, list(told.remarks), continuous=True, intrinsics=told.intrinsics)
+        recording.leave_out_dates(time.time())
+        return recording
 
     def _describe(self) -> DescribedBag:
         """The description of the bag by a child that has begun."""

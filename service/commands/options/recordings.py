@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -124,6 +125,7 @@ class RecordingOptions:
         poses = Poses(self.pose_topic, self.trajectory, self.trajectory_times, gap, self.fixed_frame, self.moving_frame)
         with messages.status(f"Reading {path} …"):
             recording = open_recording(path, self.topic, poses, prefix)
+            recording.leave_out_dates(time.time())
         with recording:
             for sentence in recording.remarks:
                 remark(sentence)

@@ -114,7 +114,7 @@ def test_a_filter_follows_edits_of_places(server: Server, map_id: str) -> None:
     server.enrol(map_id, "a", jpeg(1), x=0, y=0, heading=10, timestamp="2026-01-01T00:00:00Z", metadata={"n": 1})
     assert ids(where={"n": 1}) == ids(x=0, y=0, radius=1) == ids(heading=10, heading_tolerance=1) == ["a"]
     path = f"/v1/maps/{map_id}/places/a"
-    changes = {"metadata": {"n": 2}, "pose": {"x": 50, "heading": 200}, "timestamp": "2027-01-01T00:00:00Z"}
+    changes = {"metadata": {"n": 2}, "pose": {"x": 50, "heading": 200}, "timestamp": "2026-07-01T00:00:00Z"}
     assert server.client.patch(path, json=changes).status_code == 200
     assert ids(where={"n": 1}) == ids(x=0, y=0, radius=1) == ids(before="2026-06-01") == []
     assert ids(where={"n": 2}, x=50, y=0, radius=1, heading=190, heading_tolerance=20, after="2026-06-01") == ["a"]

@@ -65,6 +65,21 @@ def enrolled(server: Server, map_id: str, name: str, **order: Any) -> dict[str, 
     return finished(server, accepted.json())
 
 
+def test_dates_that_are_yet_to_come_are_left_out(taking: Server, placerec: Placerec, tmp_path: Path) -> None:
+    years = 10 * 31_557_600 * SECOND
+    bag = write_mcap(tmp_path / "later.mcap", [compressed(START + years + n * SECOND, jpeg(n)) for n in range(3)])
+    taking.create_map("later")
+    put(taking, "later", "later.mcap", 0, bag.read_bytes())
+    result = enrolled(taking, "later", "later.mcap", keep_standing=True)["result"]
+    (remark,) = result["remarks"]
+    assert result["changes"] == {"created": 3} and "3 of 3 frames have dates more than a day ahead" in remark
+    taking.create_map("later-by-command")
+    told = placerec("enrol", bag, "--map", "later-by-command", "--keep-standing", "--url", taking.client.base_url)
+    assert "3 of 3 frames have dates more than a day ahead" in " ".join(told.stderr.split())
+    for map_id in ("later", "later-by-command"):
+        assert [one["timestamp"] for one in taking.places(map_id).values()] == [None] * 3
+
+
 def test_a_bag_in_pieces_becomes_the_places_that_the_command_line_makes_of_it(
     taking: Server, placerec: Placerec, tmp_path: Path
 ) -> None:
