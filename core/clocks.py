@@ -23,7 +23,7 @@ LATE = 60.0
 
 AHEAD = 86_400.0
 """Seconds by which a time may be ahead of the service's clock, and by which one may go on farther than that clock has:
-a day, as time zones differ by less."""
+a day, as local time differs from UTC by less."""
 
 COUNTER_JUMP = 1000
 """By how much a number may be below the last one and count as late, and above it for each second, as no camera takes
@@ -79,10 +79,10 @@ def interval(last: Stamp, now: Stamp, passed: float) -> Interval:
     if counted is not None and counted < 0:
         anew = counted < -COUNTER_JUMP or (seconds is not None and not -LATE <= seconds <= CLOCK_JUMP)
         if not anew:
+            way = "" if last.moment is None else f"sends timestamps more than {CLOCK_JUMP:g} s after the last one, or "
             raise FrameOutOfOrder(
                 f"Frame {now.number}{_at(now)} comes after frame {last.number}{_at(last)}: leave it out, and send "
-                f"frames with numbers above {last.number}. A robot that counts anew sends timestamps more than "
-                f"{CLOCK_JUMP:g} s after the last one, or begins another session."
+                f"frames with numbers above {last.number}. A robot that counts anew {way}begins another session."
             )
     if seconds is not None and -CLOCK_JUMP <= seconds < 0:
         raise FrameOutOfOrder(
@@ -91,11 +91,18 @@ def interval(last: Stamp, now: Stamp, passed: float) -> Interval:
         )
     jumps = []
     if seconds is not None and (seconds < 0 or seconds > passed + AHEAD):
-        way = "back" if seconds < 0 else "ahead"
-        jumps.append(f"The robot's clock went {way}: the last frame was taken{_at(last)}, this one{_at(now)}.")
+        where = "back" if seconds < 0 else "ahead"
+        jumps.append(f"The robot's clock went {where}: the last frame was taken{_at(last)}, this one{_at(now)}.")
     if counted is not None and (anew or counted > COUNTER_JUMP * (1 + passed)):
         jumps.append(f"The robot's numbers went from {last.number} to {now.number}.")
     return Interval(None, 1, tuple(jumps)) if jumps else Interval(seconds, counted or 1)
+
+
+def future(moment: float, clock: float) -> str | None:
+    """What is to be said of a time that :func:`is_ahead`, after its name; None of any other."""
+    if not is_ahead(moment, clock):
+        return None
+    return f"{time_text(moment)} is more than a day ahead of the service's clock, {time_text(clock)}"
 
 
 def time_text(moment: float) -> str:

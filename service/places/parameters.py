@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from core.clocks import is_ahead, time_text
+from core.clocks import future
 from core.names import words
 from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
@@ -36,11 +36,8 @@ def check_taken(taken: datetime | None) -> None:
     Raises:
         InvalidRequest: it is far ahead of this machine's clock.
     """
-    if taken is not None and is_ahead(taken.timestamp(), now := time.time()):
-        raise InvalidRequest(
-            f"timestamp: {time_text(taken.timestamp())} is more than a day ahead of the service's clock, "
-            f"{time_text(now)}: correct it, or leave it out."
-        )
+    if taken is not None and (told := future(taken.timestamp(), time.time())) is not None:
+        raise InvalidRequest(f"timestamp: {told}: correct it, or leave it out.")
 
 
 class PoseParameters(Parameters):

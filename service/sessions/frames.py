@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, agreement, evidence_of, view_of
-from core.clocks import Interval, interval, is_ahead, time_text
+from core.clocks import Interval, future, interval
 from core.errors import FrameOutOfOrder
 from core.judgement.change import WorldChange
 from core.learning import RunFrame
@@ -195,13 +195,8 @@ def _since_last(session: Session, options: FrameParameters) -> Interval:
 
 def _distrust(taken: datetime | None) -> str | None:
     """What is to be said of a frame's time that is no date, because it is far ahead of this machine's clock."""
-    now = time.time()
-    if taken is None or not is_ahead(taken.timestamp(), now):
-        return None
-    return (
-        f"The frame's time, {time_text(taken.timestamp())}, is more than a day ahead of the service's, "
-        f"{time_text(now)}: it counts within the run alone."
-    )
+    told = None if taken is None else future(taken.timestamp(), time.time())
+    return None if told is None else f"The frame's time {told}: it counts within the run alone."
 
 
 def _advance(
@@ -230,8 +225,11 @@ def _advance(
     counted = options.frame is not None and session.number is not None and not since.jumps
     if counted and session.restored and lost is None:
         lost = since.frames - 1
-    jumped = [*since.jumps, "So the motion since the last frame is not known."] if since.jumps else []
-    notes = [*jumped, *([] if distrust is None else [distrust])]
+    notes = [*since.jumps, "So the motion since the last frame is not known."] if since.jumps else []
+    if notes:
+        log.warning("session %s: %s", session.id, " ".join(notes))
+    if distrust is not None:
+        notes.append(distrust)
     answer = SessionAnswer(
         session=session.id,
         frame=options.frame,

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from core import clocks
 from core.belief import OdometryPose
-from placerec_ros.odometry import MOST_POSES, NANOSECONDS, Odometer
+from placerec_ros.odometry import CLOCK_JUMP, MOST_POSES, NANOSECONDS, Odometer
 from placerec_ros.planar import Planar, map_to_odom, quaternion, wrapped, yaw_of
 from tests.clients.ros2.ros_messages import odometry
 
@@ -45,6 +46,10 @@ def test_no_pose_is_made_up_where_odometry_is_missing() -> None:
     assert at(odometer, 11.0) is None, "in a gap"
     assert at(odometer, 12.05) == at(odometer, 12.0), "a little after the last"
     assert at(odometer, 12.2) is None, "long after the last"
+
+
+def test_node_and_service_call_the_same_a_jump_of_a_clock() -> None:
+    assert CLOCK_JUMP == clocks.CLOCK_JUMP
 
 
 def test_messages_out_of_order_are_sorted_and_a_clock_that_is_set_back_begins_anew() -> None:
