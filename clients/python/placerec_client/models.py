@@ -1740,6 +1740,7 @@ class SessionAnswer(Model):
     change: ChangeView | None = None
     earlier: EarlierBelief | None = None
     motion: Known[Literal["first", "sequence", "speed-limit", "odometry"]]
+    note: str | None = None
     view: Known[Literal["covered", "constant"]] | None = None
     repeated: bool = False
     restored: bool

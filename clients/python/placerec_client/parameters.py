@@ -576,11 +576,14 @@ class SendFrame(TypedDict, total=False):
 
     frame: int | None
     """The robot's own number of the frame; numbers grow. A missing number is a frame that did not arrive; the last
-    number again is the same frame sent again, and gets the same answer.
+    number again is the same frame sent again, and gets the same answer. A smaller one is refused, unless it is
+    smaller by more than 1000, or the timestamp says that the robot counts anew.
     """
 
     timestamp: datetime | str | None
-    """When the frame was taken; never before the last one."""
+    """When the frame was taken. One up to a second before the last one is refused; where it goes back by more, or
+    leaps ahead by more than a day, the robot's clock was set, and the run goes on by it.
+    """
 
     forward: float | None
     """Odometry: metres forward since the last frame that the service took in, in the direction that the robot faced
