@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from core.errors import InvalidRecording, MissingExtra
 from core.frames.intrinsics import Intrinsics
 from core.recordings.frame import NANOSECONDS
-from core.recordings.pictures import image_pixels, png, sendable
+from core.recordings.pictures import compressed_file, image_png
 
 Coding = Literal["cdr", "ros1", "protobuf", "json"]
 """How a message is written: by ROS 2, by ROS 1, or as Foxglove's schemas are."""
@@ -120,8 +120,8 @@ def picture_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> b
     message = _decoded(data, kind, coding, schema)
     try:
         if kind in (IMAGE, FOXGLOVE_IMAGE):
-            return png(image_pixels(_raw_of(message) if kind == FOXGLOVE_IMAGE else message))
-        return sendable(_bytes_of(message.data))
+            return image_png(_raw_of(message) if kind == FOXGLOVE_IMAGE else message)
+        return compressed_file(str(getattr(message, "format", "")), _bytes_of(message.data))
     except (AttributeError, TypeError, ValueError) as error:
         raise InvalidRecording(f"A message is damaged: it is no {kind}.") from error
 

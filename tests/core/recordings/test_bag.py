@@ -81,46 +81,12 @@ def test_what_mcap_writes_rosbags_reads_alike(writer: str, tmp_path: Path) -> No
     assert [time for _, time in read] == [frame.nanoseconds for frame in frames]
 
 
-def test_pictures_of_every_encoding_keep_their_pixels(tmp_path: Path) -> None:
-    colours = scene(3, 64, 48)
-    grey = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)
-    deep = grey.astype(np.uint16) * 256 + 17
-    yuyv = np.stack([grey, np.full_like(grey, 128)], axis=2)
-    uyvy = yuyv[:, :, ::-1]
-    from_grey = cv2.cvtColor(yuyv, cv2.COLOR_YUV2BGR_YUY2)
-    padded = np.pad(grey, ((0, 0), (0, 16)))
-    pictures = {
-        "bgr8": (colours, colours, 0),
-        "rgb8": (colours[:, :, ::-1], colours, 0),
-        "bgra8": (np.dstack([colours, grey]), colours, 0),
-        "rgba8": (np.dstack([colours[:, :, ::-1], grey]), colours, 0),
-        "mono8": (padded, grey, 0),
-        "mono16": (deep.astype("<u2"), grey, 0),
-        "MONO16": (deep.astype(">u2"), grey, 1),
-        "yuv422_yuy2": (yuyv, from_grey, 0),
-        "yuyv": (yuyv, from_grey, 0),
-        "yuv422": (uyvy, from_grey, 0),
-        "uyvy": (uyvy, from_grey, 0),
-    }
-    said = [
-        image(START + index, 64, 48, name, np.ascontiguousarray(given).tobytes(), given[0].nbytes, big)
-        for index, (name, (given, _, big)) in enumerate(pictures.items())
-    ]
-    _, data, _ = loaded(write_mcap(tmp_path / "a.mcap", said))
-    for (name, (_, expected, _)), png in zip(pictures.items(), data, strict=True):
-        assert png.startswith(b"\x89PNG"), name
-        assert np.array_equal(pixels_of(png, cv2.IMREAD_ANYCOLOR), expected), name
-    assert data == loaded(tmp_path / "a.mcap")[1]  # the same bytes again
-
-
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_the_colour_that_was_mosaicked(pattern: str, tmp_path: Path) -> None:
-    channel = {"b": 0, "g": 1, "r": 2}
-    colour = np.array([30, 90, 200], np.uint8)  # b, g, r
-    tile = np.array([colour[channel[letter]] for letter in pattern], np.uint8).reshape(2, 2)
-    said = [image(START, 32, 32, f"bayer_{pattern}8", np.tile(tile, (16, 16)).tobytes(), 32)]
-    _, (png,), _ = loaded(write_ros1(tmp_path / "a.bag", said))
-    assert np.array_equal(pixels_of(png)[8:24, 8:24][5, 5], colour)
+def test_rows_may_have_padding(tmp_path: Path) -> None:
+    grey = cv2.cvtColor(scene(3, 64, 48), cv2.COLOR_BGR2GRAY)
+    said = [image(START, 64, 48, "mono8", np.pad(grey, ((0, 0), (0, 16))).tobytes(), 80)]
+    _, (png,), _ = loaded(write_mcap(tmp_path / "a.mcap", said))
+    assert np.array_equal(pixels_of(png, cv2.IMREAD_ANYCOLOR), grey)
+    assert [png] == loaded(tmp_path / "a.mcap")[1]  # the same bytes again
 
 
 def test_a_picture_that_cannot_be_used_fails_alone(tmp_path: Path) -> None:
@@ -132,7 +98,7 @@ def test_a_picture_that_cannot_be_used_fails_alone(tmp_path: Path) -> None:
     with open_recording(write_mcap(tmp_path / "a.mcap", said)) as recording:
         with pytest.raises(InvalidImage, match="encoding '32FC1' is not read; mono8"):
             recording.frames[0].load()
-        with pytest.raises(InvalidImage, match="announces 64x48 pixels of bgr8 and has 100 bytes"):
+        with pytest.raises(InvalidImage, match="announces 64x48 pixels of bgr8 in rows of 192 bytes and has 100 bytes"):
             recording.frames[1].load()
         assert recording.frames[2].load().startswith(b"\x89PNG")
 
