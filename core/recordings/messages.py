@@ -30,6 +30,13 @@ Coding = Literal["cdr", "ros1", "protobuf", "json"]
 COMPRESSED, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 FOXGLOVE_COMPRESSED, FOXGLOVE_IMAGE = "foxglove.CompressedImage", "foxglove.RawImage"
 IMAGE_TYPES = (COMPRESSED, IMAGE, FOXGLOVE_COMPRESSED, FOXGLOVE_IMAGE)
+VIDEO_TYPES = (
+    "theora_image_transport/msg/Packet",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+    "foxglove_msgs/msg/CompressedVideo",
+    "foxglove.CompressedVideo",
+)
+"""Packets of a video, which are named where pictures are missing."""
 FIX, FOXGLOVE_FIX = "sensor_msgs/msg/NavSatFix", "foxglove.LocationFix"
 FIXES = (FIX, FOXGLOVE_FIX)
 TRANSFORMS, FOXGLOVE_TRANSFORM, FOXGLOVE_TRANSFORMS = (

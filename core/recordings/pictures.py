@@ -24,6 +24,7 @@ from core.frames.pixel_formats import (
 READ = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 """Grey stays grey and 16 bits stay 16, as PNG can have them; transparency is dropped, as the service would."""
 
+
 def sendable(data: bytes) -> bytes:
     """The bytes of an image file as the service takes them.
 

@@ -31,7 +31,7 @@ class Picture:
         pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4]; or as the format has them.
         order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``; a fourth one, of opacity, is left out.  Or a
             pixel format of ROS, in any case: ``rgba8``, ``mono16``, ``bayer_rggb8`` (which needs OpenCV), ``yuv422`` in
-            an array [height, width, 2], ``nv12`` in one of 3/2 height rows; ``placerec_client.pixel_formats`` lists all.
+            an array [height, width, 2], ``nv12`` in one of 3/2 height rows; all are ``pixel_formats.NAMES``.
         encoding: ``png`` loses nothing, 16 bits stay 16; ``jpeg`` takes a fraction of the time and of the bytes, loses
             a little, of 16 bits the lower 8, and needs OpenCV or Pillow.
         quality: of a JPEG file, from 1 to 100.

@@ -1,4 +1,4 @@
-"""From a camera's messages to pixels and files; every pixel format is in ``tests/core/frames/test_pixel_formats.py``."""
+"""From a camera's messages to pixels and files; the pixel formats are in ``tests/core/frames``."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def published(name: str, width: int = 64) -> Published:
 
 
 class Source(NamedTuple):
-    """A way in: what it makes of raw pictures, each by format, height, width, bytes and whether these are big-endian."""
+    """A way in: what it makes of raw pictures, each by format, height, width, bytes, and 1 if big-endian."""
 
     read: Callable[[Path, Sequence[tuple[str, int, int, bytes, int]]], list[Array]]
     refuses: type[Exception]
@@ -189,7 +189,8 @@ def test_without_opencv_a_mosaic_alone_is_refused(monkeypatch: pytest.MonkeyPatc
     told = {name: published(name) for name in NAMES}
     monkeypatch.setitem(sys.modules, "cv2", None)
     for name, given in told.items():
-        message = ros_image(*(raw(name, given.array)[number] for number in (0, 2, 1, 3)))
+        _, height, width, data, _ = raw(name, given.array)
+        message = ros_image(name, width, height, data)
         if name.startswith("bayer"):
             with pytest.raises(InvalidFrame, match=f"{name} needs OpenCV"):
                 frame_bytes(Picture(given.array, name))

@@ -31,7 +31,6 @@ from tests.core.recordings.bags import (
     moved,
     walk,
     write_mcap,
-    write_ros1,
     write_rosbag2,
 )
 from tests.service.scenes import encoded, jpeg, scene
