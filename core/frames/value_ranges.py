@@ -43,7 +43,7 @@ def has_16_bits(data: bytes) -> bool:
 def scaled(pixels: NDArray[np.uint16], value_range: ValueRange) -> NDArray[np.uint8]:
     """Pixels by 8 bits, of which 0 and 255 are the ends of the range; those beyond it are as its ends."""
     low, high = value_range
-    steps = np.clip((np.arange(LARGEST + 1) - low) * (255 / (high - low)), 0, 255)
+    steps = np.clip((np.arange(LARGEST + 1) - low) * 255 / (high - low), 0, 255)
     return np.rint(steps).astype(np.uint8)[pixels]
 
 

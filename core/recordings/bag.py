@@ -112,9 +112,7 @@ class Bag:
                 self._files.append((file, self._open(file)))
             except OSError as error:
                 raise InvalidRecording(f"{file} cannot be read: {error.strerror or error}.") from error
-            except (
-                InvalidRecording
-            ) as error:  # empty, or without its beginning, as a recorder that was killed leaves it
+            except InvalidRecording as error:  # empty, or without its beginning
                 unfit.append(error)
         if unfit and not self._files:
             raise unfit[0]

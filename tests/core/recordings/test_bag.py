@@ -25,6 +25,7 @@ from tests.core.recordings.bags import (
     SECOND,
     START,
     WRITERS,
+    Said,
     compressed,
     fix,
     image,
@@ -33,6 +34,7 @@ from tests.core.recordings.bags import (
     write_mcap,
     write_rosbag2,
 )
+from tests.core.recordings.foxglove import write as write_foxglove
 from tests.service.scenes import encoded, jpeg, scene
 
 ODOM = Poses(topic=ODOMETRY)
@@ -203,6 +205,41 @@ def test_a_bag_in_several_files_is_one_bag(tmp_path: Path) -> None:
     frames, data, remarks = loaded(path)
     assert data == [jpeg(index) for index in range(6)]
     assert len({frame.id for frame in frames}) == 6 and remarks == []
+
+
+@pytest.mark.parametrize("content", [b"", bytes(4096), b"this is no bag " * 500])
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_file_of_a_bag_that_is_none_is_left_out(suffix: str, content: bytes, tmp_path: Path) -> None:
+    path = write_rosbag2(tmp_path / "walk", walk(4), plugin="sqlite3" if suffix == ".db3" else "mcap")
+    (path / "metadata.yaml").unlink()
+    (path / f"walk_1{suffix}").write_bytes(content)
+    frames, data, remarks = loaded(path)
+    assert len(frames) == 4 and data == [jpeg(index) for index in range(4)]
+    (remark,) = remarks
+    assert remark.startswith("1 of 2 files are left out, and the others are read: ") and f"walk_1{suffix}" in remark
+    (path / f"walk_0{suffix}").write_bytes(content)
+    (path / f"walk{suffix}").write_bytes(content)
+    with pytest.raises(InvalidRecording, match="walk"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ([image(START + n, 8, 8, "32FC1", bytes(256), 32) for n in range(20)], "The encoding '32FC1' is not read"),
+        ([compressed(START + n, b"\0\0\0\1video", form="h264") for n in range(20)], "h264 is another transport"),
+        ([compressed(START + n, b"?", form="16UC1; compressedDepth png") for n in range(20)], "a depth image"),
+    ],
+)
+def test_a_topic_of_which_no_picture_can_be_used_is_refused_once(said: list[Said], why: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidRecording, match=f"None of the 20 frames of /.* can be used. .*{why}"):
+        open_recording(write_mcap(tmp_path / "a.mcap", said))
+
+
+def test_a_bag_of_videos_names_them(tmp_path: Path) -> None:
+    path = write_foxglove(tmp_path / "a.mcap", "json", [("/front/video", "CompressedVideo", 1, {"format": "h264"})])
+    with pytest.raises(UnknownTopic, match=r"Videos are not read, as /front/video \(foxglove.CompressedVideo\): repub"):
+        open_recording(path)
 
 
 @pytest.mark.parametrize("name", ["empty.db3", "empty.mcap", "empty.bag", "text.db3", "text.mcap", "text.bag"])
