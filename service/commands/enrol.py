@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -316,8 +317,8 @@ def _show(report: Report, map_id: str, sequence: str, frames: int, seconds: floa
         f"{f': {counts}' if counts else ''}; {report.posed} with a pose; "
         f"{report.uploaded} sent in {seconds:.1f} s."
     )
-    refused: dict[str, list[str]] = {}
+    refused: dict[str, list[tuple[str, str]]] = {}
     for frame, reason in sorted(report.failures):
-        refused.setdefault(reason, []).append(frame)
-    for reason, named in refused.items():
-        complain(f"{named[0]}{f' and {len(named) - 1} more frames' if named[1:] else ''}: {reason}")
+        refused.setdefault(re.sub("[0-9]+", "0", reason), []).append((frame, reason))
+    for (frame, reason), *more in refused.values():
+        complain(f"{frame}: {reason}" if not more else f"{frame} and {len(more)} more frames: {reason}")
