@@ -22,6 +22,7 @@ from core.frames.containers import Header, read_header, read_structure
 from core.frames.exif import read_orientation
 from core.frames.jpeg import decode_jpeg
 from core.frames.preprocessing import Pixels
+from core.frames.value_ranges import ValueRange, has_16_bits, scaled
 
 __all__ = ["Header", "Limits", "Pixels", "decode", "encode_png", "encode_thumbnail", "read_header"]
 
@@ -45,10 +46,13 @@ ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
 """The limits of a picture that was accepted, under any settings; no service can be set to accept a larger one."""
 
 
-def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
+def decode(data: bytes, limits: Limits = Limits(), value_range: ValueRange | None = None) -> Pixels:
     """Decode a JPEG, PNG or WebP file, upright by its EXIF orientation.
 
     Grey pictures and palettes become colour, transparency is dropped, 16 bits become 8.
+
+    Args:
+        value_range: of 16 bits, the values that become 0 and 255; None: the upper 8 bits are used.
 
     Returns:
         uint8 [H, W, 3], BGR, contiguous.
@@ -79,7 +83,7 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
     if header.format == "jpeg":
         pixels: Pixels | None = decode_jpeg(data, (header.height, header.width), structure.coded, _pixels)
     else:
-        pixels = _pixels(data)
+        pixels = _pixels(data) if value_range is None else _scaled_pixels(data, value_range)
     if pixels is None:
         raise NotAnImage(f"The {header.format} data is damaged: it cannot be decoded.")
     if pixels.shape != (header.height, header.width, 3) or pixels.dtype != np.uint8:
@@ -87,10 +91,16 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
     return _upright(pixels, read_orientation(structure.exif))
 
 
-def _pixels(data: bytes) -> Pixels | None:
+def _scaled_pixels(data: bytes, value_range: ValueRange) -> Pixels | None:
+    """Decode a file with OpenCV, 16 bits by their range; None if it cannot."""
+    found: Any = _pixels(data, _COLOUR | cv2.IMREAD_ANYDEPTH) if has_16_bits(data) else _pixels(data)
+    return scaled(found, value_range) if found is not None and found.dtype == np.uint16 else found
+
+
+def _pixels(data: bytes, flags: int = _COLOUR) -> Pixels | None:
     """Decode a file with OpenCV; None if it cannot."""
     try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError("the pixels find no room") from error

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
+from core.frames.value_ranges import ValueRange
+
 Coordinate = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Corner = tuple[Coordinate, Coordinate]
 Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256), FailFast()]
@@ -53,6 +55,37 @@ class Mask(BaseModel):
     def covered(self, height: int, width: int) -> NDArray[np.bool_]:
         """Which cells of a grid over the frame are covered by half or more; bool [height, width]."""
         return np.asarray(self.shares(height, width) >= 0.5)
+
+
+class RangedMask(Mask):
+    """What of a camera's frames counts where they have 16 bits of which it uses a range: the areas, and the values.
+
+    ``polygons`` may be empty.
+    """
+
+    polygons: tuple[Polygon, ...] = ()
+    value_range: ValueRange
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of its content, hexadecimal."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+    def areas(self) -> Mask | None:
+        """The mask of the areas alone; None if there are none."""
+        return Mask(polygons=self.polygons) if self.polygons else None
+
+
+def with_range(mask: Mask | None, value_range: ValueRange | None) -> Mask | None:
+    """A mask of areas and of values, of which either may be missing."""
+    if value_range is None:
+        return mask
+    return RangedMask(polygons=() if mask is None else mask.polygons, value_range=value_range)
+
+
+def range_in(mask: Mask | None) -> ValueRange | None:
+    """The values that count of frames of 16 bits; None: all, by their upper 8 bits."""
+    return mask.value_range if isinstance(mask, RangedMask) else None
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.errors import UnknownCamera
 from core.frames.intrinsics import Intrinsics
-from core.frames.masks import Mask
+from core.frames.masks import Mask, with_range
+from core.frames.value_ranges import ValueRange
 from core.places import Camera, Timestamp
 
 MOST_CAMERAS = 256
@@ -24,7 +25,12 @@ class CameraRecord(BaseModel):
     name: Camera
     mask: Mask | None = Field(description="The areas to ignore in its frames; null: none.")
     intrinsics: Intrinsics | None = Field(default=None, description="Of its upright frames; null: not known.")
+    value_range: ValueRange | None = Field(default=None, description="Of frames of 16 bits; null: all.")
     updated_at: Timestamp
+
+    def settings(self) -> tuple[Mask | None, Intrinsics | None, ValueRange | None]:
+        """What ``Cameras.put`` takes besides the name."""
+        return self.mask, self.intrinsics, self.value_range
 
 
 class KnownCameras(ABC):
@@ -45,12 +51,15 @@ class KnownCameras(ABC):
         return found
 
     def mask(self, name: str | None) -> Mask | None:
-        """The mask of a camera, the parts of its frames to ignore; None without a name.
+        """The mask of a camera, the parts of its frames to ignore, with the range of its values; None without a name.
 
         Raises:
             UnknownCamera: the map has none of this name.
         """
-        return None if name is None else self.find(name).mask
+        if name is None:
+            return None
+        found = self.find(name)
+        return with_range(found.mask, found.value_range)
 
     def intrinsics(self, name: str | None) -> Intrinsics | None:
         """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name.
@@ -84,8 +93,14 @@ class Cameras(KnownCameras):
         """All cameras by name."""
 
     @abstractmethod
-    def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
-        """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.
+    def put(
+        self,
+        name: str,
+        mask: Mask | None,
+        intrinsics: Intrinsics | None = None,
+        value_range: ValueRange | None = None,
+    ) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace all its settings, durably; returns the camera and whether it is new.
 
         Raises:
             InvalidField: the map has too many cameras.

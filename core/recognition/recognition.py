@@ -19,8 +19,9 @@ import numpy as np
 
 from core.errors import NoRegions
 from core.frames.images import decode, encode_thumbnail
-from core.frames.masks import Mask
+from core.frames.masks import Mask, range_in
 from core.frames.preprocessing import Pixels
+from core.frames.value_ranges import ValueRange, few_values, told
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.geometry.pose import RelativeView, SharedPoints
@@ -126,9 +127,9 @@ def recognize(map_: Map, picture: bytes, encoder: Encoder, question: Question | 
         UnknownCamera: the map has no such camera.
         StorageFailure: the map's files cannot be read.
     """
-    pixels = decode(picture)  # uint8 [H, W, 3]
     question = question or Question()
     mask = _mask(map_, question.camera)
+    pixels = decode(picture, value_range=range_in(mask))  # uint8 [H, W, 3]
 
     def find() -> Keypoints:
         return find_keypoints(packaged_xfeat(), pixels, mask)
@@ -170,11 +171,12 @@ def enrol(
     """
     fields = fields or PlaceFields()
     mask = _mask(map_, fields.camera)
-    pixels = decode(picture)
+    pixels = decode(picture, value_range=range_in(mask))
     encoding = encoder.encode(pixels, mask)
     digest = frame_digest(hashlib.sha256(picture).digest(), mask)
     keypoints = find_keypoints(packaged_xfeat(), pixels, mask) if map_.record.verification else None
-    described = describe(map_, place_id, fields, picture, digest, pixels, encoding, keypoints=keypoints)
+    few = few_values(picture) if len(encoding.regions) == 0 and range_in(mask) is None else None
+    described = describe(map_, place_id, fields, picture, digest, pixels, encoding, keypoints=keypoints, few=few)
     ((place, _change),) = map_.enrol([described])
     return place
 
@@ -205,6 +207,7 @@ def describe(
     encoding: Encoding,
     thumbnail_side: int = THUMBNAIL_SIDE,
     keypoints: Keypoints | None = None,
+    few: ValueRange | None = None,
 ) -> Enrolment:
     """The record that a map stores of an encoded frame: its descriptors, fields, and the picture if the map stores it.
 
@@ -214,12 +217,13 @@ def describe(
         pixels: uint8 [H, W, 3], BGR.
         thumbnail_side: the longer side of the thumbnail, in pixels.
         keypoints: of the frame; None: the place has none to be verified by.
+        few: the lowest and highest value of a frame without regions, if it has 16 bits and uses few of them.
 
     Raises:
         NoRegions: the frame is blank, or nearly so.
     """
     if len(encoding.regions) == 0:
-        raise NoRegions("The frame has no region of interest: it is blank, or nearly so.")
+        raise no_regions(few)
     keep = map_.record.keep
     return Enrolment(
         id=place_id,
@@ -231,6 +235,21 @@ def describe(
         thumbnail=encode_thumbnail(pixels, thumbnail_side) if keep == "thumbnail" else None,
         image=picture if keep == "image" else None,
         keypoints=keypoints,
+    )
+
+
+def no_regions(few: ValueRange | None = None) -> NoRegions:
+    """Why a frame without regions has no descriptor.
+
+    Args:
+        few: its lowest and highest value, if it has 16 bits and uses few of them.
+    """
+    if few is None:
+        return NoRegions("The frame has no region of interest: it is blank, or nearly so.")
+    return NoRegions(
+        f"The frame has no region of interest in the upper 8 of its 16 bits: its values {told(few)}. Give its camera "
+        "in the map the range of its values (value_range, or --depth-bits of 'placerec maps cameras put'), and name "
+        "that camera."
     )
 
 

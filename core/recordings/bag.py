@@ -24,6 +24,7 @@ from core.recordings.messages import (
     FIXES,
     POSE_TYPES,
     TRANSFORM_TYPES,
+    VIDEO_TYPES,
     check_installed,
     frame_of,
     intrinsics_of,
@@ -47,6 +48,9 @@ PACKED = ".zstd"
 
 LONGEST_TOPIC = 96
 """Characters of a topic's name in the ids of places."""
+
+MOST_NAMED = 3
+"""Files that are no bag that one remark names."""
 
 JUMP_SECONDS, JUMP_STEPS = 60.0, 100.0
 """A clock jumps ahead if it goes on by more than a minute and a hundred times the usual step."""
@@ -84,11 +88,11 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag: a file, or a directory of files.
+        """Open a bag: a file, or a directory of files, of which those that are no bag are left out.
 
         Raises:
             MissingExtra: the reader of bags is not installed.
-            InvalidRecording: a file cannot be read, or is no bag.
+            InvalidRecording: a file cannot be read, or none is a bag.
         """
         check_installed()
         self.path, self.remarks = path, list[str]()
@@ -96,20 +100,29 @@ class Bag:
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[tuple[Path, Storage]] = []
         try:
-            for file in bag_files(path):
-                self._files.append((file, self._open(file)))
+            self._open_all(bag_files(path))
         except BaseException:
             self.close()
             raise
 
+    def _open_all(self, files: Sequence[Path]) -> None:
+        unfit: list[InvalidRecording] = []
+        for file in files:
+            try:
+                self._files.append((file, self._open(file)))
+            except OSError as error:
+                raise InvalidRecording(f"{file} cannot be read: {error.strerror or error}.") from error
+            except InvalidRecording as error:  # empty, or without its beginning
+                unfit.append(error)
+        if unfit and not self._files:
+            raise unfit[0]
+        if unfit:
+            named = " ".join(map(str, unfit[:MOST_NAMED]))
+            self.remarks.append(f"{len(unfit)} of {len(files)} files are left out, and the others are read: {named}")
+
     def _open(self, file: Path) -> Storage:
-        try:
-            file.open("rb").close()  # SQLite would not say why it cannot
-            if file.name.endswith(PACKED):
-                return STORAGES[_kind_of(file)](self._unpack(file))
-            return STORAGES[_kind_of(file)](file)
-        except OSError as error:
-            raise InvalidRecording(f"{file} cannot be read: {error.strerror or error}.") from error
+        file.open("rb").close()  # SQLite would not say why it cannot
+        return STORAGES[_kind_of(file)](self._unpack(file) if file.name.endswith(PACKED) else file)
 
     def _unpack(self, file: Path) -> Path:
         """The file that the recorder has compressed as a whole, unpacked into a folder that goes with this object."""
@@ -154,6 +167,11 @@ class Bag:
         fitting = {one: topic for one, topic in topics.items() if topic.kind in kinds}
         listed = "; ".join(f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in fitting.items())
         there = f"It has these topics of {what}: {listed}." if listed else f"It has no topic of {what}."
+        if videos := ", ".join(f"{one} ({topic.kind})" for one, topic in topics.items() if topic.kind in VIDEO_TYPES):
+            there += (
+                f" Videos are not read, as {videos}: republish one as raw or compressed (ros2 run image_transport "
+                "republish)."
+            )
         if name is None:
             filled = [one for one, topic in fitting.items() if topic.messages]
             if len(filled) == 1:

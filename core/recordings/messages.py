@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from core.errors import InvalidRecording, MissingExtra
 from core.frames.intrinsics import Intrinsics
 from core.recordings.frame import NANOSECONDS
-from core.recordings.pictures import image_pixels, png, sendable
+from core.recordings.pictures import compressed_file, image_png
 
 Coding = Literal["cdr", "ros1", "protobuf", "json"]
 """How a message is written: by ROS 2, by ROS 1, or as Foxglove's schemas are."""
@@ -30,6 +30,13 @@ Coding = Literal["cdr", "ros1", "protobuf", "json"]
 COMPRESSED, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 FOXGLOVE_COMPRESSED, FOXGLOVE_IMAGE = "foxglove.CompressedImage", "foxglove.RawImage"
 IMAGE_TYPES = (COMPRESSED, IMAGE, FOXGLOVE_COMPRESSED, FOXGLOVE_IMAGE)
+VIDEO_TYPES = (
+    "theora_image_transport/msg/Packet",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+    "foxglove_msgs/msg/CompressedVideo",
+    "foxglove.CompressedVideo",
+)
+"""Packets of a video, which are named where pictures are missing."""
 FIX, FOXGLOVE_FIX = "sensor_msgs/msg/NavSatFix", "foxglove.LocationFix"
 FIXES = (FIX, FOXGLOVE_FIX)
 TRANSFORMS, FOXGLOVE_TRANSFORM, FOXGLOVE_TRANSFORMS = (
@@ -120,8 +127,8 @@ def picture_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> b
     message = _decoded(data, kind, coding, schema)
     try:
         if kind in (IMAGE, FOXGLOVE_IMAGE):
-            return png(image_pixels(_raw_of(message) if kind == FOXGLOVE_IMAGE else message))
-        return sendable(_bytes_of(message.data))
+            return image_png(_raw_of(message) if kind == FOXGLOVE_IMAGE else message)
+        return compressed_file(str(getattr(message, "format", "")), _bytes_of(message.data))
     except (AttributeError, TypeError, ValueError) as error:
         raise InvalidRecording(f"A message is damaged: it is no {kind}.") from error
 

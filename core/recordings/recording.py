@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from core.clocks import is_ahead, time_text
-from core.errors import InvalidRecording, InvalidTrajectory
+from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnsupportedFormat
 from core.frames.intrinsics import Intrinsics
 from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES
 from core.recordings.bag import Bag, bag_files
@@ -147,9 +147,11 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
     bag = Bag(path)
     try:
         chosen = bag.choose(topic, IMAGE_TYPES, "pictures")
+        frames = bag.frames(chosen)
+        _check_format(chosen, frames)
         recording = Recording(
             path.resolve().name if path.is_dir() else path.name.removesuffix(".zstd").rpartition(".")[0],
-            bag.frames(chosen),
+            frames,
             continuous=True,
             intrinsics=bag.intrinsics(chosen),
             _close=bag.close,
@@ -164,6 +166,25 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
         bag.close()
         raise
     return recording
+
+
+def _check_format(topic: str, frames: list[RecordedFrame]) -> None:
+    """Check that a topic has a picture of a format that is read; the first one has, of a bag that can be used.
+
+    Raises:
+        InvalidRecording: it has none.
+    """
+    first: UnsupportedFormat | None = None
+    for frame in frames:
+        try:
+            frame.load()
+            return
+        except UnsupportedFormat as error:
+            first = first or error
+        except (InvalidImage, InvalidRecording, OSError):  # a damaged one, which is left out alone
+            return
+    if first is not None:
+        raise InvalidRecording(f"None of the {len(frames)} frames of {topic} can be used. {first}")
 
 
 def _open_folder(path: Path, prefix: str) -> Recording:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -37,8 +38,8 @@ from service.commands.options.recordings import (
 )
 
 if TYPE_CHECKING:
-    from core.frames.intrinsics import Intrinsics
     from core.frames.masks import Mask
+    from core.recordings import Recording
 
 
 @dataclass
@@ -143,9 +144,7 @@ def enrol(
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             return [FrameToSend(taken, name, camera) for taken in chosen]
 
-        report, frames = run(
-            _enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened.intrinsics)
-        )
+        report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened))
     _show(report, map_id, name, frames, time.monotonic() - began)
     if align:
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
@@ -192,7 +191,7 @@ async def _enrol(
     camera: str | None,
     create: bool,
     wanted: dict[str, str | None],
-    intrinsics: Intrinsics | None,
+    opened: Recording,
 ) -> tuple[Report, int]:
     """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
 
@@ -203,7 +202,7 @@ async def _enrol(
     async with open_service(target) as service:
         given = {key: value for key, value in wanted.items() if value is not None}
         used = await _ready_map(service, map_id, camera, create, given)
-        mask = None if camera is None else await _mask(service, map_id, camera, intrinsics)
+        mask = await _mask(service, map_id, camera, opened)
         frames = await asyncio.to_thread(choose, used, mask)
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
@@ -255,16 +254,21 @@ def _without_camera(map_id: str, camera: str) -> str:
     )
 
 
-async def _mask(service: Service, map_id: str, camera: str, intrinsics: Intrinsics | None) -> Mask | None:
+async def _mask(service: Service, map_id: str, camera: str | None, opened: Recording) -> Mask | None:
     """The mask of a camera's frames; a camera that the map does not have is refused, as each frame would be.
 
-    A camera without intrinsics gets those of the recording.
+    A camera without intrinsics, or without a range of values where frames have 16 bits, gets those of the recording.
 
     Raises:
         Failure: the map has no such camera.
     """
-    from core.frames.masks import Mask  # here because it takes a moment
+    from core.frames.masks import Mask, with_range  # here because it takes a moment
+    from core.recordings.value_ranges import range_remark, used_range
 
+    if camera is None:
+        if (used := await asyncio.to_thread(used_range, opened.frames)) is not None:
+            remark(range_remark(used, None))
+        return None
     path = path_of("maps", map_id, "cameras", camera)
     try:
         known = await service.get(path)
@@ -272,11 +276,20 @@ async def _mask(service: Service, map_id: str, camera: str, intrinsics: Intrinsi
         if refused.slug != "unknown-camera":
             raise
         raise Failure(f"{refused} 'placerec maps cameras put {map_id} {camera}' creates it.") from refused
-    found = known["mask"]
-    if intrinsics is not None and known["intrinsics"] is None:
-        await service.request("PUT", path, json={"mask": found, "intrinsics": intrinsics.model_dump(mode="json")})
-        remark(f"The camera {camera} had no intrinsics, and has those of the bag now.")
-    return None if found is None else Mask.model_validate_json(json.dumps(found))
+    found = {name: known.get(name) for name in ("mask", "intrinsics", "value_range")}
+    remarks = []
+    if found["intrinsics"] is None and opened.intrinsics is not None:
+        found["intrinsics"] = opened.intrinsics.model_dump(mode="json")
+        remarks.append(f"The camera {camera} had no intrinsics, and has those of the bag now.")
+    if found["value_range"] is None and (used := await asyncio.to_thread(used_range, opened.frames)) is not None:
+        found["value_range"] = used
+        remarks.append(range_remark(used, camera))
+    if remarks:
+        await service.request("PUT", path, json=found)
+    for sentence in remarks:
+        remark(sentence)
+    areas = None if found["mask"] is None else Mask.model_validate_json(json.dumps(found["mask"]))
+    return with_range(areas, found["value_range"])
 
 
 async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend]) -> frozenset[str]:
@@ -304,5 +317,8 @@ def _show(report: Report, map_id: str, sequence: str, frames: int, seconds: floa
         f"{f': {counts}' if counts else ''}; {report.posed} with a pose; "
         f"{report.uploaded} sent in {seconds:.1f} s."
     )
+    refused: dict[str, list[tuple[str, str]]] = {}
     for frame, reason in sorted(report.failures):
-        complain(f"{frame}: {reason}")
+        refused.setdefault(re.sub("[0-9]+", "0", reason), []).append((frame, reason))
+    for (frame, reason), *more in refused.values():
+        complain(f"{frame}: {reason}" if not more else f"{frame} and {len(more)} more frames: {reason}")

@@ -15,13 +15,13 @@ from dataclasses import replace
 
 from core.errors import InvalidImage
 from core.frames.images import Limits, decode
-from core.frames.masks import Mask
+from core.frames.masks import Mask, range_in
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.networks.xfeat import packaged_xfeat
 from core.threads import allowed_threads, begun, cores, keep_to, processors, use_threads
-from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
+from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded, narrow_values
 from service.errors.faults import DeadlineExceeded
 
 MOST_PIXELS = 40_000_000
@@ -134,7 +134,7 @@ class EncoderThreads:
         try:
             if frame.deadline <= time.monotonic():
                 raise deadline_exceeded()
-            pixels = decode(frame.data, self._limits)
+            pixels = decode(frame.data, self._limits, range_in(frame.mask))
             times = {"wait": 1e3 * (began - frame.queued), "decode": 1e3 * (time.perf_counter() - began)}
             spent: dict[str, float] = {}  # by another thread, which may end after a frame without regions is done
             find = begun(lambda: _keypoints(pixels, frame.mask, spent)) if frame.keypoints else None
@@ -144,7 +144,8 @@ class EncoderThreads:
             if not len(encoding.regions):
                 find = None
             times |= encoding.milliseconds
-            encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, begun=find)
+            few = narrow_values(frame, encoding)
+            encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, begun=find, few_values=few)
             if frame.after_encoding is not None:
                 with suppress(Exception):  # Searches repeats the search and reports the error
                     encoded = replace(encoded, search_result=frame.after_encoding(encoded))

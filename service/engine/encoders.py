@@ -17,8 +17,9 @@ import numpy as np
 
 from core.frames.containers import read_header
 from core.frames.images import Limits
-from core.frames.masks import Mask
+from core.frames.masks import Mask, range_in
 from core.frames.preprocessing import Pixels
+from core.frames.value_ranges import ValueRange, few_values
 from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
@@ -46,6 +47,7 @@ class Encoded:
     mask: the part of the frame that was ignored.
     keypoints: its keypoints, if they were requested.
     begun: waits for the keypoints that are still being found.
+    few_values: of a frame of 16 bits without regions, its lowest and highest value, if its camera has no range.
     search_result: what the frame's ``after_encoding`` returned for it; None if it had none, or that failed.
     """
 
@@ -57,6 +59,7 @@ class Encoded:
     keypoints: Keypoints | None = None
     search_result: Any = None
     begun: Callable[[], Keypoints] | None = None
+    few_values: ValueRange | None = None
     _scaled: ScaledFrame | None = None
 
     @cached_property
@@ -87,6 +90,11 @@ class Encoded:
         """
         scaled = self.scaled if keep_scaled else None
         return replace(self, source=np.zeros((0, 0, 3), np.uint8), begun=None, _scaled=scaled)
+
+
+def narrow_values(frame: QueuedFrame, encoding: Encoding) -> ValueRange | None:
+    """The ``few_values`` of an encoded frame."""
+    return None if len(encoding.regions) or range_in(frame.mask) is not None else few_values(frame.data)
 
 
 AfterEncoding = Callable[[Encoded], object]

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 
 from core.errors import PlacerecError
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
+from core.frames.value_ranges import few_values
 from service.errors.faults import TooManyListeners
 from service.events.feed import Feed, FeedEvent, Listener
 from service.events.relay import EventRelay
@@ -159,7 +160,7 @@ class Events:
     def _draw(self, feed: Feed | None, event: Event, frame: bytes, maps: frozenset[str | None] | None) -> None:
         picture = None
         try:
-            small = encode_thumbnail(decode(frame, ANY_SIZE), PICTURE_SIDE, PICTURE_QUALITY)
+            small = encode_thumbnail(decode(frame, ANY_SIZE, few_values(frame)), PICTURE_SIDE, PICTURE_QUALITY)
             picture = f"data:image/jpeg;base64,{base64.b64encode(small).decode()}"
         except (PlacerecError, MemoryError) as error:
             log.warning("a frame cannot be shown to listeners: %s", error)

@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.method.region_drawing import boxes, draw, layer_grids, strongest
+from core.recognition.recognition import no_regions
 from service.engine.encoders import Encoded
 from service.errors.faults import (
     QueueFull,
@@ -76,7 +77,7 @@ async def encode(
         encoded = await engine.queue.encode(identity, frame.data, deadline)
     regions = len(encoded.encoding.regions)
     if regions == 0:
-        raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
+        raise no_regions(encoded.few_values)
     values = encoded.encoding.descriptor.astype("<f4").tobytes()
     if preferred(request.headers.get("accept"), JSON, OCTETS) == OCTETS:
         return Response(values, headers={"X-Encoder": identity, "X-Regions": str(regions)}, media_type=OCTETS)

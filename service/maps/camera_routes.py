@@ -38,15 +38,15 @@ CameraName = Annotated[
 def put_camera(
     map_id: MapId, name: CameraName, definition: CameraDefinition, engine: EngineDep, response: Response
 ) -> CameraView:
-    """Create or replace a camera: a mask of what is ignored in its frames, which name it with `?camera=`, and its
-    intrinsics, by which a pose is measured.
+    """Create or replace a camera: a mask of what is ignored in its frames, which name it with `?camera=`, its
+    intrinsics, by which a pose is measured, and the range of its values, by which frames of 16 bits are scaled.
 
-    The mask is applied to every frame from now on. Places that were enrolled with another mask stay as they are
+    Mask and range are applied to every frame from now on. Places that were enrolled with others stay as they are
     until their frames are sent again. Intrinsics hold for all frames of the camera, enrolled ones included. What is
     left out is removed.
     """
     map_ = engine.maps.get(map_id)
-    made, is_new = map_.cameras.put(name, definition.mask, definition.intrinsics)
+    made, is_new = map_.cameras.put(name, definition.mask, definition.intrinsics, definition.value_range)
     tell_map(engine, map_, "cameras")
     response.status_code = 201 if is_new else 200
     return CameraView(**made.__dict__)

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
+from core.frames.value_ranges import ValueRange
 from core.judgement.background import HIGHEST_DECISION, LOWEST_DECISION
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
@@ -259,12 +260,13 @@ CAMERA_EXAMPLE: dict[str, Any] = {
         "distortion_model": "plumb_bob",
         "distortion": [-0.28, 0.07, 0.0002, 0.0, 0.0],
     },
+    "value_range": None,
     "updated_at": "2026-11-20T10:00:00Z",
 }
 
 
 class CameraDefinition(BaseModel):
-    """Which part of a camera's frames is ignored, and which direction each pixel looks in."""
+    """Which part of a camera's frames is ignored, which direction each pixel looks in, and which values it has."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -274,6 +276,11 @@ class CameraDefinition(BaseModel):
     mask: Mask | None = Field(default=None, description="The part that is ignored; null if nothing is.")
     intrinsics: Intrinsics | None = Field(
         default=None, description="Of the upright frame, as in ROS's CameraInfo; null if they are not known."
+    )
+    value_range: ValueRange | None = Field(
+        default=None,
+        description="The values of frames of 16 bits that become black and white, such as [0, 1023] of a camera of ten "
+        "bits; null: the upper 8 bits are used.",
     )
 
 
@@ -285,6 +292,7 @@ class CameraView(BaseModel):
     name: str
     mask: Mask | None
     intrinsics: Intrinsics | None
+    value_range: ValueRange | None = None
     updated_at: Timestamp
 
 

@@ -101,6 +101,7 @@ def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes
         encoded.encoding,
         engine.settings.thumbnail_side,
         encoded.keypoints,
+        encoded.few_values,
     )
     return replace(described, run=frame.origin.run, least=frame.origin.least)
 

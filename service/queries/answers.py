@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import Depends
 
@@ -20,6 +20,7 @@ from service.queries.schemas import (
     EstimatedPose,
     Match,
     QueryAnswer,
+    Reason,
     RivalGroup,
     ScoreParts,
     VerificationView,
@@ -57,7 +58,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer, usual: UsualScores | N
         margin=judgement.margin,
         decision=judgement.decision,
         threshold=found.calibration.threshold,
-        reason=None if matches else _why_nothing(found),
+        reason=None if matches else _why_nothing(found, encoded),
         matches=matches,
         rivals=[
             RivalGroup(places=list(group.places), score=group.score, same_place=group.same_place)
@@ -78,10 +79,10 @@ def change_in(found: Answer, usual: UsualScores | None = None) -> WorldChange | 
     return change_of(found.judgement, found.calibration, float(found.candidates.scores[0]), known)
 
 
-def _why_nothing(found: Answer) -> Literal["no-regions", "no-place-allowed", "empty-map"]:
+def _why_nothing(found: Answer, encoded: Encoded) -> Reason:
     """Why there is no match."""
     if found.blank:
-        return "no-regions"
+        return "no-regions" if encoded.few_values is None else "few-values"
     return "no-place-allowed" if found.candidates.places else "empty-map"
 
 

@@ -41,7 +41,7 @@ from service.queries.following import follow_answer
 from service.queries.given_answers import QueriedFrame
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
-from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
+from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, Reason, SeveralAnswer
 from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
 
@@ -199,7 +199,8 @@ def _map_answer(request: Request, report: MapReport, answer: QueryAnswer | None)
         problem = request_problem(request, report.error)
         return MapAnswer(map=report.map_id, status=problem.status, encoder=encoder, problem=problem)
     if report.answer is None or answer is None:
-        return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason="no-regions", encoder=encoder)
+        reason: Reason | None = "no-regions" if answer is None else answer.reason
+        return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason=reason, encoder=encoder)
     return MapAnswer(
         map=report.map_id,
         status=200,

@@ -246,7 +246,11 @@ class RivalGroup(BaseModel):
     )
 
 
-Reason = Literal["no-regions", "empty-map", "no-place-allowed"]
+Reason = Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]
+NO_MATCHES = (
+    "Why there are no matches, if so. `few-values`: the frame has 16 bits, of which it uses so few values that its "
+    "upper 8 bits show nothing; its camera in the map needs a `value_range`."
+)
 
 CHANGE_EXAMPLE: dict[str, Any] = {"verdict": "known", "known": 0.93, "changed": 0.06, "new": 0.01}
 
@@ -326,7 +330,7 @@ class QueryAnswer(BaseModel):
         description="The least decision value at which the best match can be recognized. A match that was verified is "
         "recognized by its probability instead."
     )
-    reason: Reason | None = Field(default=None, description="Why there are no matches, if so.")
+    reason: Reason | None = Field(default=None, description=NO_MATCHES)
     matches: list[Match]
     rivals: list[RivalGroup] = Field(
         default_factory=list, description="Why the answer is ambiguous; empty for other verdicts."
@@ -396,7 +400,7 @@ class MapAnswer(BaseModel):
     margin: float | None = None
     decision: float | None = None
     threshold: float | None = None
-    reason: Reason | None = Field(default=None, description="Why there is nothing to compare, if so.")
+    reason: Reason | None = Field(default=None, description=NO_MATCHES)
     verification: VerificationView | None = None
     rivals: list[RivalGroup] = Field(default_factory=list, description="Why the map's own verdict is `ambiguous`.")
     revision: int | None = None

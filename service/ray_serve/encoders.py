@@ -21,7 +21,8 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from core.frames.images import Limits, decode
-from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
+from core.frames.masks import range_in
+from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded, narrow_values
 from service.errors.faults import ClientGone, NotReady
 from service.ray_serve.cluster import Cluster, RayUnavailable, caller
 from service.ray_serve.loads import LOADS
@@ -312,18 +313,19 @@ class RayEncoders:
             return
         if not frame.result.set_running_or_notify_cancel():
             return
-        data, limits = frame.data, self._limits
+        data, limits, mask = frame.data, self._limits, frame.mask
         computed = {name: spent for name, spent in made.milliseconds.items() if name != "wait"}
         self._waiting.settle(frame, sum(computed.values()))
         wait = max(0.0, 1e3 * (time.perf_counter() - frame.queued) - sum(computed.values()))
         frame.result.set_result(
             Encoded(
-                lambda: decode(data, limits),
+                lambda: decode(data, limits, range_in(mask)),
                 made.encoding,
                 frame.encoder,
                 {"wait": wait, **computed},
-                frame.mask,
+                mask,
                 made.keypoints,
+                few_values=narrow_values(frame, made.encoding),
             )
         )
 

@@ -10,13 +10,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from core.belief.view import STILL, View, view_of
 from core.errors import InvalidImage, InvalidRecording
 from core.frames.images import decode
-from core.frames.masks import Mask
+from core.frames.masks import Mask, range_in
 from core.maps import Map
 from core.places import Camera, PlaceFields
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
 from core.recordings.recording import LARGEST_GAP
+from core.recordings.value_ranges import range_remark, used_range
 from service.engine.engine import Engine
 from service.http.multipart import FormPart
 from service.http.uploads import check_part
@@ -88,7 +89,7 @@ def enrol_recording(
     map_, name = context.map(engine.maps), str(context.arguments["recording"])
     order = RecordingOrder.model_validate(context.arguments["order"])
     context.progress(0, None, "reading the recording")
-    mask = map_.cameras.mask(order.camera)
+    map_.cameras.mask(order.camera)  # an unknown one is refused before the bag is read
     wanted = Order(
         path=recordings.find(str(context.map_id), name),
         topic=order.topic,
@@ -102,12 +103,15 @@ def enrol_recording(
     with readers.reading(context, wanted) as (reader, turns):
         recording = reader.recording()
         sequence = order.sequence or recording.name
+        if "camera" not in context.notes:
+            context.remember(camera=_complete_camera(engine, map_, order.camera, recording))
+        mask = map_.cameras.mask(order.camera)
         if "chosen" in context.notes:  # by an attempt before this one
             chosen, remarks = [recording.frames[number] for number in context.notes["chosen"]], context.notes["remarks"]
         else:
             chosen, remarks = _choose(engine, context, turns, recording, order, mask)
             _check_ids(map_, chosen, sequence)
-            remarks += _take_intrinsics(engine, map_, order.camera, recording)
+            remarks += context.notes["camera"]
             numbers = {frame.id: number for number, frame in enumerate(recording.frames)}
             context.remember(chosen=[numbers[frame.id] for frame in chosen], remarks=remarks, looks=None)
 
@@ -190,27 +194,37 @@ def _moving(
 
 def _view(frame: RecordedFrame, mask: Mask | None) -> View | None:
     try:
-        return view_of(decode(frame.load()), mask)
+        return view_of(decode(frame.load(), value_range=range_in(mask)), mask)
     except (InvalidImage, InvalidRecording, OSError):
         return None  # what is wrong with it is said where it is enrolled
 
 
-def _take_intrinsics(engine: Engine, map_: Map, camera: str | None, recording: Recording) -> list[str]:
-    """Give a camera of the map that has no intrinsics those of the bag; what is to be said of it.
+def _complete_camera(engine: Engine, map_: Map, camera: str | None, recording: Recording) -> list[str]:
+    """Give a camera of the map what it has not and the recording shows: intrinsics, and the range of values of 16 bits.
+
+    Returns:
+        What is to be said of it.
 
     Raises:
         UnknownCamera, StorageFull, StorageFailure.
+        JobCancelled, JobInterrupted.
     """
-    if recording.intrinsics is None:
-        return []
-    if camera is None:
-        return ["It has the intrinsics of its camera, which a camera of the map gets if one is named."]
-    known = map_.cameras.find(camera)
-    if known.intrinsics is not None:
-        return []
-    map_.cameras.put(camera, known.mask, recording.intrinsics)
-    tell_map(engine, map_, "cameras")
-    return [f"The camera {camera} had no intrinsics, and has those of the bag now."]
+    known = None if camera is None else map_.cameras.find(camera)
+    mask, intrinsics, value_range = (None, None, None) if known is None else known.settings()
+    remarks = []
+    if intrinsics is None and recording.intrinsics is not None:
+        intrinsics = recording.intrinsics
+        remarks.append(
+            "It has the intrinsics of its camera, which a camera of the map gets if one is named."
+            if camera is None
+            else f"The camera {camera} had no intrinsics, and has those of the bag now."
+        )
+    if value_range is None and (value_range := used_range(recording.frames)) is not None:
+        remarks.append(range_remark(value_range, camera))
+    if remarks and camera is not None:
+        map_.cameras.put(camera, mask, intrinsics, value_range)
+        tell_map(engine, map_, "cameras")
+    return remarks
 
 
 def _check_ids(map_: Map, frames: Sequence[RecordedFrame], sequence: str) -> None:

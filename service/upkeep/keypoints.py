@@ -13,7 +13,7 @@ from typing import Any
 
 from core.errors import InvalidImage, StorageFailure, UnknownCamera
 from core.frames.images import ANY_SIZE, decode
-from core.frames.masks import Mask
+from core.frames.masks import Mask, range_in
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.maps import Map, PicturedPlace
@@ -79,4 +79,4 @@ def _keypoints(map_: Map, place: PicturedPlace) -> Keypoints:
     mask: Mask | None = None
     with suppress(UnknownCamera):  # it was forgotten since the place was enrolled
         mask = map_.cameras.mask(place.camera)
-    return find_keypoints(packaged_xfeat(), decode(map_.picture(place.id) or b"", ANY_SIZE), mask)
+    return find_keypoints(packaged_xfeat(), decode(map_.picture(place.id) or b"", ANY_SIZE, range_in(mask)), mask)

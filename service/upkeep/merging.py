@@ -189,14 +189,14 @@ def _new_names(
         conflicts.append(f"Both maps have the sequences {_listed(shared)}.")
     if taken := [name for name in sequences.values() if name in ours or len(name) > 128]:
         conflicts.append(f"The names {_listed(taken)} of sequences are taken or too long; choose another prefix.")
-    stored = {camera.name: (camera.mask, camera.intrinsics) for camera in map_.cameras.all()}
+    stored = {camera.name: camera.settings() for camera in map_.cameras.all()}
     used = {place.camera for place in coming}
     known = [camera for camera in other.cameras.all() if camera.name in used and camera.name in stored]
-    unlike = [camera for camera in known if stored[camera.name] != (camera.mask, camera.intrinsics)]
+    unlike = [camera for camera in known if stored[camera.name] != camera.settings()]
     cameras = {camera.name: prefix + camera.name for camera in unlike} if rule == "rename" else {}
     if unlike and rule != "rename":
         conflicts.append(
-            f"The cameras {_listed([camera.name for camera in unlike])} have other masks or intrinsics here."
+            f"The cameras {_listed([camera.name for camera in unlike])} have other masks, intrinsics or values here."
         )
     if taken := [
         new for name, new in cameras.items() if len(new) > 64 or stored.get(new, (None, None)) != (None, None)
@@ -296,7 +296,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
         for camera in other.cameras.all():
             name = names["cameras"].get(camera.name, camera.name)
             if name in context.notes["cameras"]:
-                map_.cameras.put(name, camera.mask, camera.intrinsics)
+                map_.cameras.put(name, *camera.settings())
         snapshot = other.snapshot()
         for first in range(0, len(due), PLACES_PER_COMMIT):
             yield_to_requests(engine, context)

@@ -227,10 +227,10 @@ class _Reencoding:
 
     def _publish(self) -> Mapping[str, Any]:
         self.context.check_cancelled()  # from here on it cannot be undone
-        copied = {camera.name: (camera.mask, camera.intrinsics) for camera in self.made.cameras.all()}
+        copied = {camera.name: camera.settings() for camera in self.made.cameras.all()}
         for camera in self.source.cameras.all():
-            if copied.get(camera.name) != (camera.mask, camera.intrinsics):
-                self.made.cameras.put(camera.name, camera.mask, camera.intrinsics)
+            if copied.get(camera.name) != camera.settings():
+                self.made.cameras.put(camera.name, *camera.settings())
         names = {place.id: place.id for place in self.made.transfer.outline()}
         self.made.counterparts.copy(self.source.counterparts, names)
         named = [{"id": place.id, "detail": why} for place, why in list(self.left_out.values())[:MOST_LISTED]]

@@ -105,7 +105,7 @@ def test_the_node_imports_what_its_package_declares() -> None:
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CLIENT_PROJECT = tomllib.loads((CLIENT / "pyproject.toml").read_text())["project"]
 FOR_TYPES = {"numpy"}
-"""What the client imports for types alone: a caller who gives arrays has it."""
+"""What the client imports for types, and for arrays alone: a caller who gives these has it."""
 
 OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"}
 """What runs in .venv-ros, whose packages are not here."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     Pixels: TypeAlias = NDArray[numpy.uint8] | NDArray[numpy.uint16]
 
-Order: TypeAlias = Literal["bgr", "rgb"]
+Order: TypeAlias = str
 Encoding: TypeAlias = Literal["png", "jpeg"]
 
 
@@ -28,10 +28,12 @@ class Picture:
     """An array as a frame, with the order of its channels, and as which file it is sent.
 
     Args:
-        pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4].
-        order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``; a fourth one, of opacity, is left out.
-        encoding: ``png`` loses nothing; ``jpeg`` takes a fraction of the time and of the bytes, loses a little, and
-            needs OpenCV or Pillow.
+        pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4]; or as the format has them.
+        order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``; a fourth one, of opacity, is left out.  Or a
+            pixel format of ROS, in any case: ``rgba8``, ``mono16``, ``bayer_rggb8`` (which needs OpenCV), ``yuv422`` in
+            an array [height, width, 2], ``nv12`` in one of 3/2 height rows; all are ``pixel_formats.NAMES``.
+        encoding: ``png`` loses nothing, 16 bits stay 16; ``jpeg`` takes a fraction of the time and of the bytes, loses
+            a little, of 16 bits the lower 8, and needs OpenCV or Pillow.
         quality: of a JPEG file, from 1 to 100.
 
     Raises:
@@ -48,7 +50,13 @@ class Picture:
 
     def __post_init__(self) -> None:
         if self.order not in ("bgr", "rgb"):
-            raise InvalidFrame(f"The order of channels is 'bgr' or 'rgb', not {ascii(self.order)[:140]}.")
+            from placerec_client.pixel_formats import NAMES  # here because NumPy takes a moment to load
+
+            if str(self.order).strip().lower() not in NAMES:
+                raise InvalidFrame(
+                    f"The order of channels is 'bgr' or 'rgb', not {ascii(self.order)[:140]}; or it is a pixel format: "
+                    f"{', '.join(NAMES)}."
+                )
         if self.encoding not in ("png", "jpeg"):
             raise InvalidFrame(f"The encoding of a picture is 'png' or 'jpeg', not {ascii(self.encoding)[:140]}.")
         if not isinstance(self.quality, int) or not 1 <= self.quality <= 100:
@@ -58,6 +66,9 @@ class Picture:
 Frame: TypeAlias = "bytes | bytearray | memoryview | array[int] | str | os.PathLike[str] | BinaryIO | Pixels | Picture"
 """The bytes of a JPEG, PNG or WebP file, also in an array; the path of one; one opened for reading; or pixels, in
 OpenCV's order BGR."""
+
+FEWEST_VALUES = 4095
+"""A picture of 16 bits has to reach this value to become a JPEG file: one of fewer bits would be nearly black there."""
 
 LONGEST_SIDE = 65500
 """Pixels that a side of a JPEG file may have at most."""
@@ -136,20 +147,22 @@ def png(pixels: Any, order: str = "bgr") -> bytes:
     """Encode pixels as a PNG file.
 
     Args:
-        pixels: NumPy array uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4].
-        order: of the channels, ``bgr`` or ``rgb``.
+        pixels: NumPy array uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4]; 16 bits stay
+            16.
+        order: as of ``Picture``.
 
     Raises:
-        InvalidFrame: the array has another type or shape.
+        InvalidFrame: the array has another type or shape, or OpenCV is needed and missing.
     """
     found = _in_red_green_blue(pixels, order)
-    shape, grey = found.shape, found.ndim == 2
-    rows = found.reshape(shape[0], -1)
+    shape, grey, bits = found.shape, found.ndim == 2, 8 * found.dtype.itemsize
+    # PNG has the upper byte first.
+    rows = found.astype(f">u{bits // 8}").reshape(shape[0], -1).view("uint8")
     # Each row is stored as its difference from the one above (the filter "up"), which compresses better.
     filtered = rows.copy()
     filtered[1:] -= rows[:-1]
     data = b"".join(b"\x02" + row.tobytes() for row in filtered)
-    header = struct.pack(">IIBBBBB", shape[1], shape[0], 8, 0 if grey else 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", shape[1], shape[0], bits, 0 if grey else 2, 0, 0, 0)
     return b"".join(
         [
             b"\x89PNG\r\n\x1a\n",
@@ -165,13 +178,21 @@ def jpeg(pixels: Any, order: str = "bgr", quality: int = 90) -> bytes:
 
     Args:
         pixels: as of ``png``.
-        order: of the channels, ``bgr`` or ``rgb``.
+        order: as of ``Picture``.
         quality: from 1 to 100.
 
     Raises:
-        InvalidFrame: the array has another type or shape, or is too large for a JPEG file; or neither is installed.
+        InvalidFrame: the array has another type or shape, is too large for a JPEG file, or has 16 bits of which its
+            values use fewer than 12; or neither is installed.
     """
     found = _in_red_green_blue(pixels, order)
+    if found.dtype.itemsize == 2:
+        if 0 < (highest := int(found.max())) < FEWEST_VALUES:
+            raise InvalidFrame(
+                f"The values reach only {highest} of 65535, and a JPEG file has the upper 8 of 16 bits: send it as "
+                "PNG, or scale it to 8 bits."
+            )
+        found = (found >> 8).astype("uint8")
     if max(found.shape) > LONGEST_SIDE:
         raise InvalidFrame(
             f"An array of shape {list(found.shape)} cannot be a JPEG file: a side has at most {LONGEST_SIDE} pixels."
@@ -198,21 +219,26 @@ def _jpeg_by_pillow(found: Any, quality: int) -> bytes:
 
 
 def _in_red_green_blue(pixels: Any, order: str) -> Any:
-    """Pixels as uint8, [height, width] or [height, width, 3] in the order RGB; of 16 bits the upper 8 are used.
+    """Pixels as uint8 or uint16, [height, width] or [height, width, 3] in the order RGB.
 
     Raises:
-        InvalidFrame: the array has another type or shape.
+        InvalidFrame: the array has another type or shape, or OpenCV is needed and missing.
     """
     if not hasattr(pixels, "__array_interface__"):
         raise InvalidFrame(f"A {type(pixels).__name__} is no array of pixels.")
+    if order not in ("bgr", "rgb"):
+        from placerec_client.pixel_formats import UnfitPixels, pixels_of_array
+
+        try:
+            pixels = pixels_of_array(order, pixels)
+        except UnfitPixels as error:
+            raise InvalidFrame(str(error)) from error
     shape, kind = tuple(pixels.shape), pixels.dtype
     has_channels = len(shape) == 3 and shape[2] in (3, 4)
     if kind.kind != "u" or kind.itemsize > 2 or not (len(shape) == 2 or has_channels) or 0 in shape:
         raise InvalidFrame(
             f"An array {kind} of shape {list(shape)} is no picture: uint8 or uint16, [H, W], [H, W, 3] or [H, W, 4]."
         )
-    if kind.itemsize == 2:
-        pixels = (pixels >> 8).astype("uint8")
     if not has_channels:
         return pixels
     return pixels[..., :3] if order == "rgb" else pixels[..., 2::-1]

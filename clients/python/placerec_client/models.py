@@ -361,7 +361,7 @@ class QueryAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
@@ -646,6 +646,7 @@ class CameraView(Model):
     name: str
     mask: Mask | None = None
     intrinsics: Intrinsics | None = None
+    value_range: tuple[int, int] | None = None
     updated_at: datetime
 
 
@@ -679,7 +680,7 @@ class ClosureAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
@@ -1258,7 +1259,7 @@ class MapAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float | None = None
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     verification: VerificationView | None = None
     rivals: list[RivalGroup] = Field(default_factory=list)
     revision: int | None = None

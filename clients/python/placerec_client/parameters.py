@@ -1038,13 +1038,18 @@ class CalibrationOrder(TypedDict, total=False):
 
 
 class CameraDefinition(TypedDict, total=False):
-    """Which part of a camera's frames is ignored, and which direction each pixel looks in."""
+    """Which part of a camera's frames is ignored, which direction each pixel looks in, and which values it has."""
 
     mask: Mask | None
     """The part that is ignored; null if nothing is."""
 
     intrinsics: Intrinsics | None
     """Of the upright frame, as in ROS's CameraInfo; null if they are not known."""
+
+    value_range: tuple[int, int] | None
+    """The values of frames of 16 bits that become black and white, such as [0, 1023] of a camera of ten bits; null:
+    the upper 8 bits are used.
+    """
 
 
 class NewKey(TypedDict, total=False):

@@ -101,6 +101,8 @@ class Run:
             return name
         mask = None if there is None or there.mask is None else there.mask.model_dump(mode="json")
         definition: Any = {"mask": mask, "intrinsics": dict(intrinsics)}
+        if there is not None and there.value_range is not None:
+            definition["value_range"] = list(there.value_range)
         try:
             self._map.cameras.put(name, **definition)
         except Problem as problem:

@@ -64,7 +64,9 @@ class LedgerSource(ABC):
     def camera_lines(self) -> Iterator[bytes]:
         """The lines of cameras by name."""
         for camera in read_cameras(self.connection).values():
-            values = {name: json.loads(camera.model_dump_json(include={name}))[name] for name in ("mask", "intrinsics")}
+            values = json.loads(camera.model_dump_json(exclude={"name", "updated_at"}))
+            if camera.value_range is None:  # which earlier versions do not know
+                del values["value_range"]
             yield written_line({"name": camera.name, **values, "updated_at": moment_text(camera.updated_at)})
 
     def places(self) -> Iterator[ArchivedPlace]:

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 from sqlalchemy import bindparam, delete, select
 
 from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
-from core.frames.masks import Mask
+from core.frames.masks import Mask, RangedMask, with_range
+from core.frames.value_ranges import ValueRange
 from core.ledger.maps.checksums import DamagedRow, is_sound, sealed, sealed_columns
 from core.ledger.maps.connection import MapConnection, Reading
 from core.ledger.maps.schema import CAMERAS
@@ -22,6 +23,8 @@ from core.maps.cameras import Cameras as AnyCameras
 from core.maps.stored_fields import moment_text
 
 _C = CAMERAS.c
+_STORED: TypeAdapter[RangedMask | Mask] = TypeAdapter(RangedMask | Mask)
+"""What the column ``mask`` holds."""
 _COLUMNS = sealed_columns(CAMERAS)
 _ALL = Statement(select(*(_C[name] for name in _COLUMNS), _C.seal).where(_C.map == bindparam("map")).order_by(_C.name))
 _PUT = Statement(
@@ -59,13 +62,21 @@ class Cameras(AnyCameras):
     def known(self, name: str) -> CameraRecord | None:
         return self._records().get(name)
 
-    def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
-        """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.
+    def put(
+        self,
+        name: str,
+        mask: Mask | None,
+        intrinsics: Intrinsics | None = None,
+        value_range: ValueRange | None = None,
+    ) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace all its settings, durably; returns the camera and whether it is new.
 
         Raises:
             InvalidField: the map has too many cameras.
         """
-        made = CameraRecord(name=name, mask=mask, intrinsics=intrinsics, updated_at=datetime.now(UTC))
+        made = CameraRecord(
+            name=name, mask=mask, intrinsics=intrinsics, value_range=value_range, updated_at=datetime.now(UTC)
+        )
         with self._writing() as write:
             known = read_cameras(write.connection)
             if name not in known and len(known) >= MOST_CAMERAS:
@@ -98,7 +109,7 @@ def put_camera(connection: MapConnection, camera: CameraRecord) -> None:
     """Store a camera, in the place of one of its name."""
     values = {
         "name": camera.name,
-        "mask": _text(camera.mask),
+        "mask": _text(with_range(camera.mask, camera.value_range)),  # a column of its own would break the seals
         "intrinsics": _text(camera.intrinsics),
         "updated_at": moment_text(camera.updated_at),
     }
@@ -116,9 +127,12 @@ def read_cameras(connection: MapConnection) -> dict[str, CameraRecord]:
         name, mask, intrinsics, moment = columns
         if not is_sound(columns, seal):
             raise DamagedRow(f"the row of camera {name!r} does not match its checksum")
+        known = None if mask is None else _STORED.validate_json(mask)
+        ranged = known if isinstance(known, RangedMask) else None
         found[name] = CameraRecord(
             name=name,
-            mask=None if mask is None else Mask.model_validate_json(mask),
+            mask=known if ranged is None else ranged.areas(),
+            value_range=None if ranged is None else ranged.value_range,
             intrinsics=None if intrinsics is None else Intrinsics.model_validate_json(intrinsics),
             updated_at=moment,
         )

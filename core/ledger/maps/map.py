@@ -23,6 +23,7 @@ from core.errors import (
     UnknownSequence,
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
+from core.frames.value_ranges import few_values
 from core.geometry.keypoints import Keypoints
 from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import Cameras
@@ -176,7 +177,7 @@ class LedgerMap(ABC):
         if place.picture == "thumbnail":
             return picture
         try:
-            return encode_thumbnail(decode(picture, ANY_SIZE))
+            return encode_thumbnail(decode(picture, ANY_SIZE, few_values(picture)))
         except InvalidImage as error:
             raise NoThumbnail(f"The stored picture of {_named(place_id)} cannot be shown: {error}") from error
 

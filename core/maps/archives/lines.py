@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from core.errors import InvalidArchive
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
+from core.frames.value_ranges import ValueRange
 from core.geometry.keypoints import MOST_STORED
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
@@ -43,11 +44,12 @@ class SequenceLine(_Line):
 
 
 class CameraLine(_Line):
-    """A camera, the ignored parts of its frames, and its intrinsics."""
+    """A camera, the ignored parts of its frames, its intrinsics and the range of its values."""
 
     name: Camera
     mask: Mask | None
     intrinsics: Intrinsics | None
+    value_range: ValueRange | None = None
     updated_at: Timestamp
 
 

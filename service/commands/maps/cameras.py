@@ -41,9 +41,10 @@ def list_cameras(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_js
     if as_json:
         show_json(found)
         return
-    shown = table("camera", "mask", "intrinsics", "updated_at")
+    shown = table("camera", "mask", "intrinsics", "values", "updated_at")
     for camera in found:
-        shown.add_row(camera["name"], _area(camera["mask"]), _lens(camera["intrinsics"]), camera["updated_at"])
+        lens, values = _lens(camera["intrinsics"]), _values(camera["value_range"])
+        shown.add_row(camera["name"], _area(camera["mask"]), lens, values, camera["updated_at"])
     show(shown)
 
 
@@ -74,19 +75,37 @@ def put_camera(
             help="JSON: polygons, each by its corners, which are shares of width and height from the top left.",
         ),
     ] = None,
+    depth_bits: Annotated[
+        int | None,
+        typer.Option(min=1, max=16, help="Bits that the camera uses of frames of 16 bits: 10 are values 0 to 1023."),
+    ] = None,
+    value_range: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="Values of frames of 16 bits that become black and white, as of a thermal camera.",
+            show_default=False,
+        ),
+    ] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Create a camera, or change its mask or its intrinsics; what is not given stays as it is.
+    """Create a camera, or change its mask, its intrinsics or its values; what is not given stays as it is.
 
-    Without both options a new camera is only a name. FILE is JSON as the HTTP interface takes it; - reads standard
+    Without options a new camera is only a name. FILE is JSON as the HTTP interface takes it; - reads standard
     input, and a file with null removes what the camera has.
     """
     if intrinsics == mask == STANDARD_INPUT:
         raise typer.BadParameter("--intrinsics and --mask cannot both be read from standard input")
+    if depth_bits is not None and value_range is not None:
+        raise typer.BadParameter("--depth-bits is a --value-range from 0 on; give one of them")
     files = {"mask": mask, "intrinsics": intrinsics}
     changes = {field: _read_json(file) for field, file in files.items() if file is not None}
+    if depth_bits is not None:
+        changes["value_range"] = [0, 2**depth_bits - 1]
+    if value_range is not None:
+        changes["value_range"] = list(value_range)
     _show_camera(run(_put(CommandTarget(url, data_dir), path_of("maps", map_id, "cameras", name), changes)), as_json)
 
 
@@ -109,7 +128,7 @@ def delete_camera(
 async def _put(target: CommandTarget, path: str, changes: dict[str, Any]) -> dict[str, Any]:
     """Create the camera at ``path``, or change these fields of it; the camera as it is then."""
     async with open_service(target) as service:
-        before = {"mask": None, "intrinsics": None}
+        before = {"mask": None, "intrinsics": None, "value_range": None}
         try:
             found = await service.get(path)
         except Refused as refused:
@@ -159,6 +178,11 @@ def _lens(intrinsics: dict[str, Any] | None) -> str:
     return f"{intrinsics['width']} x {intrinsics['height']}, distortion {intrinsics['distortion_model']}"
 
 
+def _values(value_range: list[int] | None) -> str:
+    """The range of values of frames of 16 bits, in one cell."""
+    return "–" if value_range is None else f"{value_range[0]} to {value_range[1]}"
+
+
 def _show_camera(camera: dict[str, Any], as_json: bool) -> None:
     if as_json:
         show_json(camera)
@@ -172,5 +196,6 @@ def _show_camera(camera: dict[str, Any], as_json: bool) -> None:
     for field, value in (camera["intrinsics"] or {}).items():
         # Not rounded, for they may be copied from here.
         shown.add_row(field, ", ".join(map(str, value)) or "–" if isinstance(value, list) else str(value))
+    shown.add_row("values", _values(camera["value_range"]))
     shown.add_row("updated_at", camera["updated_at"])
     show(shown)

@@ -183,6 +183,7 @@ def without_stops(recording: Recording, frames: list[RecordedFrame], mask: Mask 
     from core.belief.view import STILL, View, view_of
     from core.errors import InvalidImage, InvalidRecording
     from core.frames.images import decode
+    from core.frames.masks import range_in
     from core.recordings.keyframes import moving
 
     with progress() as bar:
@@ -191,7 +192,7 @@ def without_stops(recording: Recording, frames: list[RecordedFrame], mask: Mask 
         def look(frame: RecordedFrame) -> View | None:
             bar.advance(task)
             try:
-                return view_of(decode(frame.load()), mask)
+                return view_of(decode(frame.load(), value_range=range_in(mask)), mask)
             except (InvalidImage, InvalidRecording, OSError):
                 return None  # what is wrong with it is said where it is sent
 
@@ -211,13 +212,14 @@ def describer(encoder: str | None, mask: Mask | None = None) -> Describe:
 
     from core.errors import InvalidImage, InvalidRecording
     from core.frames.images import decode
+    from core.frames.masks import range_in
     from service.commands.encoders.models import default_encoder, open_catalogue
 
     used = open_catalogue(None).get(encoder or default_encoder())
 
     def describe(frame: RecordedFrame) -> NDArray[np.float32] | None:
         try:
-            descriptor = used.encode(decode(frame.load()), mask).descriptor
+            descriptor = used.encode(decode(frame.load(), value_range=range_in(mask)), mask).descriptor
         except (InvalidImage, InvalidRecording, OSError):
             return None
         length = float(np.linalg.norm(descriptor))

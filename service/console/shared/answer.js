@@ -10,6 +10,7 @@ import { html, useMemo, useState } from "./view.js";
 
 const REASONS = {
   "no-regions": "The frame shows nothing to compare, as a blank wall does.",
+  "few-values": "The frame has 16 bits and uses so few of their values that it shows nothing: give its camera in the map a range of values.",
   "empty-map": "The map has no places.",
   "no-place-allowed": "No place fits the filters.",
 };

@@ -42,13 +42,14 @@ export default function Cameras({ map }) {
 }
 
 function Card({ map, camera, edit, ask, editing }) {
-  const { name, mask, intrinsics } = camera;
+  const { name, mask, intrinsics, value_range: values } = camera;
   return html`
     <section class="panel" aria-label=${`Camera ${name}`}>
       <div class="spread"><h2>${name}</h2>${may("enrol") && html`<span class="row"><button type="button" class="small" disabled=${editing} aria-label=${`Edit ${name}`} onClick=${() => edit(camera)}>Edit</button><button type="button" class="small danger" aria-label=${`Delete ${name}`} onClick=${() => ask(camera)}>Delete</button></span>`}</div>
       <${Facts} rows=${[
         ["Mask", mask ? `${counted(mask.polygons.length, "area")}, about ${percent(mask.polygons.reduce((sum, one) => sum + areaOf(one), 0))} of the frame` : "none: all of the frame counts"],
         ["Intrinsics", intrinsics ? `${intrinsics.width} × ${intrinsics.height}, f ${intrinsics.fx.toFixed(0)}, ${intrinsics.distortion_model}` : "not known"],
+        ...(values ? [["Values of 16 bits", values.join(" to ")]] : []),
         ["Changed", html`<${Moment} at=${camera.updated_at} />`],
       ]} />
       ${mask && html`<${Sample} map=${map} name=${name}><${Polygons} polygons=${mask.polygons} /><//>`}
@@ -79,6 +80,7 @@ function Editor({ map, camera, cancel, done }) {
   const [name, setName] = useState(camera.name);
   const [polygons, setPolygons] = useState(camera.mask?.polygons || []);
   const [intrinsics, setIntrinsics] = useState(camera.intrinsics ? JSON.stringify(camera.intrinsics, null, 1) : "");
+  const [values, setValues] = useState((camera.value_range || []).join(" to "));
   const [frame, setFrame] = useState(null);
   const [error, setError] = useState(null);
   useEffect(() => () => frame && URL.revokeObjectURL(frame.url), [frame]);
@@ -92,7 +94,7 @@ function Editor({ map, camera, cancel, done }) {
     event.preventDefault();
     setError(null);
     try {
-      const body = { mask: polygons.length ? { polygons } : null, intrinsics: read(intrinsics) };
+      const body = { mask: polygons.length ? { polygons } : null, intrinsics: read(intrinsics), value_range: values.trim() ? values.match(/\d+/g)?.map(Number) || [] : null };
       await send("PUT", mapPath(map, "cameras", name.trim()), { json: body });
       say(`The camera ${name.trim()} was saved. Its mask holds for frames from now on.`);
       done();
@@ -113,6 +115,9 @@ function Editor({ map, camera, cancel, done }) {
       <${MaskEditor} polygons=${polygons} change=${setPolygons}>${shown}<//>
       <${Field} label="Intrinsics" hint="JSON with width, height, fx, fy, cx, cy, distortion_model and distortion, as ROS has them; empty if they are not known.">
         <textarea class="mono" rows="3" spellcheck=${false} value=${intrinsics} onInput=${(event) => setIntrinsics(event.target.value)}></textarea>
+      <//>
+      <${Field} label="Values of 16 bits" hint="Which become black and white, such as 0 to 1023 of a camera of ten bits; empty for pictures of 8 bits, and of all 16.">
+        <input class="mono" spellcheck=${false} autocomplete="off" value=${values} onInput=${(event) => setValues(event.target.value)} />
       <//>
       ${error && html`<${Trouble} error=${error} />`}
       <footer><button type="button" onClick=${cancel}>Cancel</button><button type="submit" class="primary" disabled=${!name.trim()}>Save</button></footer>

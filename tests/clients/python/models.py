@@ -1,4 +1,5 @@
-"""The modules of the client that are written from ``openapi.json``: models, parameters, problems.
+"""The modules of the client that are written: models, parameters and problems from ``openapi.json``, pixel formats
+from the core's.
 
     python -m tests.clients.python.models     # writes them; so does scripts/client
 
@@ -240,7 +241,18 @@ def problems() -> str:
     return "\n".join(lines)
 
 
-MODULES = {"models.py": models, "parameters.py": parameters, "problems.py": problems}
+def pixel_formats() -> str:
+    """The module of the pixel formats: the core's own, which the client may not import."""
+    source = (ROOT / "core" / "frames" / "pixel_formats.py").read_text()
+    return "# Written from core/frames/pixel_formats.py by scripts/client.  Do not edit.\n" + source
+
+
+MODULES = {
+    "models.py": models,
+    "parameters.py": parameters,
+    "problems.py": problems,
+    "pixel_formats.py": pixel_formats,
+}
 
 
 def formatted(source: str, name: str) -> str:

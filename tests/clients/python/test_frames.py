@@ -37,14 +37,25 @@ def test_the_order_of_the_channels_and_views_of_arrays() -> None:
     assert read is not None and np.array_equal(read, pixels[10:50:2, 5:60])
 
 
-def test_opacity_and_the_lower_bits_are_left_out() -> None:
+def test_opacity_is_left_out_and_sixteen_bits_stay() -> None:
     pixels = np.random.default_rng(0).integers(0, 1 << 16, (31, 7, 4), np.uint16)
-    upper = (pixels >> 8).astype(np.uint8)
-    expected = frame_bytes(np.ascontiguousarray(upper[..., :3]))
-    for given in (upper, pixels[..., :3], pixels, pixels.astype(">u2")):
+    expected = frame_bytes(np.ascontiguousarray(pixels[..., :3]))
+    read = cv2.imdecode(np.frombuffer(expected, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read is not None and read.dtype == np.uint16 and np.array_equal(read, pixels[..., :3])
+    for given in (pixels[..., :3], pixels, pixels.astype(">u2"), Picture(pixels[..., [2, 1, 0, 3]], order="rgb")):
         assert frame_bytes(given) == expected
-    assert frame_bytes(Picture(pixels[..., [2, 1, 0, 3]], order="rgb")) == expected
-    assert frame_bytes(pixels[..., 0]) == frame_bytes(upper[..., 0])
+    upper = (pixels >> 8).astype(np.uint8)
+    assert frame_bytes(upper) == frame_bytes(np.ascontiguousarray(upper[..., :3]))
+    read = cv2.imdecode(np.frombuffer(frame_bytes(pixels[..., 0]), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read is not None and np.array_equal(read, pixels[..., 0])
+
+
+def test_a_jpeg_has_the_upper_bits_if_there_is_something_in_them() -> None:
+    pixels = np.asarray(cv2.GaussianBlur(scene(1), (0, 0), 3), np.uint8)
+    full, ten = pixels.astype(np.uint16) * 257, pixels.astype(np.uint16) * 4
+    assert frame_bytes(Picture(full, encoding="jpeg")) == frame_bytes(Picture(pixels, encoding="jpeg"))
+    with pytest.raises(InvalidFrame, match=f"reach only {ten.max()} of 65535"):
+        frame_bytes(Picture(ten, encoding="jpeg"))
 
 
 def test_the_bytes_of_a_file_in_an_array() -> None:

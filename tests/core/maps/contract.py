@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from core import errors
-from core.frames.masks import Mask
+from core.frames.masks import Mask, with_range
 from core.judgement.priors import Disc, Period
 from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, SameFrame, Selection, Store
 from core.maps.archives.reading import Archive, check
@@ -310,16 +310,20 @@ class StoreContract(RuleBasedStateMachine):
 
         self.agree(lambda model: model.store_counterparts([pair], poses), stored)
 
-    @rule(name=st.sampled_from(["front", "rear"]), covered=st.sampled_from([None, 0.5]))
-    def put_camera(self, name: str, covered: float | None) -> None:
+    @rule(
+        name=st.sampled_from(["front", "rear"]),
+        covered=st.sampled_from([None, 0.5]),
+        values=st.sampled_from([None, (0, 1023)]),
+    )
+    def put_camera(self, name: str, covered: float | None, values: tuple[int, int] | None) -> None:
         mask = None if covered is None else Mask(polygons=(((0, 0), (covered, 0), (0, covered)),))
 
         def put(model: MapModel) -> bool:
             is_new = name not in model.cameras
-            model.cameras[name] = mask
+            model.cameras[name] = with_range(mask, values)
             return is_new
 
-        self.agree(put, lambda lab: lab.cameras.put(name, mask)[1])
+        self.agree(put, lambda lab: lab.cameras.put(name, mask, value_range=values)[1])
 
     @rule(name=st.sampled_from(["front", "rear"]))
     def forget_camera(self, name: str) -> None:
@@ -443,7 +447,7 @@ class StoreContract(RuleBasedStateMachine):
         assert len(found) == len(expected["places"])
         assert not (wrong := differences(wanted, found)), "\n".join(wrong)
         self.model.told(found)
-        assert {camera.name: camera.mask for camera in lab.cameras.all()} == expected["cameras"]
+        assert {camera.name: lab.cameras.mask(camera.name) for camera in lab.cameras.all()} == expected["cameras"]
         ends = sorted(([name, end] for name, end in lab.transfer.sequence_ends().items()), key=str)
         assert ends == expected["ends"]
         names = sorted({place.sequence for place in self.model.places.values() if place.sequence is not None})

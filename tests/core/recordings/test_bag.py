@@ -25,15 +25,16 @@ from tests.core.recordings.bags import (
     SECOND,
     START,
     WRITERS,
+    Said,
     compressed,
     fix,
     image,
     moved,
     walk,
     write_mcap,
-    write_ros1,
     write_rosbag2,
 )
+from tests.core.recordings.foxglove import write as write_foxglove
 from tests.service.scenes import encoded, jpeg, scene
 
 ODOM = Poses(topic=ODOMETRY)
@@ -81,46 +82,12 @@ def test_what_mcap_writes_rosbags_reads_alike(writer: str, tmp_path: Path) -> No
     assert [time for _, time in read] == [frame.nanoseconds for frame in frames]
 
 
-def test_pictures_of_every_encoding_keep_their_pixels(tmp_path: Path) -> None:
-    colours = scene(3, 64, 48)
-    grey = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)
-    deep = grey.astype(np.uint16) * 256 + 17
-    yuyv = np.stack([grey, np.full_like(grey, 128)], axis=2)
-    uyvy = yuyv[:, :, ::-1]
-    from_grey = cv2.cvtColor(yuyv, cv2.COLOR_YUV2BGR_YUY2)
-    padded = np.pad(grey, ((0, 0), (0, 16)))
-    pictures = {
-        "bgr8": (colours, colours, 0),
-        "rgb8": (colours[:, :, ::-1], colours, 0),
-        "bgra8": (np.dstack([colours, grey]), colours, 0),
-        "rgba8": (np.dstack([colours[:, :, ::-1], grey]), colours, 0),
-        "mono8": (padded, grey, 0),
-        "mono16": (deep.astype("<u2"), grey, 0),
-        "MONO16": (deep.astype(">u2"), grey, 1),
-        "yuv422_yuy2": (yuyv, from_grey, 0),
-        "yuyv": (yuyv, from_grey, 0),
-        "yuv422": (uyvy, from_grey, 0),
-        "uyvy": (uyvy, from_grey, 0),
-    }
-    said = [
-        image(START + index, 64, 48, name, np.ascontiguousarray(given).tobytes(), given[0].nbytes, big)
-        for index, (name, (given, _, big)) in enumerate(pictures.items())
-    ]
-    _, data, _ = loaded(write_mcap(tmp_path / "a.mcap", said))
-    for (name, (_, expected, _)), png in zip(pictures.items(), data, strict=True):
-        assert png.startswith(b"\x89PNG"), name
-        assert np.array_equal(pixels_of(png, cv2.IMREAD_ANYCOLOR), expected), name
-    assert data == loaded(tmp_path / "a.mcap")[1]  # the same bytes again
-
-
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_the_colour_that_was_mosaicked(pattern: str, tmp_path: Path) -> None:
-    channel = {"b": 0, "g": 1, "r": 2}
-    colour = np.array([30, 90, 200], np.uint8)  # b, g, r
-    tile = np.array([colour[channel[letter]] for letter in pattern], np.uint8).reshape(2, 2)
-    said = [image(START, 32, 32, f"bayer_{pattern}8", np.tile(tile, (16, 16)).tobytes(), 32)]
-    _, (png,), _ = loaded(write_ros1(tmp_path / "a.bag", said))
-    assert np.array_equal(pixels_of(png)[8:24, 8:24][5, 5], colour)
+def test_rows_may_have_padding(tmp_path: Path) -> None:
+    grey = cv2.cvtColor(scene(3, 64, 48), cv2.COLOR_BGR2GRAY)
+    said = [image(START, 64, 48, "mono8", np.pad(grey, ((0, 0), (0, 16))).tobytes(), 80)]
+    _, (png,), _ = loaded(write_mcap(tmp_path / "a.mcap", said))
+    assert np.array_equal(pixels_of(png, cv2.IMREAD_ANYCOLOR), grey)
+    assert [png] == loaded(tmp_path / "a.mcap")[1]  # the same bytes again
 
 
 def test_a_picture_that_cannot_be_used_fails_alone(tmp_path: Path) -> None:
@@ -132,7 +99,7 @@ def test_a_picture_that_cannot_be_used_fails_alone(tmp_path: Path) -> None:
     with open_recording(write_mcap(tmp_path / "a.mcap", said)) as recording:
         with pytest.raises(InvalidImage, match="encoding '32FC1' is not read; mono8"):
             recording.frames[0].load()
-        with pytest.raises(InvalidImage, match="announces 64x48 pixels of bgr8 and has 100 bytes"):
+        with pytest.raises(InvalidImage, match="announces 64x48 pixels of bgr8 in rows of 192 bytes and has 100 bytes"):
             recording.frames[1].load()
         assert recording.frames[2].load().startswith(b"\x89PNG")
 
@@ -238,6 +205,41 @@ def test_a_bag_in_several_files_is_one_bag(tmp_path: Path) -> None:
     frames, data, remarks = loaded(path)
     assert data == [jpeg(index) for index in range(6)]
     assert len({frame.id for frame in frames}) == 6 and remarks == []
+
+
+@pytest.mark.parametrize("content", [b"", bytes(4096), b"this is no bag " * 500])
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_file_of_a_bag_that_is_none_is_left_out(suffix: str, content: bytes, tmp_path: Path) -> None:
+    path = write_rosbag2(tmp_path / "walk", walk(4), plugin="sqlite3" if suffix == ".db3" else "mcap")
+    (path / "metadata.yaml").unlink()
+    (path / f"walk_1{suffix}").write_bytes(content)
+    frames, data, remarks = loaded(path)
+    assert len(frames) == 4 and data == [jpeg(index) for index in range(4)]
+    (remark,) = remarks
+    assert remark.startswith("1 of 2 files are left out, and the others are read: ") and f"walk_1{suffix}" in remark
+    (path / f"walk_0{suffix}").write_bytes(content)
+    (path / f"walk{suffix}").write_bytes(content)
+    with pytest.raises(InvalidRecording, match="walk"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ([image(START + n, 8, 8, "32FC1", bytes(256), 32) for n in range(20)], "The encoding '32FC1' is not read"),
+        ([compressed(START + n, b"\0\0\0\1video", form="h264") for n in range(20)], "h264 is another transport"),
+        ([compressed(START + n, b"?", form="16UC1; compressedDepth png") for n in range(20)], "a depth image"),
+    ],
+)
+def test_a_topic_of_which_no_picture_can_be_used_is_refused_once(said: list[Said], why: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidRecording, match=f"None of the 20 frames of /.* can be used. .*{why}"):
+        open_recording(write_mcap(tmp_path / "a.mcap", said))
+
+
+def test_a_bag_of_videos_names_them(tmp_path: Path) -> None:
+    path = write_foxglove(tmp_path / "a.mcap", "json", [("/front/video", "CompressedVideo", 1, {"format": "h264"})])
+    with pytest.raises(UnknownTopic, match=r"Videos are not read, as /front/video \(foxglove.CompressedVideo\): repub"):
+        open_recording(path)
 
 
 @pytest.mark.parametrize("name", ["empty.db3", "empty.mcap", "empty.bag", "text.db3", "text.mcap", "text.bag"])

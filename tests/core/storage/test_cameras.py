@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -43,6 +43,24 @@ def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Atlas, la
     again.put("front", None)
     assert again.find("front").intrinsics is None
     opened.close()
+
+
+@pytest.mark.parametrize("mask", [None, MASK])
+def test_a_range_of_values_goes_with_the_mask_of_frames(
+    mask: Mask | None, directory: Path, atlas: Atlas, lab: Map
+) -> None:
+    lab.cameras.put("front", mask, None, (0, 1023))
+    before = lab.cameras.mask("front")
+    lab.cameras.put("front", mask, None, (0, 4095))
+    atlas.close()
+    with closing(Atlas(directory)) as opened:
+        cameras = opened.get(lab.record.id).cameras
+        assert cameras.find("front").settings() == (mask, None, (0, 4095))
+        used = cameras.mask("front")
+        assert used is not None and before is not None and used.digest != before.digest
+        assert used.covered(8, 8).any() == (mask is not None)
+        cameras.put("front", mask)
+        assert cameras.mask("front") == mask
 
 
 def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import cv2
@@ -182,6 +183,35 @@ def test_impossible_intrinsics_are_refused_and_nothing_is_stored(
     assert_problem(refused, 422, "invalid-request")
     assert told in refused.text
     assert_problem(client.get(path), 404, "unknown-camera")
+
+
+def deep(seed: int, low: int, step: int) -> bytes:
+    """A scene in 16 bits, from ``low`` on in steps of ``step``."""
+    grey = cv2.cvtColor(scene(seed), cv2.COLOR_BGR2GRAY)
+    return encoded((grey.astype(np.uint16) * step + low), ".png")
+
+
+@pytest.mark.parametrize(
+    ("low", "step", "said"),
+    [(0, 4, r"its values reach only \d+ of 65535"), (20_000, 8, r"its values lie between 2\d+ and 2\d+ of 65535")],
+)
+def test_frames_of_16_bits_are_scaled_by_the_range_of_their_camera(
+    server: Server, map_id: str, low: int, step: int, said: str
+) -> None:
+    path = f"/v1/maps/{map_id}/cameras/deep"
+    dark = assert_problem(server.enrol(map_id, "dark", deep(1, low, step)), 422, "no-regions")
+    assert re.search(said, dark["detail"]) and "value_range" in dark["detail"]
+    assert_problem(server.client.put(path, json={"value_range": [low, low]}), 422, "invalid-request")
+    made = server.client.put(path, json={"value_range": [low, low + 255 * step]})
+    assert made.status_code == 201 and made.json()["value_range"] == [low, low + 255 * step], made.text
+    for seed in (1, 2):
+        assert server.enrol(map_id, f"p{seed}", deep(seed, low, step), camera="deep").status_code == 201
+    grey = encoded(cv2.cvtColor(scene(2), cv2.COLOR_BGR2GRAY), ".png")
+    for answer in (server.query(map_id, deep(2, low, step), camera="deep"), server.query(map_id, grey, camera="deep")):
+        assert answer["matches"][0]["place"]["id"] == "p2" and answer["matches"][0]["score"] > 0.99
+    blank = server.query(map_id, deep(2, low, step))
+    assert (blank["verdict"], blank["reason"]) == ("unknown", "few-values")
+    assert server.query(map_id, encoded(np.zeros((64, 64), np.uint8), ".png"))["reason"] == "no-regions"
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 
 from placerec_client import Client
@@ -20,13 +23,14 @@ from tests.core.recordings.bags import (
     WRITERS,
     camera_info,
     compressed,
+    image,
     walk,
     write_mcap,
     write_ros1,
 )
 from tests.service.commands.conftest import Placerec, placerec
 from tests.service.map_jobs import finished, places, reaching, wait_until
-from tests.service.scenes import jpeg
+from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server
 
 __all__ = ["placerec"]
@@ -148,6 +152,35 @@ def test_a_camera_without_intrinsics_gets_those_of_the_bag(taking: Server, place
     assert said[2][0] in placerec(*words).stderr
     for map_id in (by_bag, by_command):
         assert stored(map_id, "unmeasured") == SEEN and stored(map_id, "measured")["fx"] == 90.0
+
+
+def test_a_camera_without_a_range_gets_that_of_a_bag_of_ten_bits(
+    taking: Server, placerec: Placerec, tmp_path: Path
+) -> None:
+    greys = [cv2.cvtColor(scene(number), cv2.COLOR_BGR2GRAY) for number in range(4)]
+    ten = [(grey.astype(np.uint16) * 4).tobytes() for grey in greys]
+    said = [image(START + n * SECOND, 320, 240, "mono16", data, 640) for n, data in enumerate(ten)]
+    path = write_mcap(tmp_path / "ten.mcap", said)
+    by_bag, by_command = "range-by-bag", "range-by-command"
+    for map_id in (by_bag, by_command):
+        taking.create_map(map_id)
+        assert taking.client.put(f"/v1/maps/{map_id}/cameras/deep", json={}).status_code == 201
+    assert put(taking, by_bag, "ten.mcap", 0, path.read_bytes()).status_code == 200
+    result = enrolled(taking, by_bag, "ten.mcap", camera="deep")["result"]
+    words = ("enrol", path, "--map", by_command, "--url", taking.client.base_url)
+    told = placerec(*words, "--camera", "deep").stderr
+    assert result["chosen"] == 4 and len(result["remarks"]) == 1 and result["remarks"][0] in " ".join(told.split())
+    assert "The camera deep had no range of values" in result["remarks"][0]
+    assert re.search(r"whose values reach only \d+ of 65535", result["remarks"][0])
+    for map_id in (by_bag, by_command):
+        low, high = taking.client.get(f"/v1/maps/{map_id}/cameras/deep").json()["value_range"]
+        assert 0 <= low < 200 and 900 < high <= 1020
+        answer = taking.query(map_id, encoded(greys[2], ".png"))
+        assert answer["matches"][0]["place"]["id"] == list(places(taking, map_id))[2]
+        assert answer["matches"][0]["score"] > 0.9
+
+    refused = placerec(*words, "--sequence", "again", "--id-prefix", "n-", status=1).stderr
+    assert "name a camera of the map" in refused and refused.count("and 3 more frames: The frame has no region") == 1
 
 
 def test_intrinsics_that_are_none_are_told_and_not_stored(taking: Server, tmp_path: Path) -> None:

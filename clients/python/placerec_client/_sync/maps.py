@@ -566,7 +566,9 @@ class Cameras(OldNames, forget="delete"):
                 yield item
 
     def put(self, name: str, **options: Unpack[parameters.CameraDefinition]) -> models.CameraView:
-        """Create or replace a camera: ``mask`` is what to ignore in its frames, ``intrinsics`` measure poses."""
+        """Create or replace a camera: ``mask`` is what to ignore in its frames, ``intrinsics`` measure poses,
+        ``value_range`` scales 16 bits.
+        """
         return self._connection.ask(models.CameraView, "PUT", self._of(name), json=options)
 
     def read(self, name: str) -> models.CameraView:

@@ -29,7 +29,7 @@ LENS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 @pytest.fixture
 def full(lab: MemoryMap) -> MemoryMap:
     """Two places and two cameras, with a value in every column of one or the other."""
-    lab.cameras.put("front", MASK, LENS)
+    lab.cameras.put("front", MASK, LENS, (0, 1023))
     lab.cameras.put("rear", None)
     metre, degree = Pose(x=1.5, y=-0.0, z=0.1, heading=359.5), Pose(latitude=48.8566, longitude=-2.0)
     lab.enrol([frame("p0", timestamp=MOMENT, sequence="Ünter den Linden", camera="front", metadata={"ä": [None, 1.5]})])
@@ -103,7 +103,9 @@ def test_a_changed_value_of_a_camera_is_noticed(full: MemoryMap) -> None:
             with pytest.raises(DamagedRow, match=f"camera '{name}' does not match its checksum"):
                 cameras.read_cameras(connection)
     with full._reading() as connection:
-        assert cameras.unsound(connection) == [] and len(cameras.read_cameras(connection)) == 2
+        known = cameras.read_cameras(connection)
+        assert cameras.unsound(connection) == [] and list(known) == ["front", "rear"]
+    assert known["front"].settings() == (MASK, LENS, (0, 1023)) and known["rear"].settings() == (None, None, None)
 
 
 def test_a_changed_record_of_a_map_is_noticed(full: MemoryMap) -> None:

@@ -30,7 +30,9 @@ def filled(lab: Map) -> Map:
     lab.forget("gone")  # with its sequence, whose track stays
     lab.forget("p5")
     lab.cameras.put("front", Mask(polygons=(((0, 0), (0.25, 0), (0, 0.25)),)))
-    lab.cameras.put("rear", None, Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0))
+    lab.cameras.put(
+        "rear", None, Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0), (7000, 9000)
+    )
     lab.edit({"description": "hall", "keep": "none", "index": "exact"})
     return lab
 

@@ -42,21 +42,26 @@ def test_a_camera_from_its_making_to_its_end(placerec: Placerec, where: list[str
         placerec(*put, *words, stdin=stdin)
         found = json.loads(placerec("maps", "cameras", "show", lab, "front", "--json", *where).stdout)
         assert found["name"] == "front"
+        assert found["value_range"] == (values or None)
         return [found["mask"], found["intrinsics"]]
 
+    values: list[int] = []
     assert made() == [None, None], "only a name"
     assert made("--mask", mask) == [MASK, None]
     assert made("--intrinsics", "-", stdin=lens.read_text()) == [MASK, LENS]
     assert made() == [MASK, LENS]
     assert made("--mask", nothing) == [None, LENS]
     assert made("--mask", "-", "--intrinsics", nothing, stdin=mask.read_text()) == [MASK, None]
-    assert made("--intrinsics", lens) == [MASK, LENS]
+    values += [0, 1023]
+    assert made("--intrinsics", lens, "--depth-bits", 10) == [MASK, LENS]
+    values[:] = [7000, 9000]
+    assert made("--value-range", 7000, 9000) == made() == [MASK, LENS]
 
     placerec("maps", "cameras", "put", lab, "rear", *where)
     listed = json.loads(placerec("maps", "cameras", "list", lab, "--json", *where).stdout)
     assert [camera["name"] for camera in listed] == ["front", "rear"]
     front, rear = cells(placerec("maps", "cameras", "list", lab, *where).stdout)[1:]
-    assert " ".join(front).startswith("front 1 polygon 640 x 480, distortion plumb_bob 2")
+    assert " ".join(front).startswith("front 1 polygon 640 x 480, distortion plumb_bob 7000 to 9000 2")
     assert rear[:3] == ["rear", "–", "–"]
     shown = cells(placerec("maps", "cameras", "show", lab, "front", *where).stdout)
     assert ["polygon", "1", "(0,", "0.75)", "(1,", "0.75)", "(1,", "1)", "(0,", "1)"] in shown
@@ -90,6 +95,8 @@ def test_a_wrong_mask_is_refused_and_nothing_is_made(
 def test_wrong_words_are_refused(placerec: Placerec, server: Server, tmp_path: Path) -> None:
     put, there = ("maps", "cameras", "put", "nosuch", "front"), ("--url", server.client.base_url)
     placerec(*put, "--mask", "-", "--intrinsics", "-", *there, status=2)
+    placerec(*put, "--depth-bits", 10, "--value-range", 0, 9, *there, status=2)
+    placerec(*put, "--depth-bits", 17, *there, status=2)
     missing = placerec(*put, "--mask", tmp_path / "missing.json", *there, status=1).stderr
     assert "missing.json cannot be read: No such file or directory." in missing
     assert "nosuch" in placerec(*put, *there, status=1).stderr
