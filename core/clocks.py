@@ -35,7 +35,7 @@ LAST_SECOND = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()
 
 @dataclass(frozen=True)
 class Stamp:
-    """What a frame says of when it was taken; None where it does not say.
+    """The time and the number that a frame says of itself; None where it does not say.
 
     moment: by the robot's clock, seconds since 1970 UTC.
     number: the robot's number of the frame.
@@ -99,7 +99,7 @@ def interval(last: Stamp, now: Stamp, passed: float) -> Interval:
 
 
 def future(moment: float, clock: float) -> str | None:
-    """What is to be said of a time that :func:`is_ahead`, after its name; None of any other."""
+    """The remark on a time that :func:`is_ahead`, to follow its name; None on any other."""
     if not is_ahead(moment, clock):
         return None
     return f"{time_text(moment)} is more than a day ahead of the service's clock, {time_text(clock)}"

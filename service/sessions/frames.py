@@ -194,7 +194,7 @@ def _since_last(session: Session, options: FrameParameters) -> Interval:
 
 
 def _distrust(taken: datetime | None) -> str | None:
-    """What is to be said of a frame's time that is no date, because it is far ahead of this machine's clock."""
+    """The remark on a frame's time that is no date, because it is far ahead of this machine's clock; None on others."""
     told = None if taken is None else future(taken.timestamp(), time.time())
     return None if told is None else f"The frame's time {told}: it counts within the run alone."
 

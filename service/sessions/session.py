@@ -145,7 +145,7 @@ class Session:
 
     @property
     def stamp(self) -> Stamp:
-        """What the last frame, or those before it, said of when it was taken."""
+        """The time and the number of the last frame that had each."""
         return Stamp(self.moment, self.number)
 
     @property
