@@ -6,12 +6,14 @@ import csv
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from core.errors import InvalidRecording, InvalidTraverse
 from core.frames.traverses import find_images
+from core.names import composed
+from core.numerals import check_numeral
 from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
 from core.recordings.frame import RecordedFrame, make_id
 from core.recordings.pictures import sendable
@@ -21,17 +23,20 @@ POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 COLUMNS = ("file", "id", *POSE, "timestamp")
 
 
+_Cell = Annotated[float, BeforeValidator(lambda text: check_numeral(text.removeprefix("+")))]
+
+
 class _Row(BaseModel):
     """The cells of one row of ``places.csv`` that are not empty."""
 
     model_config = ConfigDict(extra="ignore")
 
-    x: float | None = None
-    y: float | None = None
-    z: float | None = None
-    heading: float | None = None
-    latitude: float | None = None
-    longitude: float | None = None
+    x: _Cell | None = None
+    y: _Cell | None = None
+    z: _Cell | None = None
+    heading: _Cell | None = None
+    latitude: _Cell | None = None
+    longitude: _Cell | None = None
     timestamp: Timestamp | None = None
 
 
@@ -146,12 +151,19 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         )
 
 
+def _in_any_form(path: Path) -> Path:
+    """A file of this name, or of one that differs from it in its form of Unicode alone; the path itself if none is."""
+    if path.name.isascii() or path.is_file() or not path.parent.is_dir():
+        return path
+    return next((one for one in path.parent.iterdir() if composed(one.name) == composed(path.name)), path)
+
+
 def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> _Found:
     where = f"{path.name}, line {line}"
     if None in cells or None in cells.values():
         raise InvalidTraverse(f"{where}: the row has more or fewer cells than the first line.")
     given = {name: cell.strip() for name, cell in cells.items() if cell.strip()}
-    image = path.parent / given.get("file", "")
+    image = _in_any_form(path.parent / given.get("file", ""))
     if "file" not in given or not image.is_file():
         raise InvalidTraverse(f"{where}: there is no file {given.get('file', '')!r}.")
     try:

@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 
 from core.errors import InvalidRecording
 from core.frames.exif import read_pose_and_time
+from core.names import composed
 from core.places import Pose, microseconds
 
 NANOSECONDS = 1_000_000_000
@@ -63,7 +64,7 @@ def make_id(text: str, prefix: str = "") -> str:
     Raises:
         InvalidRecording: no character of an id is left.
     """
-    made = re.sub(r"[^A-Za-z0-9._~-]+", "-", prefix + text)
+    made = re.sub(r"[^A-Za-z0-9._~-]+", "-", composed(prefix + text))
     made = re.sub(r"^[^A-Za-z0-9]+", "", made)[:128]
     if not made.strip("-"):
         raise InvalidRecording(f"No id can be made from the name {text!r}; give one in places.csv.")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from core.errors import InvalidIdentifier
+from core.names import composed
 from core.places import check_sequence
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
@@ -284,7 +285,7 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend
     wanted = {frame.id for frame in frames}
     known: dict[str, Any] = {}
     async for page in service.pages(path_of("maps", map_id, "places")):
-        known.update({place["id"]: place["sequence"] for place in page["items"] if place["id"] in wanted})
+        known.update({place["id"]: composed(place["sequence"]) for place in page["items"] if place["id"] in wanted})
     taken = [frame for frame in frames if frame.id in known and known[frame.id] != frame.sequence]
     if taken:
         other = known[taken[0].id]
