@@ -29,6 +29,7 @@ from service.commands.options.recordings import (
     FixedFrame,
     LargestGap,
     MovingFrame,
+    PosesFrom,
     PoseTopic,
     RecordingOptions,
     Topic,
@@ -96,6 +97,7 @@ def enrol(
     moving_frame: MovingFrame = None,
     trajectory: TrajectoryFile = None,
     trajectory_times: TrajectoryTimes = None,
+    poses: PosesFrom = None,
     largest_gap: LargestGap = None,
     every_metres: EveryMetres = None,
     every_degrees: EveryDegrees = None,
@@ -115,8 +117,9 @@ def enrol(
     """Enrol the frames of a recording, in their order, as places of a map.
 
     A directory of images is taken in natural order. Poses come from places.csv in it
-    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
-    images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
+    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the file names if all are
+    of the form @east@north@…@heading@…@.jpg, or else from the EXIF data of the images; ids are the file names without
+    their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
     shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
@@ -133,6 +136,7 @@ def enrol(
         every_change,
         fixed_frame,
         moving_frame,
+        poses,
     )
     target = CommandTarget(url, data_dir)
     began = time.monotonic()
