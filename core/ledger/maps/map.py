@@ -423,9 +423,12 @@ class LedgerMap(ABC):
         return len(found)
 
     def forget_sequence(self, name: str) -> int:
-        count = 0
+        count, spelled = 0, None
         with self._writing() as write:
             while some := places.listed(write.connection, -1, _AT_ONCE, PlaceFilter(sequence=name)):
+                if count and some[0].place.sequence != spelled:
+                    break  # another traverse, of old, whose name looks the same
+                spelled = some[0].place.sequence
                 for stored in some:
                     write.forget(stored)
                 count += len(some)
