@@ -96,6 +96,10 @@ class InvalidField(PlacerecError):
     """A pose, timestamp, sequence, metadata or map setting is malformed."""
 
 
+class MixedCoordinates(PlacerecError):
+    """A pose is in metres and the places of the map have latitudes and longitudes, or the other way round."""
+
+
 class InvalidCursor(PlacerecError):
     """A pagination cursor was not made by this listing."""
 

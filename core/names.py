@@ -7,13 +7,17 @@ none has a slash, a backslash, which browsers take for one, or such a character.
 
 A name is either a *text* in any script, or a *word* of ASCII that begins with a letter or a digit, which no text can
 look like.  Both are patterns without anchors and without assertions, which JSON Schema and Rust can read as well.
+
+A text has one form, the composed one of Unicode (NFC), in which keyboards write: some systems take file names apart
+(``e`` and an accent behind it), and two names that look the same would be two.
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 
@@ -38,6 +42,32 @@ _NO_NAME = re.compile(r"(\.|%2e){1,2}|.*[\ud800-\udfff\U000e0001\U000e0020-\U000
 
 LONGEST = 128
 """Characters of the longest name."""
+
+
+Value = TypeVar("Value")
+
+
+def composed(value: Value) -> Value:
+    """A text in its one form (NFC); of an object or a list as JSON has them, all texts and all names in it.
+
+    Raises:
+        ValueError: two names of an object are one in this form.
+    """
+    made: Any = value
+    if isinstance(value, str):
+        made = unicodedata.normalize("NFC", value)
+    elif isinstance(value, list):
+        made = [composed(one) for one in value]
+    elif isinstance(value, dict):
+        made = {composed(name): composed(one) for name, one in value.items()}
+        if len(made) < len(value):
+            raise ValueError("two names of an object differ in nothing that can be seen")
+    return made
+
+
+def spellings(text: str) -> list[str]:
+    """The forms in which a text may have been stored before there was one form, this one first."""
+    return list(dict.fromkeys((text, unicodedata.normalize("NFD", text))))
 
 
 def word(most: int, more: str = "~") -> str:
@@ -65,11 +95,12 @@ class Names:
     but: str | None = None
 
     def check(self, text: str) -> str:
-        """Return ``text`` if it can be a name.
+        """Return ``text`` in its one form if it can be a name.
 
         Raises:
             InvalidIdentifier: it cannot.
         """
+        text = composed(text)
         too_long = self.most is not None and len(text) > self.most
         if too_long or text == self.but or _NO_NAME.fullmatch(text) or not re.fullmatch(self.pattern, text):
             raise InvalidIdentifier(f"{text[:140]!a} cannot name {self.what}: a name {self.rule}.")

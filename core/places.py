@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core import names
-from core.errors import InvalidIdentifier
+from core.errors import InvalidIdentifier, MixedCoordinates
 
 MAP_IDS = names.file_names("a map", but="import")
 PLACE_IDS = names.words("a place", 128)
@@ -104,6 +104,13 @@ def check_sequence(text: str) -> str:
     return SEQUENCES.check(text)
 
 
+PoseKind = Literal["metric", "geographic"]
+COORDINATES: dict[PoseKind, str] = {
+    "metric": "metric coordinates (x and y in metres)",
+    "geographic": "geographic coordinates (latitude and longitude in degrees)",
+}
+
+
 class Pose(BaseModel):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84).
 
@@ -149,9 +156,34 @@ class Pose(BaseModel):
         unit = [math.cos(phi) * math.cos(theta), math.cos(phi) * math.sin(theta), math.sin(phi)]
         return EARTH_RADIUS * np.array(unit)
 
-    def kind(self) -> Literal["metric", "geographic"]:
+    def kind(self) -> PoseKind:
         """Whether the pose is in metres or in degrees."""
         return "metric" if self.x is not None else "geographic"
+
+
+def pose_kinds(kinds: NDArray[np.int8]) -> set[PoseKind]:
+    """Which kinds of poses are among some, int8 [n] (``Whereabouts.kind``)."""
+    codes: tuple[tuple[PoseKind, int], ...] = (("metric", METRIC), ("geographic", GEOGRAPHIC))
+    return {name for name, code in codes if (kinds == code).any()}
+
+
+def check_coordinates(known: Collection[PoseKind], kind: PoseKind, subject: str) -> None:
+    """Check that coordinates are of the kind that the places of a map have.
+
+    Args:
+        known: the kinds of their poses; none while no place has a pose, and both in a map of old.
+        kind: of the coordinates.
+        subject: what has these, as a sentence begins.
+
+    Raises:
+        MixedCoordinates: they are of the other kind.
+    """
+    if known and kind not in known:
+        (there,) = known
+        raise MixedCoordinates(
+            f"{subject} has {COORDINATES[kind]}, and the places of the map have {COORDINATES[there]}: a map has one "
+            "kind. Convert them, or use another map."
+        )
 
 
 def _utc(moment: datetime) -> datetime:

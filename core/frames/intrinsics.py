@@ -95,6 +95,13 @@ class Intrinsics(BaseModel):
         """The angle in radians that a pixel in the middle covers: the mean of both directions."""
         return float(1 / np.sqrt(self.fx * self.fy))
 
+    @property
+    def across(self) -> float:
+        """The angle in radians between the left and the right edge of the frame; NaN if a distortion has no inverse."""
+        middle = self.cy + 0.5
+        left, right = self.bearings(np.array([[0.0, middle], [self.width, middle]]))
+        return float(np.arccos(np.clip(left @ right, -1, 1)))
+
     def of_size(self, width: int, height: int) -> Intrinsics:
         """The intrinsics of the same camera's frames after they were scaled by one factor.
 

@@ -25,7 +25,7 @@ from core.maps.records import (
 from core.maps.review import ReviewFrame, stored_frames
 from core.maps.selection import Selection
 from core.maps.status import ErasureReport, IndexStatus, Recall, StorageStatus
-from core.maps.store import Map, Ranking, Scope, Snapshot, Store
+from core.maps.store import Map, Ranking, Reject, Scope, Snapshot, Store, refuse_all
 
 __all__ = [
     "EVERY_PLACE",
@@ -48,6 +48,7 @@ __all__ = [
     "Precision",
     "Ranking",
     "Recall",
+    "Reject",
     "RejectedGround",
     "ReviewFrame",
     "ReviewSetting",
@@ -61,5 +62,6 @@ __all__ = [
     "TierSetting",
     "VerifyReport",
     "own_poses",
+    "refuse_all",
     "stored_frames",
 ]

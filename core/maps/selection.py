@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
-from core.judgement.priors import Constraint
+from core.judgement.priors import Constraint, Disc, GeographicBox
 from core.maps.place_filter import Scalar
+from core.places import PoseKind, check_coordinates
 
 TRUST = 0.9
 """The probability that a prior is right, if the caller states none."""
@@ -63,3 +64,17 @@ class Selection:
 
     def __bool__(self) -> bool:
         return bool(self.filters or self.prior or self.recent or self.excluded)
+
+    def check_coordinates(self, known: Callable[[PoseKind], Collection[PoseKind]]) -> None:
+        """Check that areas are given in coordinates that the places of a map have.
+
+        Args:
+            known: the kinds of their poses, of which it has to tell a given one.
+
+        Raises:
+            MixedCoordinates: an area is given in the other kind.
+        """
+        for constraint in (*self.filters.geometry, *self.prior.geometry):
+            if isinstance(constraint, Disc | GeographicBox):
+                kind = constraint.centre.kind() if isinstance(constraint, Disc) else "geographic"
+                check_coordinates(known(kind), kind, "The area of the query")

@@ -50,6 +50,15 @@ Ranking = tuple[Rows, NDArray[np.float32]]
 """Rows, best first, and their inner products."""
 
 
+Reject = Callable[[int, Exception], None]
+"""Is called with the position of an item of many and the reason why it is not taken; it may raise, to refuse all."""
+
+
+def refuse_all(_position: int, error: Exception) -> None:
+    """Refuse all items because of one."""
+    raise error
+
+
 def merged(a: Ranking, b: Ranking) -> Ranking:
     """The rows of two rankings of one map, best first."""
     rows, first = np.unique(np.concatenate([a[0], b[0]]), return_index=True)
@@ -355,20 +364,30 @@ class Map(Protocol):
     def enrol(self, items: Sequence[Enrolment]) -> Sequence[tuple[Place, Change]]: ...
 
     @overload
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
+    def enrol(
+        self, items: Sequence[Enrolment | SameFrame], reject: Reject = ...
+    ) -> Sequence[tuple[Place, Change] | None]: ...
 
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
+    def enrol(
+        self, items: Sequence[Enrolment | SameFrame], reject: Reject = refuse_all
+    ) -> Sequence[tuple[Place, Change] | None]:
         """Store frames as places, or as looks of places, in the order given, all of them or, if this raises, none.
 
         An id that exists keeps its place and creation time: if the frame's digest is the same, only its fields are
         stored (``unchanged``, ``updated``), otherwise its frame is ``replaced``, and the looks that the place learnt
         from runs are gone.  An id may occur twice.
 
+        Args:
+            reject: is called with the position of an item whose coordinates are of the kind that the map does not have
+                (MixedCoordinates); unless it raises, the others are stored.
+
         Returns:
-            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame.
+            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame,
+            and for an item that was rejected.
 
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
+            MixedCoordinates: by ``reject``, if it is left out.
             UnknownPlace, RepeatedLook, LookNameTaken, TooManyLooks: a look is of no place, or of one that cannot have
                 it.
             NoRegions: a descriptor is all zero.
@@ -379,14 +398,14 @@ class Map(Protocol):
         """Replace all fields of a place; its frame stays.
 
         Raises:
-            UnknownPlace, InvalidField.
+            UnknownPlace, InvalidField, MixedCoordinates.
         """
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
         """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
 
         Raises:
-            UnknownPlace, InvalidField.
+            UnknownPlace, InvalidField, MixedCoordinates.
         """
 
     def add_keypoints(self, found: Sequence[tuple[PicturedPlace, Keypoints]]) -> int:

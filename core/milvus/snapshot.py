@@ -266,15 +266,20 @@ class MilvusScope:
 
 
 def scope_of(connection: MapConnection, snapshot: MilvusSnapshot, selection: Selection | None) -> MilvusScope:
-    """The places of a snapshot that a query may find by what its caller knows."""
+    """The places of a snapshot that a query may find by what its caller knows.
+
+    Raises:
+        MixedCoordinates: an area is given in coordinates that the places do not have.
+    """
     whole = MilvusScope(snapshot)
     if not selection:
         return whole
+    selection.check_coordinates(lambda kind: places.kinds_of_poses(connection, kind))
     filters = selection.filters
     constraints = _constraints(connection, filters)
     recent = selection.recent
     if recent is not None:
-        code = sequences.codes_of(connection, [recent.sequence]).get(recent.sequence)
+        code = sequences.find_code(connection, recent.sequence)
         if code is not None:
             oldest = sequences.oldest_of_last(connection, code, recent.frames) if recent.frames else None
             moment = recent.moment if recent.seconds else None

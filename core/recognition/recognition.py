@@ -67,6 +67,10 @@ class RivalPlaces:
     same_place: bool
 
 
+OTHER_LENS = 1.6
+"""The factor between the horizontal fields of view of two cameras from which an answer is doubtful."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """The answer to one query.
@@ -80,6 +84,7 @@ class Answer:
     pose: the estimated pose of the query, from the poses of the best match and its neighbours, and from the geometry
         where they were verified; None if they have none.
     note: why the camera's intrinsics were not used for the pose; None if they were, or if there are none.
+    lens: by how much the camera sees more or less than that of the best match, if that makes answers wrong; else None.
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them, less further looks of these places.
     third_stage: whether the candidates were verified geometrically.
@@ -97,6 +102,7 @@ class Answer:
     third_stage: ThirdStage = NOT_VERIFIED
     rivals: tuple[RivalPlaces, ...] = ()
     note: str | None = None
+    lens: str | None = None
 
     @property
     def blank(self) -> bool:
@@ -371,7 +377,32 @@ def _put_together(
     if len(listed) < len(places):
         candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
-    return Answer(judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note)
+    lens = other_lens(map_, query.question.camera, places[0].camera) if places else None
+    return Answer(
+        judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note, lens
+    )
+
+
+def other_lens(map_: Map, camera: str | None, other: str | None) -> str | None:
+    """Say, in a sentence, that a camera sees much more or less than the one that took a place; else None.
+
+    Nothing can be said where the angle of one is not known.
+
+    Args:
+        camera, other: the names of the camera of the query and of that of the place.
+    """
+    if camera == other:
+        return None
+    ours, theirs = map_.cameras.intrinsics(camera), map_.cameras.intrinsics(other)
+    if ours is None or theirs is None:
+        return None
+    factor = ours.across / theirs.across
+    if not max(factor, 1 / factor) >= OTHER_LENS:
+        return None
+    return (
+        f"The camera {camera!r} sees {factor:.2g} times the angle that the camera {other!r} of the place sees: answers "
+        "across so different lenses are often wrong by a few places, however sure they seem."
+    )
 
 
 def _why_without_intrinsics(map_: Map, camera: str | None, best: Place, stage: ThirdStage) -> str | None:

@@ -1,4 +1,8 @@
-"""A folder of pictures: those that its ``places.csv`` lists, in that order, or all, in natural order."""
+"""A folder of pictures: those that its ``places.csv`` lists, in that order, or all, in natural order.
+
+Poses are those of the list; without one, those in the names of the files (:mod:`core.recordings.pose_names`) if all
+have that form; else those of the EXIF data.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,25 @@ import csv
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from core.errors import InvalidRecording, InvalidTraverse
 from core.frames.traverses import find_images
+from core.names import composed
+from core.numerals import check_numeral
 from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
 from core.recordings.frame import RecordedFrame, make_id
 from core.recordings.pictures import sendable
+from core.recordings.pose_names import NamedPose, named_pose
 
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 COLUMNS = ("file", "id", *POSE, "timestamp")
+
+
+_Cell = Annotated[float, BeforeValidator(lambda text: check_numeral(text.removeprefix("+")))]
 
 
 class _Row(BaseModel):
@@ -26,12 +36,12 @@ class _Row(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    x: float | None = None
-    y: float | None = None
-    z: float | None = None
-    heading: float | None = None
-    latitude: float | None = None
-    longitude: float | None = None
+    x: _Cell | None = None
+    y: _Cell | None = None
+    z: _Cell | None = None
+    heading: _Cell | None = None
+    latitude: _Cell | None = None
+    longitude: _Cell | None = None
     timestamp: Timestamp | None = None
 
 
@@ -43,19 +53,20 @@ class _Found(NamedTuple):
     line: int | None = None
 
 
-def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame], list[str]]:
+def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> tuple[list[RecordedFrame], list[str]]:
     """The frames of a directory, and remarks on them; a frame has its name as its id if no id can be made of it.
 
     Args:
         prefix: of the ids that are made from file names.
+        by_names: whether poses are those in the names, also if there is a list, or not all names have one.
 
     Raises:
         InvalidTraverse: the directory has neither a list nor an image; the list is malformed or names a missing file;
-            or two frames have the same id.
+            two frames have the same id; or the names have no poses, or poses in several zones.
     """
     listed = directory / FILE_NAME
-    remarks = []
-    if listed.is_file():
+    remarks: list[str] = []
+    if listed.is_file() and not by_names:
         found = list(_listed_frames(listed, prefix))
         if not found:
             raise InvalidTraverse(f"{listed} lists no frame.")
@@ -63,12 +74,50 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame
         if left_out:
             remarks.append(f"{left_out} images of {directory} are not listed in {FILE_NAME} and are left out.")
     else:
-        found = [
-            _Found(path, RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
-            for path in find_images(directory)
-        ]
+        images = find_images(directory)
+        poses = _named_poses(images, by_names, remarks)
+        found = [_Found(path, _frame(path, prefix, pose)) for path, pose in zip(images, poses, strict=True)]
     _check_ids(found)
     return [one.frame for one in found], remarks
+
+
+def _frame(path: Path, prefix: str, pose: NamedPose | None) -> RecordedFrame:
+    """A picture that no list names; its time, and its pose where names have none, are those of its EXIF data."""
+    embedded, at = pose is None or pose.pose is not None, None if pose is None else pose.pose
+    return RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), at, embedded=embedded)
+
+
+def _named_poses(images: list[Path], wanted: bool, remarks: list[str]) -> list[NamedPose | None]:
+    """The poses in the names of some pictures; none of all if they are not wanted and a name has not their form.
+
+    Raises:
+        InvalidTraverse: they are wanted, and no name has one; or they are of several zones.
+    """
+    found = [named_pose(path.name) for path in images]
+    posed = [one.pose for one in found if one is not None and one.pose is not None]
+    if wanted and not posed:
+        raise InvalidTraverse(
+            f"No file name of {images[0].parent} says a pose, as @east@north@…@heading@…@.jpg does: leave out --poses."
+        )
+    if not wanted and (not posed or None in found):
+        if posed:
+            remarks.append(
+                f"{len(posed)} of {len(images)} file names say a pose (@east@north@…), and the others do not: poses "
+                "are those of EXIF data; with --poses names they are those of the names."
+            )
+        return [None] * len(images)
+    zones = sorted({one.zone for one in found if one is not None and one.zone})
+    if len(zones) > 1:
+        raise InvalidTraverse(
+            f"The file names are of several zones of UTM ({', '.join(zones)}), whose metres lie in no common frame: "
+            "enrol the pictures of each zone into a map of its own."
+        )
+    headed = sum(pose.heading is not None for pose in posed)
+    remarks.append(
+        f"Poses are those in the file names (@east@north@…{f', UTM zone {zones[0]}' if zones else ''}): {len(posed)} "
+        f"of {len(images)} frames have one, {headed} with a heading."
+    )
+    return [NamedPose(None) if one is None else one for one in found]
 
 
 def _check_ids(found: list[_Found]) -> None:
@@ -146,12 +195,19 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         )
 
 
+def _in_any_form(path: Path) -> Path:
+    """A file of this name, or of one that differs from it in its form of Unicode alone; the path itself if none is."""
+    if path.name.isascii() or path.is_file() or not path.parent.is_dir():
+        return path
+    return next((one for one in path.parent.iterdir() if composed(one.name) == composed(path.name)), path)
+
+
 def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> _Found:
     where = f"{path.name}, line {line}"
     if None in cells or None in cells.values():
         raise InvalidTraverse(f"{where}: the row has more or fewer cells than the first line.")
     given = {name: cell.strip() for name, cell in cells.items() if cell.strip()}
-    image = path.parent / given.get("file", "")
+    image = _in_any_form(path.parent / given.get("file", ""))
     if "file" not in given or not image.is_file():
         raise InvalidTraverse(f"{where}: there is no file {given.get('file', '')!r}.")
     try:

@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 
 from core.errors import InvalidRecording
 from core.frames.exif import read_pose_and_time
+from core.names import composed
 from core.places import Pose, microseconds
 
 NANOSECONDS = 1_000_000_000
@@ -25,7 +26,8 @@ class RecordedFrame:
         order cost least, for a bag retains one unpacked chunk and a video decodes forward only.
     nanoseconds: when it was taken by the recording's own clock, which for bags counts from 1970; None if not known.
     timestamp: when it was taken, UTC; None if not known, as for a video.
-    embedded: whether pose and timestamp are those of the EXIF data of its bytes, which ``described`` reads.
+    embedded: whether the timestamp, and the pose unless there is one, are those of the EXIF data of its bytes, which
+        ``described`` reads.
     """
 
     id: str
@@ -46,6 +48,7 @@ class RecordedFrame:
             return self
         pose, timestamp = read_pose_and_time(self.load() if data is None else data)
         taken = None if timestamp is None else 1000 * microseconds(timestamp)
+        pose = pose if self.pose is None else self.pose
         return replace(self, pose=pose, timestamp=timestamp, nanoseconds=taken, embedded=False)
 
 
@@ -63,7 +66,7 @@ def make_id(text: str, prefix: str = "") -> str:
     Raises:
         InvalidRecording: no character of an id is left.
     """
-    made = re.sub(r"[^A-Za-z0-9._~-]+", "-", prefix + text)
+    made = re.sub(r"[^A-Za-z0-9._~-]+", "-", composed(prefix + text))
     made = re.sub(r"^[^A-Za-z0-9]+", "", made)[:128]
     if not made.strip("-"):
         raise InvalidRecording(f"No id can be made from the name {text!r}; give one in places.csv.")

@@ -34,6 +34,7 @@ class Poses:
     file: a trajectory in the form of TUM or KITTI.
     times: of the trajectory in the form of KITTI; None if it has a pose for each frame.
     largest_gap: seconds between two poses between which one is interpolated.
+    names: those in the names of the files of a folder, whatever else says poses.
     """
 
     topic: str | None = None
@@ -42,6 +43,7 @@ class Poses:
     largest_gap: float = LARGEST_GAP
     fixed: str | None = None
     moving: str | None = None
+    names: bool = False
 
 
 @dataclass
@@ -114,10 +116,14 @@ def open_recording(path: Path, topic: str | None = None, poses: Poses = Poses(),
             raise InvalidRecording(f"{path} is not a bag, so it has no topics: leave out {option}.")
     if poses.times is not None and poses.file is None:
         raise InvalidTrajectory("A file of times goes with a trajectory.")
+    if poses.names and (of_bag or not path.is_dir()):
+        raise InvalidRecording(
+            f"{path} is not a folder of pictures, so no names of files say poses: leave out --poses."
+        )
     if of_bag:
         recording = _open_bag(path, topic, poses)
     else:
-        recording = _open_video(path) if _is_video(path) else _open_folder(path, prefix)
+        recording = _open_video(path) if _is_video(path) else _open_folder(path, prefix, poses.names)
     try:
         if poses.file is not None:
             trajectory, by_frame = read_trajectory(poses.file, poses.times)
@@ -187,8 +193,8 @@ def _check_format(topic: str, frames: list[RecordedFrame]) -> None:
         raise InvalidRecording(f"None of the {len(frames)} frames of {topic} can be used. {first}")
 
 
-def _open_folder(path: Path, prefix: str) -> Recording:
-    frames, remarks = folder_frames(path, prefix)
+def _open_folder(path: Path, prefix: str, by_names: bool) -> Recording:
+    frames, remarks = folder_frames(path, prefix, by_names)
     return Recording(path.resolve().name, frames, remarks)
 
 

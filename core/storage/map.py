@@ -21,6 +21,7 @@ from core.ledger.maps.record import MapState
 from core.maps.records import MapRecord, VerifyReport
 from core.maps.selection import Selection
 from core.maps.status import ErasureReport, IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
+from core.maps.store import Reject, refuse_all
 from core.places import Place
 from core.storage.archives.exporter import Exporter
 from core.storage.database.connections import FILE, DatabaseClosed, at_one_moment, connect, read_now
@@ -353,8 +354,8 @@ class Map(LedgerMap):
                     connection.close()
         return super().drop_pictures(before, most)
 
-    def enrol(self, items: Any) -> Any:
-        found = super().enrol(items)
+    def enrol(self, items: Any, reject: Reject = refuse_all) -> Any:
+        found = super().enrol(items, reject)
         if items and self.indexer is not None:
             self.indexer.keep_up()
         return found

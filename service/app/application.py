@@ -36,6 +36,7 @@ from service.fairness import RefusalPace
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
+from service.http.text_form import TextForm
 from service.jobs import routes as jobs
 from service.maps import calibration, calibration_preview, camera_routes, event_routes, transfer_routes
 from service.maps import routes as maps
@@ -291,6 +292,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
     app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics, pace=pace)
     app.add_middleware(Telemetry, metrics=metrics)
+    app.add_middleware(TextForm)
     if chosen.root_path:
         app.add_middleware(RootPath, root_path=chosen.root_path)  # the outermost middleware is added last
     return app

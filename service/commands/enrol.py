@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from core.errors import InvalidIdentifier
+from core.names import composed
 from core.places import check_sequence
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
@@ -29,6 +30,7 @@ from service.commands.options.recordings import (
     FixedFrame,
     LargestGap,
     MovingFrame,
+    PosesFrom,
     PoseTopic,
     RecordingOptions,
     Topic,
@@ -96,6 +98,7 @@ def enrol(
     moving_frame: MovingFrame = None,
     trajectory: TrajectoryFile = None,
     trajectory_times: TrajectoryTimes = None,
+    poses: PosesFrom = None,
     largest_gap: LargestGap = None,
     every_metres: EveryMetres = None,
     every_degrees: EveryDegrees = None,
@@ -115,8 +118,9 @@ def enrol(
     """Enrol the frames of a recording, in their order, as places of a map.
 
     A directory of images is taken in natural order. Poses come from places.csv in it
-    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
-    images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
+    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the file names if all are
+    of the form @east@north@…@heading@…@.jpg, or else from the EXIF data of the images; ids are the file names without
+    their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
     shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again.
@@ -133,6 +137,7 @@ def enrol(
         every_change,
         fixed_frame,
         moving_frame,
+        poses,
     )
     target = CommandTarget(url, data_dir)
     began = time.monotonic()
@@ -297,7 +302,7 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend
     wanted = {frame.id for frame in frames}
     known: dict[str, Any] = {}
     async for page in service.pages(path_of("maps", map_id, "places")):
-        known.update({place["id"]: place["sequence"] for place in page["items"] if place["id"] in wanted})
+        known.update({place["id"]: composed(place["sequence"]) for place in page["items"] if place["id"] in wanted})
     taken = [frame for frame in frames if frame.id in known and known[frame.id] != frame.sequence]
     if taken:
         other = known[taken[0].id]

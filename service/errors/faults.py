@@ -34,6 +34,12 @@ class UnsupportedMediaType(Fault):
     """The resource does not support the content type, or the bytes are of another type."""
 
 
+class UnsupportedCoding(UnsupportedMediaType):
+    """The body is sent in a content coding, such as gzip."""
+
+    headers: ClassVar = {"Accept-Encoding": "identity"}
+
+
 class BodyTooLarge(Fault):
     """The body has more bytes than the limit of the resource; the rest was not read."""
 

@@ -95,6 +95,7 @@ KINDS: dict[type[Exception], Kind] = {
     # Maps and places
     errors.InvalidIdentifier: Kind(422, "invalid-identifier", "The id is not valid"),
     errors.InvalidField: Kind(422, "invalid-field", "A field is not valid"),
+    errors.MixedCoordinates: Kind(409, "mixed-coordinates", "The map has coordinates of the other kind"),
     errors.InvalidCursor: Kind(422, "invalid-cursor", "The cursor does not belong to this list"),
     errors.UnknownMap: Kind(404, "unknown-map", "The map does not exist"),
     errors.MapExists: Kind(409, "map-exists", "A map of this id already exists"),

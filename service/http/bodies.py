@@ -9,11 +9,22 @@ import time
 from collections.abc import AsyncIterator
 from typing import Any
 
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
+from core.names import composed
+from service.errors.faults import (
+    BodyTooLarge,
+    ClientGone,
+    DeadlineExceeded,
+    InvalidRequest,
+    MalformedBody,
+    MemoryFull,
+    UnsupportedCoding,
+)
 from service.fairness import Holding, SharedRoom
+from service.http.digests import StatedDigests
 from service.settings import Settings
 
 PIECE_BYTES = 1 << 20
@@ -72,11 +83,14 @@ class Intake:
         self.size, self.complete = 0, False
         self.holding = Holding(self._give_way)
         """The bytes of this body that are held in memory."""
+        self._digest_headers: tuple[str, ...] = ("Content-Digest",)
         self._is_held, self._given_way = True, False
         self._receiving: asyncio.Timeout | None = None
         self._receive, self._memory = receive, memory
-        lengths = [value for name, value in scope["headers"] if name == b"content-length"]
-        self._announced = int(lengths[0]) if lengths and lengths[0].isdigit() else 0
+        self._headers = Headers(scope=scope)
+        self._digests: StatedDigests | None = None
+        length = self._headers.get("content-length", "")
+        self._announced = int(length) if length.isdecimal() else 0
 
     async def __call__(self) -> Message:
         """The next message.
@@ -86,9 +100,13 @@ class Intake:
             MemoryFull: the uploads under way leave no room for the body, or not any more.
             DeadlineExceeded: the body did not arrive in time.
             ClientGone: the connection was closed before the end of the body.
+            UnsupportedCoding: the body is compressed.
+            InvalidRequest: its digest is malformed.
+            DigestMismatch: the whole body has another digest; this comes in place of its last bytes.
         """
         if self.complete:
             return await self._next(None)
+        digests = self._stated_digests()
         self._check(self._announced)
         if self._is_held:
             self._memory.check(self.holding, max(0, self._announced - self.size))
@@ -106,8 +124,28 @@ class Intake:
         if self._is_held and arrived:
             self._memory.hold(self.holding, arrived)
         self.size += arrived
-        self.complete = not message.get("more_body", False)
+        digests.add(message.get("body", b""))
+        if not message.get("more_body", False):
+            digests.check()
+            self.complete = True
         return message
+
+    def _stated_digests(self) -> StatedDigests:
+        """The digests that the head of the request states of its body, once its coding is known to be none."""
+        if self._digests is None:
+            codings = self._headers.get("content-encoding", "")
+            if coding := next((one for one in codings.split(",") if one.strip().lower() not in ("", "identity")), None):
+                raise UnsupportedCoding(
+                    f"Content-Encoding: {coding.strip()[:40]!r} is not taken here; send the body as it is."
+                )
+            self._digests = StatedDigests()
+            for header in self._digest_headers:
+                self._digests.expect(header, ",".join(self._headers.getlist(header)))
+        return self._digests
+
+    def check_whole(self) -> None:
+        """Check ``Repr-Digest`` as well: the body is a whole file, and no piece of one."""
+        self._digest_headers = ("Content-Digest", "Repr-Digest")
 
     async def _next(self, seconds: float | None) -> Message:
         """The next message of the server; raises TimeoutError, or MemoryFull as soon as the body has given way."""
@@ -192,14 +230,29 @@ def intake_of(request: Request) -> Intake:
     return intake
 
 
-def parse_json(data: bytes | str, what: str) -> Any:
-    """Parse JSON; numbers may still be infinite and strings may contain lone surrogates.
+def read_json(data: bytes | str, **options: Any) -> Any:
+    """The value of JSON, whose texts and names are in their one form (:func:`core.names.composed`).
+
+    Args:
+        options: of ``json.loads``.
 
     Raises:
-        MalformedBody: the text is not JSON, or is nested too deeply.
+        ValueError: it is not JSON, or has two names in an object that look the same.
+        RecursionError.
+    """
+    value = json.loads(data, **options)
+    escaped = "\\u" in data if isinstance(data, str) else b"\\u" in data
+    return composed(value) if escaped or not data.isascii() else value
+
+
+def parse_json(data: bytes | str, what: str) -> Any:
+    """Parse JSON, its texts in their one form; numbers may still be infinite, and strings may contain lone surrogates.
+
+    Raises:
+        MalformedBody: the text is not JSON, is nested too deeply, or has two names in an object that look the same.
     """
     try:
-        return json.loads(data)
+        return read_json(data)
     except RecursionError:
         raise MalformedBody(f"{what} is nested too deeply.") from None
     except ValueError as error:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from core.names import composed
 from service.errors.faults import BodyTooLarge, MalformedBody
 
 if TYPE_CHECKING:
@@ -118,8 +119,8 @@ class FormReader:
         headers = self._part.headers
         _, options = parse_options_header(headers.get(b"content-disposition", b""))
         try:
-            name = options.get(b"name", b"").decode()
-            filename = options[b"filename"].decode() if b"filename" in options else None
+            name = composed(options.get(b"name", b"").decode())
+            filename = composed(options[b"filename"].decode()) if b"filename" in options else None
             content_type = headers.get(b"content-type", b"").split(b";")[0].strip().lower().decode() or None
         except UnicodeDecodeError as error:
             raise MalformedBody("A part's headers are not UTF-8.") from error

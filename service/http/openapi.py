@@ -44,6 +44,8 @@ COMMON_V1: tuple[type[Exception], ...] = (faults.InvalidRequest,)
 COMMON_OF_BODIES: tuple[type[Exception], ...] = (
     faults.MalformedBody,
     faults.BodyTooLarge,
+    faults.UnsupportedMediaType,
+    faults.DigestMismatch,
     faults.MemoryFull,
     faults.DeadlineExceeded,
 )

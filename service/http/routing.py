@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 from starlette.responses import Response
 
 from core.maps import Map
+from core.numerals import Decimal
 from core.places import check_map_id, check_place_id, check_sequence
 from service.access.roles import Principal
 from service.engine.engine import Engine
@@ -62,7 +63,7 @@ async def _principal(request: Request) -> Principal:
 async def _request_deadline(
     request: Request,
     x_request_timeout: Annotated[
-        float | None,
+        Decimal | None,
         Header(
             gt=0,
             le=3600,

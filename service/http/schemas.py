@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self, TypeVar
+from functools import cache
+from typing import Annotated, Any, Self, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from core.numerals import check_numeral
 from core.places import Camera
 from core.recognition.question import Verify
 from service.errors.faults import InvalidRequest
@@ -48,9 +50,14 @@ def validated(model: type[Model], value: Any) -> Model:
 
 
 class Parameters(BaseModel):
-    """Base of the parameters of one operation; unknown names are refused."""
+    """Base of the parameters of one operation; unknown names are refused, and texts that are no plain numerals."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _plain_number(cls, value: Any, info: ValidationInfo) -> Any:
+        return check_numeral(value) if isinstance(value, str) and info.field_name in _numbers_of(cls) else value
 
     def joined(self, fields: Mapping[str, str]) -> Self:
         """These parameters, from the query string, together with the fields of a form.
@@ -65,6 +72,17 @@ class Parameters(BaseModel):
         if twice:
             raise InvalidRequest(f"{twice[0]} is given both in the query string and in the form.")
         return validated(type(self), {**given, **fields})
+
+
+@cache
+def _numbers_of(model: type[BaseModel]) -> frozenset[str]:
+    """The names of the fields that are numbers."""
+    return frozenset(name for name, field in model.model_fields.items() if _is_number(field.annotation))
+
+
+def _is_number(annotation: Any) -> bool:
+    parts = get_args(annotation)
+    return annotation in (int, float) or (str not in parts and any(map(_is_number, parts)))
 
 
 class PageParameters(Parameters):

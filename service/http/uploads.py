@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +10,16 @@ from starlette.requests import Request
 
 from core.errors import EmptyImage, ImageTooLarge
 from core.frames.containers import read_header
+from core.names import composed
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
-from service.http.bodies import intake_of, parse_json
+from service.http.bodies import intake_of, parse_json, read_json
 from service.http.multipart import FormPart, read_form
 from service.settings import Settings
 
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png", "image/webp": "webp"}
+OTHER_NAMES = {"image/jpg": "image/jpeg", "image/pjpeg": "image/jpeg", "image/x-png": "image/png"}
+"""Content types of the same formats that some clients send."""
+
 UNSPECIFIC = (None, "application/octet-stream")
 """Content types of a part that do not say which format it has; its first bytes decide."""
 
@@ -37,8 +40,9 @@ class UploadedFrame:
 
 
 def media_type(request: Request) -> str:
-    """The request's content type without its parameters, in lower case; "" if it names none."""
-    return request.headers.get("content-type", "").split(";")[0].strip().lower()
+    """The request's content type by its registered name, without parameters, in lower case; "" if it names none."""
+    kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    return OTHER_NAMES.get(kind, kind)
 
 
 def check_frame(data: bytes, content_type: str | None) -> None:
@@ -51,6 +55,7 @@ def check_frame(data: bytes, content_type: str | None) -> None:
         InvalidImage: there are no bytes, or they are not those of a JPEG, PNG or WebP file.
         UnsupportedMediaType: the content type is of no such file, or of another format.
     """
+    content_type = OTHER_NAMES.get(content_type or "", content_type)
     if content_type not in UNSPECIFIC and content_type not in FORMATS:
         raise UnsupportedMediaType(f"Send a frame as {', '.join(FORMATS)}, not as {str(content_type)[:80]}.")
     if not data:
@@ -168,7 +173,7 @@ def split_form(parts: Iterable[FormPart]) -> tuple[list[FormPart], dict[str, str
 
 def _text(part: FormPart) -> str:
     try:
-        return part.data.decode()
+        return composed(part.data.decode())
     except UnicodeDecodeError:
         raise InvalidRequest(f"The field {part.name[:80]!r} is not UTF-8.") from None
 
@@ -193,9 +198,9 @@ def parse_metadata(text: str) -> dict[str, Any]:
         InvalidRequest: the text is not a JSON object.
     """
     try:
-        value = json.loads(text)
+        value = read_json(text)
     except (ValueError, RecursionError):
-        raise InvalidRequest("metadata: the value is not valid JSON.") from None
+        raise InvalidRequest("metadata: the value is not valid JSON, or has a name twice.") from None
     if not isinstance(value, dict):
         raise InvalidRequest("metadata: the value is not a JSON object.")
     return value

@@ -14,6 +14,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
 from core.maps.pagination import Listing, decode_number, page_of
+from core.numerals import Decimal
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
@@ -65,7 +66,7 @@ class JobPageParameters(PageParameters):
 JobPageQuery = Annotated[JobPageParameters, Query()]
 JobId = Annotated[str, Path(alias="job", max_length=64, description="Id of the job.", examples=["5f0c6a1de2b94c77"])]
 Wait = Annotated[
-    float,
+    Decimal,
     Query(
         ge=0, le=LONGEST_WAIT, allow_inf_nan=False, description="Seconds to wait for the job's end before answering."
     ),

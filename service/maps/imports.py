@@ -6,12 +6,11 @@ imports/.<name>      a file that is still arriving; the next start removes what 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import shutil
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -40,7 +39,7 @@ from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
 from core.storage.archives.unpacking import check_sizes
 from service.engine.engine import Engine
-from service.errors.faults import ClientGone, DigestMismatch, TooManyImports, TooManyPlaces
+from service.errors.faults import ClientGone, TooManyImports, TooManyPlaces
 from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
 from service.jobs.context import JobContext
@@ -107,18 +106,15 @@ class Imports:
 
     # Receiving
 
-    async def receive(
-        self, chunks: AsyncIterator[bytes], announced: int, digests: Sequence[bytes], accept: Accept
-    ) -> ReceivedFile:
+    async def receive(self, chunks: AsyncIterator[bytes], announced: int, accept: Accept) -> ReceivedFile:
         """Store a file as it arrives, and check its manifest as soon as that is there.
 
         Args:
             announced: length of the file in bytes; 0 if it is not known.
-            digests: each must be the SHA-256 of the file.
 
         Raises:
-            TooManyImports, InvalidArchive, ArchiveTooNew, DigestMismatch, StorageFull, StorageFailure, and whatever
-                ``accept`` and ``chunks`` raise: nothing of the file is left.
+            TooManyImports, InvalidArchive, ArchiveTooNew, StorageFull, StorageFailure, and whatever ``accept`` and
+                ``chunks`` raise: nothing of the file is left.
         """
         if len(self._files) >= self._engine.settings.max_imports:
             raise TooManyImports("Too many maps are being imported; send this one again later.")
@@ -129,7 +125,7 @@ class Imports:
             async with arriving(arrival, incoming.check_room):
                 async for piece in in_pieces(chunks):
                     await to_its_end(partial(incoming.add, piece))
-                return await to_its_end(lambda: incoming.complete(digests))
+                return await to_its_end(incoming.complete)
         except BaseException:
             await to_its_end(lambda: self._remove(arrival.name))
             raise
@@ -295,14 +291,14 @@ class Imports:
 
 
 class _IncomingFile:
-    """A file that is arriving: its bytes are hashed as they come, and its manifest is read as soon as it is there.
+    """A file that is arriving: its manifest is read as soon as it is there.
 
     For one thread at a time.
     """
 
     def __init__(self, arrival: Arrival, announced: int, accept: Accept) -> None:
         self._arrival, self._announced, self._accept = arrival, announced, accept
-        self._hash, self._size = hashlib.sha256(), 0
+        self._size = 0
         self._checked: tuple[Manifest, str, str] | None = None
         """The manifest, its tag, and the id of the map, as soon as they are known."""
 
@@ -317,7 +313,6 @@ class _IncomingFile:
         """Write the next bytes; raises what ``accept`` raises, or InvalidArchive, if the manifest is refused."""
         with disk_errors("store the map file"):
             write_at(self._arrival.file, data, self._size)
-        self._hash.update(data)
         self._size += len(data)
         if self._checked is None and self._size >= BLOCK:
             self._check_manifest()
@@ -333,14 +328,12 @@ class _IncomingFile:
                 )
             self._checked = manifest, tag, self._accept(manifest)
 
-    def complete(self, digests: Sequence[bytes]) -> ReceivedFile:
+    def complete(self) -> ReceivedFile:
         """Give the file its name for good.
 
         Raises:
-            DigestMismatch, InvalidArchive, StorageFull, StorageFailure.
+            InvalidArchive, StorageFull, StorageFailure.
         """
-        if any(digest != self._hash.digest() for digest in digests):
-            raise DigestMismatch("The body does not have the SHA-256 that its header states.")
         if self._checked is None:
             raise InvalidArchive(f"The file ends after {self._size} bytes, within its manifest.")
         manifest, tag, map_id = self._checked

@@ -25,6 +25,7 @@ FRAME_ERRORS = (
     errors.NoRegions,
     errors.InvalidIdentifier,
     errors.InvalidField,
+    errors.MixedCoordinates,
     errors.UnknownCamera,
     FrameNeeded,
     InvalidRequest,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field, replace
 
 from core.frames.masks import Mask
-from core.maps import Change, Enrolment, Map, SameFrame
+from core.maps import Change, Enrolment, Map, Reject, SameFrame, refuse_all
 from core.places import Place, PlaceFields, look_address
 from core.recognition.recognition import describe, frame_digest
 from service.engine.encoders import Encoded
@@ -106,16 +106,12 @@ def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes
     return replace(described, run=frame.origin.run, least=frame.origin.least)
 
 
-def _raise(_index: int, error: Exception) -> None:
-    raise error
-
-
 async def enrol(
     engine: Engine,
     map_: Map,
     frames: Sequence[FrameToEnrol],
     deadline: RequestDeadline,
-    reject: Callable[[int, Exception], None] = _raise,
+    reject: Reject = refuse_all,
     queued: bool = True,
     batch_turn: BatchTurn | None = None,
 ) -> dict[int, Enrolled]:
@@ -125,7 +121,8 @@ async def enrol(
 
     Args:
         frames: frames with different ids.
-        reject: is called with the index of a frame that cannot be encoded, and the error; it may raise to abort all.
+        reject: is called with the index of a frame that cannot be encoded or stored, and the error; it may raise to
+            abort all.
         queued: whether the frames take a place in the queue, as those of a request do, but not those of a job.
         batch_turn: the turn of this batch, if it has to be encoded and stored after another one.
 
@@ -140,7 +137,12 @@ async def enrol(
     """
     digests = await in_thread(lambda: [digest_of(frame) for frame in frames])
     stored: dict[int, Enrolled] = {}
-    open_ = set(range(len(frames)))
+    open_, refused = set(range(len(frames))), set[int]()
+
+    def refuse(index: int, error: Exception) -> None:
+        refused.add(index)
+        reject(index, error)
+
     known = await in_thread(lambda: {i for i in open_ if map_.digest(frames[i].id) == digests[i]})
     if batch_turn is not None:
         await batch_turn.wait_for(Stage.ENCODED)
@@ -149,7 +151,7 @@ async def enrol(
         times: dict[int, Mapping[str, float]] = {}
         sent = [(i, data) for i in sorted(open_ - known) if (data := frames[i].data) is not None]
         for i in sorted(open_ - known - {i for i, _ in sent}):
-            reject(i, FrameNeeded(f"The place {frames[i].id!r} does not hold the frame of this digest; send it."))
+            refuse(i, FrameNeeded(f"The place {frames[i].id!r} does not hold the frame of this digest; send it."))
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [frames[i].mask for i in new]
@@ -162,7 +164,7 @@ async def enrol(
                         prepared = await in_thread(_prepare_all, engine, map_, frames, digests, encoded)
                         for i, made in prepared.items():
                             if isinstance(made, Exception):
-                                reject(i, made)
+                                refuse(i, made)
                             else:
                                 enrolments[i], times[i] = made
                         if batch_turn is not None and len(sent) - len(enrolments) <= engine.queue.encoders.ahead:
@@ -170,10 +172,11 @@ async def enrol(
         if batch_turn is not None:
             batch_turn.report(Stage.ENCODED)
             await batch_turn.wait_for(Stage.STORED)
-        done = await in_thread(_commit, engine, map_, enrolments, {i: (frames[i], digests[i]) for i in sorted(known)})
+        held = {i: (frames[i], digests[i]) for i in sorted(known)}
+        done = await in_thread(_commit, engine, map_, enrolments, held, refuse)
         stored.update({i: Enrolled(place, change, times.get(i, {})) for i, (place, change) in done.items()})
         # Places that were deleted, or got another frame, since their digest was read: their frames have to be encoded.
-        open_, known = known - set(done), set()
+        open_, known = known - set(done) - refused, set()
     return stored
 
 
@@ -226,6 +229,7 @@ def _commit(
     map_: Map,
     enrolments: Mapping[int, Enrolment],
     known: Mapping[int, tuple[FrameToEnrol, bytes]],
+    refuse: Reject,
 ) -> dict[int, tuple[Place, Change]]:
     """Store new frames, and new fields of frames that the map still holds, in one commit.
 
@@ -233,16 +237,19 @@ def _commit(
 
     Args:
         known: the frames that the map held when their digests were read, with these digests.
+        refuse: is called with the index of a frame that the map does not take.
     """
     items: dict[int, Enrolment | SameFrame] = dict(enrolments)
     items |= {i: SameFrame(frame.id, frame.fields, digest) for i, (frame, digest) in known.items()}
     items = dict(sorted(items.items()))
+    order = list(items)
     began = time.perf_counter()
     with engine.writing(map_.record.id):
         if enrolments:
             check_place_limit(engine, map_, [enrolment.id for enrolment in enrolments.values()])
-        found = zip(items, map_.enrol(list(items.values())), strict=True)
-        done = {i: stored for i, stored in found if stored is not None}
+        stored = map_.enrol(list(items.values()), lambda position, error: refuse(order[position], error))
+        found = zip(order, stored, strict=True)
+        done = {i: one for i, one in found if one is not None}
     engine.metrics.commits.observe(time.perf_counter() - began)
     tell_enrolment(engine, map_, list(done.values()))
     return done

@@ -12,6 +12,7 @@ from core.ledger.maps.places import LONGEST_TEXT
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import Camera, Timestamp
 from service.errors.faults import InvalidRequest
+from service.http.bodies import read_json
 from service.http.schemas import PageParameters
 
 MOST_NAMES = 100
@@ -25,18 +26,19 @@ def parsed_json(text: str, what: str) -> Any:
     """The value of JSON text in a parameter.
 
     Raises:
-        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair).
+        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair, a name
+            twice).
     """
 
     def refuse(constant: str) -> Any:
         raise ValueError(constant)
 
     try:
-        found = json.loads(text, parse_constant=refuse)
+        found = read_json(text, parse_constant=refuse)
         json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
         return found
     except (ValueError, RecursionError):
-        raise InvalidRequest(f"{what}: the value is not JSON.") from None
+        raise InvalidRequest(f"{what}: the value is not JSON, or has a name twice.") from None
 
 
 def checked_metadata(found: Any) -> dict[str, Scalar]:

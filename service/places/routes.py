@@ -85,6 +85,7 @@ traverses = APIRouter(
 ENROLMENT_PROBLEMS = (
     errors.UnknownCamera,
     errors.WrongEncoder,
+    errors.MixedCoordinates,
     UnsupportedMediaType,
     errors.NoRegions,
     errors.StorageFull,
@@ -290,7 +291,13 @@ def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView
     "/{place}",
     dependencies=[Depends(json_body)],
     openapi_extra=json_patch(PlaceChanges),
-    responses=problem_documentation(UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull),
+    responses=problem_documentation(
+        UnsupportedMediaType,
+        errors.UnknownPlace,
+        errors.InvalidField,
+        errors.MixedCoordinates,
+        errors.StorageFull,
+    ),
 )
 def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
     """Edit the fields of a place by a merge patch: `null` clears a field, and fields that are left out stay."""

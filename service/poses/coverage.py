@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.maps import Map
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, Coordinate, Pose, Whereabouts
+from core.places import Coordinate, Pose, check_coordinates, pose_kinds
 from core.recognition.stages import neighborhood_of
 from core.upkeep.surroundings import State, Surroundings, surroundings
-from service.errors.faults import InvalidRequest
 from service.http.schemas import validated
 from service.places.parameters import PoseParameters
 
@@ -102,14 +101,15 @@ def coverage_of(map_: Map, options: CoverageParameters) -> CoverageView:
     """Whether a pose is in a map; it reads what is in memory of all places, and blocks.
 
     Raises:
-        InvalidRequest: the pose is none, or of the kind that the map's poses are not.
+        InvalidRequest: the pose is none.
+        MixedCoordinates: it is of the kind that the map's poses are not.
         UnknownMap, MapQuarantined, StorageFailure.
     """
     pose = options.pose()
     snapshot = map_.snapshot()
     rows = np.flatnonzero(snapshot.alive)
     where = snapshot.whereabouts_at(rows)
-    _check_kind(where, pose)
+    check_coordinates(pose_kinds(where.kind), pose.kind(), "The pose")
     radius = neighborhood_of(map_).radius
     found = surroundings(where, pose, radius)
     near = found.order[: min(found.near, MOST_FRAMES)]
@@ -128,14 +128,6 @@ def coverage_of(map_: Map, options: CoverageParameters) -> CoverageView:
         nearest=_nearest(map_, found, rows, options.k),
         gap=_gap(map_, found, rows),
     )
-
-
-def _check_kind(where: Whereabouts, pose: Pose) -> None:
-    kinds = set(np.unique(where.kind[where.kind != NO_POSE]).tolist())
-    if kinds == {METRIC} and pose.kind() == "geographic":
-        raise InvalidRequest("latitude, longitude: the map is in metres: give x and y.")
-    if kinds == {GEOGRAPHIC} and pose.kind() == "metric":
-        raise InvalidRequest("x, y: the map is in degrees: give latitude and longitude.")
 
 
 def _nearest(map_: Map, found: Surroundings, rows: NDArray[np.int64], k: int) -> list[NearPlace]:

@@ -6,6 +6,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query
 
+from core import errors
+from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, MapId, single_values
 from service.poses.coverage import CoverageParameters, CoverageView, coverage_of
 from service.worker_threads import in_thread
@@ -13,7 +15,7 @@ from service.worker_threads import in_thread
 router = APIRouter(prefix="/v1/maps/{map}/coverage", tags=["places"], dependencies=[Depends(single_values)])
 
 
-@router.get("")
+@router.get("", responses=problem_documentation(errors.MixedCoordinates))
 async def check_coverage(
     map_id: MapId, options: Annotated[CoverageParameters, Query()], engine: EngineDep
 ) -> CoverageView:

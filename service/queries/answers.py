@@ -59,6 +59,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer, usual: UsualScores | N
         decision=judgement.decision,
         threshold=found.calibration.threshold,
         reason=None if matches else _why_nothing(found, encoded),
+        note=found.lens,
         matches=matches,
         rivals=[
             RivalGroup(places=list(group.places), score=group.score, same_place=group.same_place)

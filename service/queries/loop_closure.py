@@ -115,6 +115,7 @@ router = APIRouter(
         errors.UnknownCamera,
         errors.UnknownSequence,
         errors.WrongEncoder,
+        errors.MixedCoordinates,
         PlaceTaken,
         UnsupportedMediaType,
         errors.StorageFull,

@@ -29,6 +29,7 @@ MAP_ERRORS = (
     errors.MapQuarantined,
     errors.StorageFailure,
     errors.UnknownCamera,
+    errors.MixedCoordinates,
     errors.UnknownEncoder,
     errors.InvalidModel,
     EncoderNotInstalled,

@@ -24,7 +24,7 @@ Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
 KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
 
 _NAMES: TypeAdapter[list[str]] = TypeAdapter(Annotated[list[Sequence], Field(min_length=1, max_length=MOST_NAMES)])
-_DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
+_DEGREES = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]+)?")
 
 
 class FilterParameters(PlaceDescription):

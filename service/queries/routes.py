@@ -51,7 +51,12 @@ router = APIRouter(
     tags=["queries"],
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
-        errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
+        errors.UnknownCamera,
+        errors.WrongEncoder,
+        errors.MixedCoordinates,
+        UnsupportedMediaType,
+        QueueFull,
+        EncoderNotInstalled,
     ),
 )
 explanations = APIRouter(

@@ -331,6 +331,12 @@ class QueryAnswer(BaseModel):
         "recognized by its probability instead."
     )
     reason: Reason | None = Field(default=None, description=NO_MATCHES)
+    note: str | None = Field(
+        default=None,
+        exclude_if=lambda note: note is None,
+        description="What makes the answer doubtful beside its numbers: the camera sees 1.6 times the angle of that "
+        "which took the best match, or more, or as much less. Left out where that is not so, or not known.",
+    )
     matches: list[Match]
     rivals: list[RivalGroup] = Field(
         default_factory=list, description="Why the answer is ambiguous; empty for other verdicts."

@@ -12,6 +12,7 @@ from core.errors import InvalidImage, InvalidRecording
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
 from core.maps import Map
+from core.names import composed
 from core.places import Camera, PlaceFields
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
@@ -235,7 +236,8 @@ def _check_ids(map_: Map, frames: Sequence[RecordedFrame], sequence: str) -> Non
     """
     map_.open()
     rows = [row for row in map_.rows_of([frame.id for frame in frames]) if row is not None]
-    taken = [place for place in map_.places_at(rows) if place is not None and place.sequence != sequence]
+    found = [place for place in map_.places_at(rows) if place is not None]
+    taken = [place for place in found if composed(place.sequence) != sequence]
     if taken:
         raise InvalidRecording(
             f"{len(taken)} ids of these frames belong to places of another traverse, such as {taken[0].id!r}: give "

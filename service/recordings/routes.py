@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from core import errors
+from core.numerals import Whole
 from service.errors.faults import (
     BodyTooLarge,
     JobQueueFull,
@@ -101,7 +102,7 @@ async def upload_recording(
     request: Request,
     engine: EngineDep,
     recordings: RecordingsDep,
-    offset: Annotated[int, Query(ge=0, le=2**53, description="Where the piece begins.")] = 0,
+    offset: Annotated[Whole, Query(ge=0, le=2**53, description="Where the piece begins.")] = 0,
 ) -> RecordingView:
     """Upload a piece of a bag: a rosbag2 (`.mcap`, `.db3`) or a bag of ROS 1 (`.bag`), a file at a time.
 

@@ -21,7 +21,7 @@ from core.disk.files import disk_errors, make_folder, sync_folder, write_at
 from core.disk.permissions import open_private
 from core.errors import StorageFull
 from core.recordings.messages import check_installed
-from service.errors.faults import RecordingInUse, RecordingOffset, StagingFull, UnknownRecording
+from service.errors.faults import DigestMismatch, RecordingInUse, RecordingOffset, StagingFull, UnknownRecording
 from service.fairness import CALLER
 from service.http.bodies import in_pieces
 from service.jobs.job import Job
@@ -87,7 +87,9 @@ class Recordings:
         return self.path(map_id, name)
 
     async def receive(self, map_id: str, name: str, offset: int, chunks: AsyncIterator[bytes]) -> int:
-        """Add a piece to a bag; returns how many bytes of it are here then.  If the piece breaks off, its part stays.
+        """Add a piece to a bag; returns how many bytes of it are here then.
+
+        If the piece breaks off, its part stays; of one that does not have its digest nothing does.
 
         Args:
             offset: where the piece begins; 0 begins anew only if nothing is here.
@@ -110,6 +112,9 @@ class Recordings:
                     await to_its_end(partial(self._write, path, descriptor, piece, at))
                     at += len(piece)
                 await to_its_end(partial(_sync, descriptor))
+            except DigestMismatch:
+                os.ftruncate(descriptor, offset)
+                raise
             finally:
                 os.close(descriptor)
             return at

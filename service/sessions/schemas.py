@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from core.belief import Odometry, OdometryPose, RunOptions, Sight, Stride
 from core.clocks import Stamp
 from core.judgement.verdict import Verdict
+from core.numerals import check_numeral
 from core.places import Sequence, Timestamp
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
@@ -162,10 +163,11 @@ class FrameParameters(Parameters):
     )
     odometry_heading: float | None = Field(
         default=None,
-        ge=-1e6,
-        le=1e6,
+        ge=-360,
+        le=360,
         allow_inf_nan=False,
-        description="Degrees counter-clockwise from +x of odometry's frame to where the camera looks; with odometry_x.",
+        description="Degrees counter-clockwise from +x of odometry's frame to where the camera looks, -360 to 360; "
+        "with odometry_x.",
     )
     odometry_covariance: str | None = Field(
         default=None,
@@ -227,7 +229,7 @@ class FrameParameters(Parameters):
 def _covariance(text: str) -> tuple[float, ...] | None:
     """The nine numbers of a covariance, row by row; None if they are none."""
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        numbers = tuple(float(str(check_numeral(part.strip().removeprefix("+")))) for part in text.split(","))
     except ValueError:
         return None
     if len(numbers) != 9 or not all(abs(number) <= LARGEST_COVARIANCE for number in numbers):

@@ -15,12 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, UnknownCamera, UnknownMap, WrongEncoder
+from core.errors import (
+    InvalidIdentifier,
+    MixedCoordinates,
+    PlacerecError,
+    StorageFailure,
+    UnknownCamera,
+    UnknownMap,
+    WrongEncoder,
+)
 from core.maps import Enrolment, History, Map, Snapshot
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, check_place_id, look_address, place_and_look
+from core.places import PoseKind, check_coordinates, check_place_id, look_address, place_and_look, pose_kinds
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
@@ -79,28 +87,25 @@ class MergePlan:
         }
 
 
-def poses_apart(map_: Map, other: Map) -> str | None:
-    """Say, in a sentence, that the poses of two maps are of different kinds; None where they are not, or one has none.
+def poses_apart(map_: Map, other: Map) -> MixedCoordinates | None:
+    """Why the places of a map cannot be copied into another one: their coordinates are of the kind that it has not.
 
     Raises:
         StorageFailure.
     """
     ours, theirs = _kinds(map_), _kinds(other)
-    if not ours or not theirs or ours & theirs:
-        return None
-    names = {METRIC: "metric", GEOGRAPHIC: "geographic"}
-    (here, *_), (there, *_) = ours, theirs
-    return (
-        f"The poses of {other.record.id} are {names[there]}, those of {map_.record.id} {names[here]}: they lie in no "
-        "common frame, so that no distance between their places is known."
-    )
+    try:
+        for kind in theirs:
+            check_coordinates(ours, kind, f"The map {other.record.id!r}")
+    except MixedCoordinates as error:
+        return error
+    return None
 
 
-def _kinds(map_: Map) -> set[int]:
+def _kinds(map_: Map) -> set[PoseKind]:
     """The kinds of the poses of a map."""
     snapshot = map_.snapshot()
-    kinds = snapshot.whereabouts_at(np.flatnonzero(snapshot.alive)).kind
-    return set(np.unique(kinds).tolist()) - {NO_POSE}
+    return pose_kinds(snapshot.whereabouts_at(np.flatnonzero(snapshot.alive)).kind)
 
 
 def check_same_encoder(map_: Map, other: Map) -> None:
@@ -223,8 +228,8 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     The other arguments are ``on_conflict``, ``prefix``, ``dry_run`` and ``sample`` of the request.
 
     Raises:
-        UnknownMap, WrongEncoder, MergeConflict, EncoderNotInstalled, StorageFull, StorageFailure: the map is what it
-            was before.
+        UnknownMap, WrongEncoder, MixedCoordinates, MergeConflict, EncoderNotInstalled, StorageFull, StorageFailure:
+            the map is what it was before.
         JobCancelled: likewise.
         JobInterrupted: the next attempt continues.
     """
@@ -242,11 +247,12 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         plan = plan_merge(map_, other, context.arguments, outline)
         apart = poses_apart(map_, other)
         report = plan.report() | {
-            "warnings": [] if apart is None else [apart],
             "overlap": measure_overlap(engine, context, map_, other) if context.arguments["sample"] else None,
         }
         if context.arguments["dry_run"]:
-            return report
+            return report if apart is None else report | {"conflicts": [str(apart), *plan.conflicts]}
+        if apart is not None:
+            raise apart
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
         after = max((place.number for place in outline), default=0)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from core.errors import InvalidIdentifier
-from core.names import LONGEST, TEXT, Names, texts, word
+from core.names import LONGEST, TEXT, Names, composed, texts, word
 from core.networks.network import NAMES as NETWORK_NAMES
 from core.places import (
     CAMERAS,
@@ -74,13 +74,28 @@ def taken(text: str) -> bool:
 @pytest.mark.thorough
 @given(st.one_of(st.text(max_size=LONGEST + 2), st.text(ODD, max_size=5), st.from_regex(TEXT, fullmatch=True)))
 def test_a_name_is_what_can_be_read_and_stands_in_a_path(text: str) -> None:
-    assert taken(text) == can_be(text)
+    assert taken(text) == can_be(unicodedata.normalize("NFC", text))
 
 
 @pytest.mark.parametrize("letter", [chr(point) for point in range(0x3200) if cannot_be_in(chr(point))], ids=ascii)
 def test_no_name_has_an_unseen_character(letter: str) -> None:
     for text in (letter, f"a{letter}", f"{letter}a", f"a{letter}b", f"..{letter}", f"...{letter}"):
         assert not taken(text)
+
+
+@given(st.text(max_size=20))
+def test_a_name_has_one_form(text: str) -> None:
+    for form in ("NFC", "NFD"):
+        spelled = unicodedata.normalize(form, text)
+        if taken(spelled):
+            assert check_sequence(spelled) == SEQUENCE.validate_python(spelled) == unicodedata.normalize("NFC", text)
+
+
+def test_texts_of_json_have_one_form_with_their_names() -> None:
+    apart = unicodedata.normalize("NFD", "é")
+    assert composed({apart: [apart, 1, None, {"a": apart}], "b": True}) == {"é": ["é", 1, None, {"a": "é"}], "b": True}
+    with pytest.raises(ValueError, match="differ in nothing that can be seen"):
+        composed([{apart: 1, "é": 2}])
 
 
 def test_dots_are_names_only_from_three_on() -> None:

@@ -175,6 +175,7 @@ class MapModel:
             ordinal: of a new place; None: that of its view.
         """
         keypoints = keypoints if self.settings.get("verification", True) else None
+        self._expect_coordinates(place_id, fields)
         known = self.places.get(place_id)
         if known is not None and known.shown.digest == shown.digest:
             known.keypoints = keypoints if known.keypoints is None else known.keypoints
@@ -253,6 +254,7 @@ class MapModel:
         place = self.place(place_id)
         if canonical(place.fields) == canonical(fields):
             return "unchanged"
+        self._expect_coordinates(place_id, fields)
         self._place_in(place, fields)
         place.updated = ANY
         return "updated"
@@ -325,6 +327,16 @@ class MapModel:
         if place_id not in self.places:
             raise Refused("UnknownPlace")
         return self.places[place_id]
+
+    def kinds_of_poses(self, but: str = "") -> set[bool]:
+        """Which kinds of poses there are, by whether they are metric; those of one place do not count."""
+        poses = [place.fields.get("pose") for place_id, place in self.places.items() if place_id != but]
+        return {"x" in pose for pose in poses if pose}
+
+    def _expect_coordinates(self, place_id: str, fields: Fields) -> None:
+        pose, kinds = fields.get("pose"), self.kinds_of_poses(but=place_id)
+        if pose and kinds and ("x" in pose) not in kinds:
+            raise Refused("MixedCoordinates")
 
     def _along(self, sequence: str | None) -> list[PlaceModel]:
         """The places of a sequence in the order of their enrolment."""

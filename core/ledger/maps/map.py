@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime
+from functools import partial
 from typing import Any, overload
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from core.errors import (
     InvalidImage,
+    MixedCoordinates,
     NoThumbnail,
     RevisionMismatch,
     StorageFailure,
@@ -47,6 +49,7 @@ from core.maps.records import (
     patched_fields,
     patched_record,
 )
+from core.maps.store import Reject, refuse_all
 from core.places import Look, Place, PlaceFields, look_address, place_and_look
 
 
@@ -128,7 +131,7 @@ class LedgerMap(ABC):
 
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
         with self._reading() as connection:
-            return set(names) - set(sequences.codes_of(connection, names))
+            return {name for name in names if sequences.find_code(connection, name) is None}
 
     def digest(self, place_id: str) -> bytes | None:
         with self._reading() as connection:
@@ -225,23 +228,16 @@ class LedgerMap(ABC):
     def enrol(self, items: Sequence[Enrolment]) -> Sequence[tuple[Place, Change]]: ...
 
     @overload
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
+    def enrol(
+        self, items: Sequence[Enrolment | SameFrame], reject: Reject = ...
+    ) -> Sequence[tuple[Place, Change] | None]: ...
 
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
+    def enrol(
+        self, items: Sequence[Enrolment | SameFrame], reject: Reject = refuse_all
+    ) -> Sequence[tuple[Place, Change] | None]:
         """Store frames as places, all of them or, if this raises, none, with one COMMIT.
 
-        The items are stored in the order given, which is the order of the places in their sequences.  An id that
-        exists keeps its place and creation time: if the frame's digest is the same, only its fields are stored
-        (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
-
-        Returns:
-            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame:
-            such an item changes nothing.
-
-        Raises:
-            InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
-            NoRegions: a descriptor is all zero.
-            ValueError: descriptors or a digest of the wrong kind.
+        See :meth:`core.maps.store.Map.enrol`.
         """
         new = [item for item in items if isinstance(item, Enrolment)]
         for item in new:
@@ -251,7 +247,7 @@ class LedgerMap(ABC):
         with self._writing() as write:
             write.expect(len(new))
             write.look_for([item.id for item in items])
-            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
+            return [_enrolled(write, item, partial(reject, position)) for position, item in enumerate(items)]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
         with self._writing() as write:
@@ -428,9 +424,12 @@ class LedgerMap(ABC):
         return len(found)
 
     def forget_sequence(self, name: str) -> int:
-        count = 0
+        count, spelled = 0, None
         with self._writing() as write:
             while some := places.listed(write.connection, -1, _AT_ONCE, PlaceFilter(sequence=name)):
+                if count and some[0].place.sequence != spelled:
+                    break  # another traverse, of old, whose name looks the same
+                spelled = some[0].place.sequence
                 for stored in some:
                     write.forget(stored)
                 count += len(some)
@@ -440,6 +439,16 @@ class LedgerMap(ABC):
 
 
 _AT_ONCE = 1000
+
+
+def _enrolled(
+    write: Write, item: Enrolment | SameFrame, reject: Callable[[Exception], None]
+) -> tuple[Place, Change] | None:
+    try:
+        return write.enrol(item) if isinstance(item, Enrolment) else write.renew(item)
+    except MixedCoordinates as error:  # before anything of the item was changed
+        reject(error)
+        return None
 
 
 def _withdrawn(write: Write, rows: Sequence[int]) -> int:

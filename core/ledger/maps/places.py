@@ -24,6 +24,7 @@ from core.maps.counterparts import PlaceStation
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter, Scalar
 from core.maps.records import Keep, Outline
 from core.maps.stored_fields import POSE_VALUES, field_columns, moment_text
+from core.names import spellings
 from core.places import (
     GEOGRAPHIC,
     METRIC,
@@ -33,6 +34,7 @@ from core.places import (
     Place,
     PlaceFields,
     Pose,
+    PoseKind,
     Whereabouts,
     microseconds,
     place_and_look,
@@ -380,6 +382,17 @@ def pictured_before(connection: MapConnection, moment: datetime, limit: int) -> 
     return [str(place_id) for (place_id,) in found]
 
 
+NO_PLACE = -1
+"""The number of no place."""
+
+_NUMBERED = select(_P.x.is_not(None)).where(_P.map == bindparam("map"), _IS_PLACE, _P.number != bindparam("but"))
+_NEWEST_FIRST = _NUMBERED.order_by(_P.number.desc()).limit(1)
+_NEWEST_POSE = Statement(_NEWEST_FIRST.where(_P.x.is_not(None) | _P.latitude.is_not(None)))
+_POSE_OF: dict[PoseKind, Statement] = {
+    "metric": Statement(_NEWEST_FIRST.where(_P.x.is_not(None))),
+    "geographic": Statement(_NEWEST_FIRST.where(_P.latitude.is_not(None))),
+}
+
 Conditions = tuple[tuple[str, ...], int]
 """The conditions of a listing by name, and how many values of metadata are wanted."""
 
@@ -393,6 +406,7 @@ def _values(wanted: PlaceFilter) -> dict[str, Any]:
     given = {
         "ids": None if wanted.ids is None else list(wanted.ids),
         "sequence_name": wanted.sequence,
+        "spellings": None if wanted.sequence is None else spellings(wanted.sequence),
         "camera_name": wanted.camera,
         "from_moment": wanted.after and moment_text(wanted.after),
         "to_moment": wanted.before and moment_text(wanted.before),
@@ -405,7 +419,12 @@ def _values(wanted: PlaceFilter) -> dict[str, Any]:
 def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     names, values = conditions
     query = select(_P.id).where(_P.map == bindparam("map")) if ids_alone else _STORED
-    code = select(_S.code).where(_S.map == bindparam("map"), _S.name == bindparam("sequence_name"))
+    code = (
+        select(_S.code)
+        .where(_S.map == bindparam("map"), among(_S.name, "spellings"))
+        .order_by((_S.name == bindparam("sequence_name")).desc())
+        .limit(1)
+    )
     all_conditions = {
         "ids": among(_P.id, "ids"),
         "sequence": _P.sequence == code.scalar_subquery(),
@@ -422,6 +441,23 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
         )
         query = query.where(has_token)
     return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
+
+
+def kinds_of_poses(connection: MapConnection, kind: PoseKind, but: int = NO_PLACE) -> set[PoseKind]:
+    """The kind of the pose that a place got last, and also ``kind`` if any place has a pose of it; none without poses.
+
+    It is quick where the first is ``kind``, as in any map of one kind.
+
+    Args:
+        but: the number of a place that does not count.
+    """
+    newest = connection.one(_NEWEST_POSE, but=but)
+    if newest is None:
+        return set()
+    found: set[PoseKind] = {"metric" if newest[0] else "geographic"}
+    if kind not in found and connection.one(_POSE_OF[kind], but=but) is not None:
+        found.add(kind)
+    return found
 
 
 def outlines(connection: MapConnection, looks: bool) -> list[Outline]:

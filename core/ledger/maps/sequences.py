@@ -10,6 +10,7 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import MAPS, PLACES, SEQUENCES
 from core.ledger.statements import Statement, among, greatest
 from core.maps.records import SequenceSummary
+from core.names import spellings
 from core.places import NO_SEQUENCE
 
 _S, _P = SEQUENCES.c, PLACES.c
@@ -73,7 +74,7 @@ _LOST = Statement(
     .order_by(_P.number)
     .limit(bindparam("most"))
 )
-_END = Statement(select(_S.code, _S.next_ordinal).where(_OF_MAP, _S.name == bindparam("name")))
+_END = Statement(select(_S.next_ordinal).where(_OF_MAP, _S.code == bindparam("code")))
 _LAST = Statement(select(_P.ordinal, _P.row).where(_OF_SEQUENCE).order_by(_P.number.desc()).limit(1))
 _FIRST_AT = Statement(select(_P.row).where(_AT, _P.number < bindparam("before")).order_by(_P.number).limit(1))
 _BEFORE = select(_P.row).where(_AT, _P.number < bindparam("number")).order_by(_P.number.desc()).limit(1)
@@ -90,8 +91,17 @@ _OLDEST_OF_LAST = Statement(select(func.min(_LAST_ORDINALS.c.ordinal)))
 
 
 def codes_of(connection: MapConnection, names: Sequence[str]) -> dict[str, int]:
-    """The codes of sequences (``Whereabouts.sequence``) by name; names that do not exist are left out."""
-    return dict(connection.execute(_CODES, names=list(names)))
+    """The codes of sequences (``Whereabouts.sequence``) by name, as it is stored; those that do not exist are left out.
+
+    A name of old may be stored in another form of Unicode, and is found by its one form as well.
+    """
+    return dict(connection.execute(_CODES, names=[one for name in names for one in spellings(name)]))
+
+
+def find_code(connection: MapConnection, name: str) -> int | None:
+    """The code of a sequence; None if there is none."""
+    found = codes_of(connection, [name])
+    return next((found[one] for one in spellings(name) if one in found), None)
 
 
 def new_code(connection: MapConnection) -> int:
@@ -104,7 +114,7 @@ def code_of(connection: MapConnection, name: str | None) -> int:
     """The code of a sequence, which is made if there is none; NO_SEQUENCE for None."""
     if name is None:
         return NO_SEQUENCE
-    found = codes_of(connection, [name]).get(name)
+    found = find_code(connection, name)
     return new_sequence(connection, name) if found is None else found
 
 
@@ -174,13 +184,11 @@ def latest(connection: MapConnection, name: str, positions: int) -> tuple[tuple[
     Args:
         positions: the number of ordinals before the last one that are looked at, too.
     """
-    found = connection.one(_END, name=name)
-    if found is None:
+    code = find_code(connection, name)
+    last = None if code is None else connection.one(_LAST, code=code)
+    if code is None or last is None:
         return None, {}
-    code, following = found
-    last = connection.one(_LAST, code=code)
-    if last is None:
-        return None, {}
+    ((following,),) = connection.execute(_END, code=code)
     first = {}
     for ordinal in sorted({last[0], *range(max(0, following - 1 - positions), following)}):
         row = first_at(connection, code, ordinal)

@@ -24,7 +24,7 @@ from core.maps.enrolling import picture_of
 from core.maps.records import MOST_LOOKS, Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
 from core.maps.stored_fields import moment_text, same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, ViewedFrame, latest_views, leaves_view, reach_of
-from core.places import NO_SEQUENCE, Place, PlaceFields, Pose, place_and_look
+from core.places import NO_SEQUENCE, Place, PlaceFields, Pose, PoseKind, check_coordinates, place_and_look
 
 Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
 """The descriptor, float32 [D], and the local descriptors, int8 [C, L], of one frame."""
@@ -50,6 +50,7 @@ class Write(ABC):
         self._pictures_by_row: dict[int, StoredPicture] = {}
         self._keypoints: dict[int, tuple[bytes, bytes]] = {}  # digest of the frame and record, by row
         self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
+        self._kinds: set[PoseKind] = set()  # of the poses that places may get, as far as was looked up
         self._now = datetime.now(UTC)
 
     @property
@@ -140,6 +141,10 @@ class Write(ABC):
         Args:
             keep: the picture of the frame to store; by default that of the map's settings.
             ordinal: the position of a new place in its sequence; None: by its view, at the end of the sequence.
+
+        Raises:
+            MixedCoordinates: its pose is of the kind that the map's places do not have; nothing was changed.
+            UnknownPlace, RepeatedLook, LookNameTaken, TooManyLooks.
         """
         of, name = place_and_look(item.id)
         stored, place = self.find(item.id), None if name is None else self.find(of)
@@ -151,6 +156,8 @@ class Write(ABC):
             if stored is not None:
                 raise LookNameTaken(f"Another frame of place {of!r} is its look {name}.")
             place = self._expect_room_for_look(of, item.digest)
+        if name is None:
+            self._expect_coordinates(item.id, item.fields.pose, stored)
         row, (kind, picture) = self.state.rows, picture_of(item, self.record.keep if keep is None else keep)
         checksum = self._add_descriptors(row, item)
         self.state = replace(self.state, rows=row + 1)
@@ -175,6 +182,24 @@ class Write(ABC):
         if item.keypoints is not None:
             self._put_keypoints(made, item.keypoints)
         return made.shown(), "created" if stored is None else "replaced"
+
+    def _expect_coordinates(self, place_id: str, pose: Pose | None, stored: StoredPlace | None) -> None:
+        """Check that the pose of a place is of the kind that those of the others are.
+
+        Args:
+            stored: the place as it is; None: it is new.
+
+        Raises:
+            MixedCoordinates: it is of the other kind.
+        """
+        if pose is None or pose.kind() in self._kinds:
+            return
+        kind = pose.kind()
+        if stored is not None and stored.place.pose is not None and stored.place.pose.kind() == kind:
+            return
+        known = places.kinds_of_poses(self.connection, kind, places.NO_PLACE if stored is None else stored.number)
+        check_coordinates(known, kind, f"The pose of place {place_id!r}")
+        self._kinds = {*known, kind}
 
     def _expect_room_for_look(self, place_id: str, digest: bytes) -> StoredPlace:
         """The place that a new look is of.
@@ -386,6 +411,7 @@ class Write(ABC):
         """Change the fields of a place; its frame stays."""
         if same_fields(stored.place, fields):
             return stored.place, "unchanged"
+        self._expect_coordinates(stored.place.id, fields.pose, stored)
         return self._put(self._with_fields(stored, fields), stored).place, "updated"
 
     def count_served(self, stored: StoredPlace, right: int, wrong: int, passed: int) -> None:

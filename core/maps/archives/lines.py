@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from core.errors import InvalidArchive
 from core.frames.intrinsics import Intrinsics
@@ -14,8 +14,8 @@ from core.frames.value_ranges import ValueRange
 from core.geometry.keypoints import MOST_STORED
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
-from core.names import LONGEST, TEXT
-from core.places import LOOK, PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
+from core.names import LONGEST, TEXT, composed
+from core.places import LOOK, PLACE_ID, Camera, PlaceFields, Pose, Timestamp, check_sequence
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to accept more."""
@@ -32,6 +32,23 @@ Number = Annotated[int, Field(ge=0, le=LARGEST, strict=True)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
+def _as_written(name: str) -> str:
+    """The name of a sequence as the file has it, which may be from before texts had one form: it has two such apart."""
+    check_sequence(name)
+    return name
+
+
+def _composed_if_possible(metadata: Any) -> Any:
+    """Metadata in the one form of texts, or as it is where two of its names would be one."""
+    try:
+        return composed(metadata)
+    except ValueError:
+        return metadata
+
+
+WrittenSequence = Annotated[str, AfterValidator(_as_written)]
+
+
 class _Line(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,7 +56,7 @@ class _Line(BaseModel):
 class SequenceLine(_Line):
     """A sequence.  name: None for the places that belong to none."""
 
-    name: Sequence | None
+    name: WrittenSequence | None
     next_ordinal: Number
 
 
@@ -80,12 +97,12 @@ class PlaceLine(_Line):
     pose: Pose | None
     pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None
     timestamp: Timestamp | None
-    sequence: Sequence | None
+    sequence: WrittenSequence | None
     ordinal: Number
-    track: Sequence | Number | None
+    track: WrittenSequence | Number | None
     station: Annotated[int, Field(ge=-LARGEST, le=LARGEST, strict=True)] | None
     camera: Camera | None
-    metadata: dict[str, Any]
+    metadata: Annotated[dict[str, Any], BeforeValidator(_composed_if_possible)]
     regions: Number
     digest: Digest
     picture: Picture | None

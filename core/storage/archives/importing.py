@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
@@ -21,9 +22,12 @@ from core.maps.cameras import CameraRecord
 from core.maps.enrolling import CheckDescriptors, any_descriptors
 from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
+from core.names import LONGEST, composed
 from core.places import NO_SEQUENCE, place_and_look
 from core.storage.archives.unpacking import Advance, CheckPicture, Content, Unpacking
 from core.storage.files.segment_files import Layout
+
+log = logging.getLogger(__name__)
 
 
 class ImportWrite(Protocol):
@@ -66,7 +70,7 @@ class Importing(Unpacking):
         self._writing = writing
         self.places = 0
         """Places that are stored, their looks apart."""
-        self._codes: dict[str, int] = {}
+        self._codes: dict[str, int] = {}  # of sequences, by their names in the file
         self._lost: dict[int, int] = {}  # the codes of the tracks whose sequences are gone, by their numbers there
 
     def fill(self) -> None:
@@ -88,7 +92,7 @@ class Importing(Unpacking):
                 if line.name is not None:
                     if line.name in self._codes:
                         raise InvalidArchive(f"The sequence {line.name!r} is listed twice.")
-                    self._codes[line.name] = sequences.new_sequence(write.connection, line.name)
+                    self._codes[line.name] = sequences.new_sequence(write.connection, self._free(write, line.name))
                 code = NO_SEQUENCE if line.name is None else self._codes[line.name]
                 sequences.keep_free(write.connection, code, line.next_ordinal)
             seen = set()
@@ -99,6 +103,16 @@ class Importing(Unpacking):
                 values = {name: getattr(camera, name) for name in CameraRecord.model_fields}
                 put_camera(write.connection, CameraRecord(**values))
             write.changed = True
+
+    def _free(self, write: ImportWrite, written: str) -> str:
+        """The name that a sequence of the file gets: in the one form of texts, and not that of another sequence."""
+        wanted = composed(written)
+        name, number = wanted, 2
+        while sequences.find_code(write.connection, name) is not None:
+            name, number = f"{wanted[: LONGEST - 8]}~{number}", number + 1
+        if name != written:
+            log.warning("sequence renamed", extra={"map": self.archive.manifest.map.id, "before": written, "now": name})
+        return name
 
     def put_places(self, lines: Sequence[PlaceLine], stored: NDArray[np.void], contents: Iterator[Content]) -> None:
         with self._writing() as write:

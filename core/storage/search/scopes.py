@@ -12,6 +12,7 @@ from core.ledger.maps import places, sequences
 from core.ledger.maps.connection import Reading
 from core.maps.place_filter import Scalar
 from core.maps.selection import Conditions, Selection
+from core.places import pose_kinds
 from core.storage.search.snapshot import SearchScope, Snapshot
 
 
@@ -29,8 +30,11 @@ class Chooser:
         """Which rows may be found, and their weights.
 
         Raises:
+            MixedCoordinates: an area is given in coordinates that the places do not have.
             StorageFailure: the metadata cannot be read.
         """
+        snapshot = self._snapshot
+        selection.check_coordinates(lambda _kind: pose_kinds(snapshot.whereabouts.kind[snapshot.alive]))
         return SearchScope(self._snapshot, self._allowed(selection), self._weights(selection))
 
     def _constraints(self, conditions: Conditions) -> list[Constraint]:
@@ -66,7 +70,7 @@ class Chooser:
         if recent is None:
             return None
         with self._reading() as connection:
-            code = sequences.codes_of(connection, [recent.sequence]).get(recent.sequence)
+            code = sequences.find_code(connection, recent.sequence)
             if code is None:
                 return None  # the map has no place of the sequence yet
             oldest = sequences.oldest_of_last(connection, code, recent.frames) if recent.frames else None

@@ -13,12 +13,10 @@ from pydantic import ValidationError
 from core.errors import InvalidGroundTruth
 from core.frames.traverses import Truth
 from core.places import Pose
+from core.recordings.pose_names import named_pose
 
 FILE_NAME = "places.csv"
 COLUMNS = ("x", "y", "z", "heading", "latitude", "longitude")
-UTM_FIELDS = 15
-"""Number of fields between the @ of a file name that holds its position, as street view collections write it:
-easting, northing, zone number and letter, latitude, longitude, ids, heading, pitch, …"""
 
 
 def read_poses(images: Sequence[Path]) -> list[Pose]:
@@ -138,20 +136,8 @@ def _pose(fields: dict[str, str], where: str) -> Pose:
 
 
 def _named(path: Path) -> Pose | None:
-    """The position in a file's name: metres east and north in its UTM zone, degrees clockwise from north."""
-    pieces = path.name.split("@")
-    if len(pieces) < 3 or pieces[0]:
-        return None
-    fields = {"x": pieces[1], "y": pieces[2]}
-    if len(pieces) >= UTM_FIELDS and pieces[9]:
-        try:
-            fields["heading"] = str((90 - float(pieces[9])) % 360)  # counter-clockwise from east, as beside any x and y
-        except ValueError:
-            return None
-    try:
-        return Pose.model_validate(fields)
-    except ValidationError:
-        return None
+    found = named_pose(path.name)
+    return None if found is None else found.pose
 
 
 def _embedded(path: Path) -> Pose | None:

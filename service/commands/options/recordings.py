@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -59,6 +59,15 @@ TrajectoryTimes = Annotated[
         rich_help_panel=PANEL,
     ),
 ]
+PosesFrom = Annotated[
+    Literal["names"] | None,
+    typer.Option(
+        "--poses",
+        help="Of a folder: take poses from the file names (@east@north@…@heading@…@.jpg), as is done without being "
+        "told where all have that form and there is no places.csv.",
+        rich_help_panel=PANEL,
+    ),
+]
 LargestGap = Annotated[
     float | None,
     typer.Option(
@@ -104,6 +113,7 @@ class RecordingOptions:
     every_change: EveryChange = None
     fixed_frame: FixedFrame = None
     moving_frame: MovingFrame = None
+    poses: PosesFrom = None
 
     @contextmanager
     def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
@@ -115,6 +125,8 @@ class RecordingOptions:
         """
         if self.pose_topic is not None and self.trajectory is not None:
             raise typer.BadParameter("give --pose-topic or --trajectory, not both")
+        if self.poses is not None and (self.pose_topic is not None or self.trajectory is not None):
+            raise typer.BadParameter("give --poses or another source of poses, not both")
         if self.trajectory_times is not None and self.trajectory is None:
             raise typer.BadParameter("--trajectory-times goes with --trajectory")
         # Imported here because it takes a moment.
@@ -122,7 +134,15 @@ class RecordingOptions:
         from core.recordings.recording import LARGEST_GAP
 
         gap = LARGEST_GAP if self.largest_gap is None else self.largest_gap
-        poses = Poses(self.pose_topic, self.trajectory, self.trajectory_times, gap, self.fixed_frame, self.moving_frame)
+        poses = Poses(
+            self.pose_topic,
+            self.trajectory,
+            self.trajectory_times,
+            gap,
+            self.fixed_frame,
+            self.moving_frame,
+            self.poses == "names",
+        )
         with messages.status(f"Reading {path} …"):
             recording = open_recording(path, self.topic, poses, prefix)
             recording.leave_out_dates(time.time())

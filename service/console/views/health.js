@@ -293,12 +293,10 @@ function Merge({ map }) {
           report.conflicts.length > 0 && ["Conflicts", html`<ul>${report.conflicts.map((one) => html`<li>${one}</li>`)}</ul>`],
           report.overlap && ["Overlap", html`<${Result} value=${report.overlap} />`],
         ]} />
-        ${(report.warnings || []).map((one) => html`<p class="notice">${one}</p>`)}
         ${report.coming > 0 && order.dry_run && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Copy ${integer(report.coming)} places</button></div>`}
       `}
       ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
         <p>${integer(report.coming)} places of ${order.from} come into ${map}.</p>
-        ${(report.warnings || []).map((one) => html`<p class="notice">${one}</p>`)}
       <//>`}
     </section>
   `;

@@ -395,6 +395,12 @@ class StoreContract(RuleBasedStateMachine):
 
     @rule(picture=pictures, selection=selections, cut=st.integers(1, 3))
     def query(self, picture: str, selection: Selection, cut: int) -> None:
+        kinds = self.model.kinds_of_poses()
+        wanted = {one.centre.kind() == "metric" for one in selection.filters.geometry if isinstance(one, Disc)}
+        if kinds and not wanted <= kinds:
+            with pytest.raises(errors.MixedCoordinates):
+                self.map.scope(selection)
+            return
         scope, asked = self.map.scope(selection), descriptor_of(picture)
         ((rows, products),) = scope.search(asked[np.newaxis])
         found = [place and place.id for place in self.map.places_at(rows.tolist())]

@@ -19,6 +19,7 @@ from core.postgres import rows
 from core.postgres.map import PostgresMap
 from core.postgres.search.store import CodedStore
 from core.storage import Atlas
+from tests.core.maps.mixed import check_one_kind_wins
 from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
 from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.storage.archives.conftest import filled
@@ -53,6 +54,13 @@ def test_writers_at_the_same_time_lose_nothing(postgres: Postgres, store: CodedS
     check_writers_lose_nothing(store, others)
     for other in others:
         other.close()
+
+
+def test_of_two_writers_of_both_kinds_of_coordinates_one_wins(postgres: Postgres, store: CodedStore) -> None:
+    made(store)
+    other = CodedStore(postgres.address)
+    check_one_kind_wins(store.get("lab"), other.get("lab"))
+    other.close()
 
 
 def test_a_refused_import_leaves_nothing(store: CodedStore, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unicodedata import normalize
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from core.errors import EmptyImage, InvalidImage, InvalidRecording, InvalidTraverse, NotAnImage, UnsupportedFormat
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels
+from core.places import Pose
 from core.recordings import Poses, open_recording
 from core.recordings.pictures import sendable
 from tests.service.scenes import encoded, jpeg, scene
@@ -92,6 +94,30 @@ def test_a_list_gives_order_ids_poses_and_times(tmp_path: Path) -> None:
         assert door.pose is not None and (door.pose.x, door.pose.y) == (1, 2) and plain.pose is None
         assert door.nanoseconds == 1_767_225_600_500_000_000
         assert "1 images of" in recording.remarks[0]
+
+
+@pytest.mark.parametrize(("listed", "on_disk"), [("NFC", "NFD"), ("NFD", "NFC"), ("NFD", "NFD")])
+def test_names_of_files_have_one_form(tmp_path: Path, listed: str, on_disk: str) -> None:
+    (tmp_path / normalize(on_disk, "Café 1.jpg")).write_bytes(jpeg(1, 64, 48))
+    with open_recording(tmp_path) as recording:
+        assert recording.frames[0].id == "Caf-1"
+    (tmp_path / "places.csv").write_text(f"file,x,y\n{normalize(listed, 'Café 1.jpg')},1,2\n")
+    with open_recording(tmp_path) as recording:
+        assert (recording.frames[0].id, recording.frames[0].pose) == ("Caf-1", Pose(x=1, y=2))
+
+
+@pytest.mark.parametrize(
+    ("cell", "taken"), [("1.5", 1.5), ("+1.5", 1.5), ("-2e1", -20.0), ("1_0", None), ("inf", None)]
+)
+def test_numbers_of_a_list_are_plain(tmp_path: Path, cell: str, taken: float | None) -> None:
+    (tmp_path / "a.jpg").write_bytes(jpeg(1, 64, 48))
+    (tmp_path / "places.csv").write_text(f"file,x,y\na.jpg,{cell},2\n")
+    if taken is None:
+        with pytest.raises(InvalidTraverse, match="line 2"):
+            open_recording(tmp_path)
+        return
+    with open_recording(tmp_path) as recording:
+        assert recording.frames[0].pose == Pose(x=taken, y=2)
 
 
 def test_options_of_bags_do_not_go_with_folders(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from core.errors import (
     InvalidCursor,
     InvalidField,
     InvalidIdentifier,
+    MixedCoordinates,
     NoRegions,
     NoThumbnail,
     RevisionMismatch,
@@ -23,14 +24,17 @@ from core.errors import (
     UnknownSequence,
 )
 from core.frames.images import decode, encode_png
+from core.judgement.priors import Disc, GeographicBox
 from core.judgement.verdict import Calibration
 from core.ledger.maps import frames, places
 from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
+from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
 from core.storage.database import connections
 from core.storage.database.schema import driver_of
+from tests.core.maps.mixed import POSES, both_kinds, check_one_kind_wins, posed
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
@@ -64,6 +68,30 @@ def test_a_place_is_remembered_with_all_that_was_said_of_it(lab: Map) -> None:
     assert lab.digest("p7") == digest_of("p7")
     assert lab.thumbnail("p7") == b"thumbnail of p7"
     assert lab.count_places() == 1
+
+
+def test_of_two_writers_of_both_kinds_of_coordinates_one_wins(lab: Map) -> None:
+    check_one_kind_wins(lab, lab)
+
+
+def test_areas_of_the_other_kind_are_refused(lab: Map) -> None:
+    metres, degrees = (Conditions((Disc(pose, 5.0),)) for pose in POSES)
+    box = Conditions((GeographicBox(2, 48, 3, 49),))
+    for area in (metres, degrees, box):
+        lab.scope(Selection(filters=area))  # no place has a pose yet
+    lab.enrol([posed("p0", POSES[0])])
+    for area in (degrees, box):
+        for selection in (Selection(filters=area), Selection(prior=area)):
+            with pytest.raises(MixedCoordinates, match="area of the query has geographic"):
+                lab.scope(selection)
+    lab.scope(Selection(filters=metres))
+    with both_kinds():
+        lab.enrol([posed("p1", POSES[1])])
+    for area in (metres, degrees, box):
+        lab.scope(Selection(filters=area))
+    lab.forget("p0")
+    with pytest.raises(MixedCoordinates, match="area of the query has metric"):
+        lab.scope(Selection(filters=metres))
 
 
 def test_a_geographic_pose_and_its_position(lab: Map) -> None:

@@ -286,7 +286,7 @@ def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -
 
 
 @pytest.mark.thorough
-def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin: Operator, keyed: Server) -> None:
+def test_maps_whose_poses_lie_in_no_common_frame_are_not_merged(admin: Operator, keyed: Server) -> None:
     for name, pose in (("metric", {"x": 1, "y": 2}), ("geographic", {"latitude": 48.1, "longitude": 11.5})):
         keyed.create_map(name)
         assert keyed.enrol(name, f"{name}-0", world.frame(len(name)), sequence=name, **pose).status_code == 201
@@ -294,10 +294,8 @@ def test_maps_whose_poses_lie_in_no_common_frame_are_merged_with_a_warning(admin
     merge = page.get_by_role("region", name="Merge")
     merge.get_by_label("From").select_option("geographic")
     merge.get_by_role("button", name="Preview the merge").click()
-    warning = "The poses of geographic are geographic, those of metric metric"
-    merge.get_by_text(warning).wait_for()
-    merge.get_by_role("button", name="Copy 1 places").click()
-    page.get_by_role("dialog").get_by_text(warning).wait_for()
+    merge.get_by_text("The map 'geographic' has geographic coordinates").wait_for()
+    expect(merge.get_by_role("button", name="Copy 1 places")).to_have_count(0)
 
 
 @pytest.mark.thorough

@@ -36,7 +36,7 @@ async def chunks(data: bytes) -> AsyncIterator[bytes]:
 
 
 async def received(runtime: Runtime, data: bytes) -> ReceivedFile:
-    return await runtime.imports.receive(chunks(data), 0, [], lambda _: "lab")
+    return await runtime.imports.receive(chunks(data), 0, lambda _: "lab")
 
 
 class Gate:

@@ -25,7 +25,7 @@ def test_good_frames_are_stored_and_bad_ones_reported(server: Server, map_id: st
     places: list[Any] = [
         {"id": "good-1", "file": "a", "x": 1, "y": 2, "heading": 3, "sequence": "s", "metadata": {"n": 1}},
         {"id": "cut", "file": "cut"},
-        {"id": "good-2", "file": "b", "latitude": 48, "longitude": 2, "timestamp": "2026-11-20T10:00:00Z"},
+        {"id": "good-2", "file": "b", "x": 48, "y": 2, "timestamp": "2026-11-20T10:00:00Z"},
         {"id": "not an id", "file": "a"},
         {"id": "no-file", "file": "absent"},
         {"id": "half-pose", "file": "a", "x": 1},
@@ -40,6 +40,7 @@ def test_good_frames_are_stored_and_bad_ones_reported(server: Server, map_id: st
         {"id": "empty", "file": "empty"},
         {"id": "tiny", "file": "tiny"},
         {"id": "good-3", "file": "a"},
+        {"id": "other-kind", "file": "a", "latitude": 48, "longitude": 2},
     ]
     files = {
         "a": jpeg(1),
@@ -73,6 +74,7 @@ def test_good_frames_are_stored_and_bad_ones_reported(server: Server, map_id: st
         13: (422, "not-an-image"),
         14: (422, "empty-image"),
         15: (422, "image-too-small"),
+        17: (409, "mixed-coordinates"),
     }
     for position, (status, slug) in expected.items():
         assert_item_problem(by_position[position], status, slug)

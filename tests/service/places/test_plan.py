@@ -33,10 +33,10 @@ def test_the_columns_say_what_the_places_say(server: Server, map_id: str) -> Non
     moment = "2026-11-20T10:00:00.125Z"
     assert plan_of(server, map_id)["ids"] == []
     server.enrol(map_id, "p0", jpeg(0), x=1.23456, y=-2, heading=359.999, sequence="tuesday", timestamp=moment)
-    server.enrol(map_id, "p1", jpeg(1), latitude=48.12345678, longitude=-11.5, sequence="monday")
+    server.enrol(map_id, "p1", jpeg(1), x=48.12345678, y=-11.5, sequence="monday")
     server.enrol(map_id, "p2", jpeg(2))
     server.client.delete(f"/v1/maps/{map_id}/places/p1")
-    server.enrol(map_id, "p1", jpeg(1), latitude=48.12345678, longitude=-11.5, sequence="monday")
+    server.enrol(map_id, "p1", jpeg(1), x=48.12345678, y=-11.5, sequence="monday")
     plan = plan_of(server, map_id)
     milliseconds = round(1e3 * datetime.fromisoformat(moment).timestamp())
     assert plan == {
@@ -49,11 +49,11 @@ def test_the_columns_say_what_the_places_say(server: Server, map_id: str) -> Non
         "sequences": ["monday", "tuesday"],
         "ids": ["p0", "p2", "p1"],
         "sequence": [1, -1, 0],
-        "x": [1.235, None, None],
-        "y": [-2.0, None, None],
+        "x": [1.235, None, 48.123],
+        "y": [-2.0, None, -11.5],
         "z": None,
-        "latitude": [None, None, 48.1234568],
-        "longitude": [None, None, -11.5],
+        "latitude": None,
+        "longitude": None,
         "heading": [360.0, None, None],
         "timestamp": [milliseconds, None, None],
         "flags": [HAS_PICTURE] * 3,

@@ -70,12 +70,11 @@ def test_a_map_without_poses(server: Server, map_id: str) -> None:
         ({}, "a pose is either"),
         ({"x": 1}, "needs x and y"),
         ({"x": 1, "y": 1, "latitude": 1, "longitude": 1}, "is either"),
-        ({"latitude": 48, "longitude": 2}, "the map is in metres"),
         ({"x": "nan", "y": 1}, "x"),
         ({"x": 1, "y": 1, "radius": 5}, "radius"),
     ],
 )
-def test_what_is_no_pose_of_the_map_is_refused(server: Server, walked: str, pose: Any, reason: str) -> None:
+def test_what_is_no_pose_is_refused(server: Server, walked: str, pose: Any, reason: str) -> None:
     response = server.client.get(f"/v1/maps/{walked}/coverage", params=pose)
     problem = assert_problem(response, 422, "invalid-request")
     assert reason in json.dumps(problem)
@@ -87,7 +86,7 @@ def test_a_map_in_degrees(server: Server, map_id: str) -> None:
     found = coverage(server, map_id, latitude=48.000005, longitude=2)
     assert found["state"] == "covered" and found["distance"] == pytest.approx(0.556, abs=0.01)
     refused = server.client.get(f"/v1/maps/{map_id}/coverage", params={"x": 0, "y": 0})
-    assert "the map is in degrees" in assert_problem(refused, 422, "invalid-request")["detail"]
+    assert "geographic" in assert_problem(refused, 409, "mixed-coordinates")["detail"]
 
 
 def test_an_unknown_map(server: Server) -> None:

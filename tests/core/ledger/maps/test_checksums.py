@@ -20,6 +20,7 @@ from core.ledger.maps.schema import CAMERAS, MAPS, METADATA, PLACES
 from core.maps.counterparts import Correspondence
 from core.places import PlaceFields, Pose
 from tests.core.ledger.maps.memory import MOMENT, MemoryMap
+from tests.core.maps.mixed import both_kinds
 from tests.core.storage.frames import frame
 
 MASK = Mask(polygons=(((0, 0), (0.25, 0), (0, 0.25)),))
@@ -35,7 +36,8 @@ def full(lab: MemoryMap) -> MemoryMap:
     lab.enrol([frame("p0", timestamp=MOMENT, sequence="Ünter den Linden", camera="front", metadata={"ä": [None, 1.5]})])
     lab.enrol([frame("p1")])
     lab.set_fields("p0", lab.place("p0").fields().model_copy(update={"pose": metre}))
-    lab.set_fields("p1", PlaceFields(pose=degree))
+    with both_kinds():
+        lab.set_fields("p1", PlaceFields(pose=degree))
     lab.counterparts.store(Correspondence({1: (0, 0)}, {}))
     return lab
 

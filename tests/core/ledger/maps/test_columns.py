@@ -14,6 +14,7 @@ from core.ledger.maps.columns import read_columns
 from core.ledger.maps.schema import PLACES
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, PlaceFields, Pose, microseconds
 from tests.core.ledger.maps.memory import MemoryMap
+from tests.core.maps.mixed import both_kinds
 from tests.core.storage.frames import frame
 
 FIELDS = [
@@ -31,7 +32,8 @@ KINDS = {"metric": METRIC, "geographic": GEOGRAPHIC}
 @pytest.mark.parametrize("at_once", [2, 65_536])
 def test_columns_are_the_fields_of_the_places(lab: MemoryMap, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(columns, "_AT_ONCE", at_once)
-    lab.enrol([replace(frame(f"p{i}"), fields=fields) for i, fields in enumerate(FIELDS)])
+    with both_kinds():
+        lab.enrol([replace(frame(f"p{i}"), fields=fields) for i, fields in enumerate(FIELDS)])
     lab.forget("p0")
     with lab._reading() as connection:
         found = read_columns(connection, 5)

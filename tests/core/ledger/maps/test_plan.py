@@ -10,6 +10,7 @@ from core.maps.counterparts import Correspondence
 from core.maps.store import HANDED_OVER, HAS_PICTURE
 from core.places import PlaceFields, Pose
 from tests.core.ledger.maps.memory import MemoryMap
+from tests.core.maps.mixed import both_kinds
 from tests.core.storage.frames import frame
 
 
@@ -32,7 +33,8 @@ def test_the_columns_are_those_of_the_places(lab: MemoryMap) -> None:
     lab.enrol([frame("p2"), frame("p3")])
     lab.set_fields("p0", lab.place("p0").fields().model_copy(update={"pose": Pose(x=1.23456, y=-2, heading=359.999)}))
     geographic = PlaceFields(pose=Pose(latitude=48.12345678, longitude=-11.5), sequence="Ünter", timestamp=before)
-    lab.set_fields("p1", geographic)
+    with both_kinds():
+        lab.set_fields("p1", geographic)
     lab.edit({"keep": "none"})
     lab.enrol([frame("p2", "another")])
     lab.counterparts.store(Correspondence({3: (0, 0)}, {3: 0}))

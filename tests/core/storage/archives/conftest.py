@@ -9,6 +9,7 @@ from core.frames.masks import Mask
 from core.maps import Correspondence, Enrolment, MapSettings
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map
+from tests.core.maps.mixed import both_kinds
 from tests.core.storage.archives.files import exported
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
@@ -21,7 +22,8 @@ def filled(lab: Map) -> Map:
     lab.enrol([frame("q0", timestamp=moment), frame("q1", camera="front"), frame("gone", sequence="gone")])
     roof = frame("roof")
     where = PlaceFields(pose=Pose(latitude=48.8, longitude=2.3, heading=10), sequence="Ünter den Linden")
-    lab.enrol([Enrolment("roof", where, roof.descriptor, 3, roof.digest, roof.local)])
+    with both_kinds():
+        lab.enrol([Enrolment("roof", where, roof.descriptor, 3, roof.digest, roof.local)])
     lab.enrol([frame("p3", "p3 from elsewhere", x=1.0, sequence="monday")])
     q0, q1, gone, roof_row, p2 = (int(row or 0) for row in lab.rows_of(["q0", "q1", "gone", "roof", "p2"]))
     sequence = lab.snapshot().whereabouts.sequence
