@@ -14,7 +14,7 @@ from contextlib import suppress
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 
-from core.errors import PlacerecError, UnknownMap
+from core.errors import PlacerecError, StorageFull, UnknownMap
 from core.judgement.change import UsualScore
 from core.judgement.verdict import Verdict
 from core.ledger import Ledger
@@ -225,6 +225,11 @@ class QueryStatistics:
             self._write_counts()
         self.recent.flush()
 
+    def _flush_if_room(self) -> None:
+        """The same before something is read; what has no room on the disk waits in memory, and is left out."""
+        with suppress(StorageFull):
+            self.flush()
+
     def _write_counts(self) -> None:
         with self._lock:
             taken, self._counts, self._waiting = self._counts, {}, 0
@@ -283,14 +288,14 @@ class QueryStatistics:
     @once_more_if_replaced
     def read(self, key: MapKey) -> Statistics:
         """The statistics of a map, including the counts that are not written yet."""
-        self.flush()
+        self._flush_if_room()
         with self._ledger.transaction(READ) as connection:
             return read_counts(connection, key)
 
     @once_more_if_replaced
     def of_place(self, key: MapKey, place_id: str) -> PlaceCount:
         """The counts of one place of a map, including those that are not written yet."""
-        self.flush()
+        self._flush_if_room()
         return read_place(self._ledger, key, place_id)
 
     def hours(self, key: MapKey) -> list[HourCount]:
@@ -338,7 +343,7 @@ class QueryStatistics:
     @once_more_if_replaced
     def histories(self, key: MapKey) -> Histories:
         """How the places of a map answered over time, including what is not written yet."""
-        self.flush()
+        self._flush_if_room()
         with self._ledger.transaction(READ) as connection:
             return read_histories(connection, key)
 

@@ -21,7 +21,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from core.frames.images import Limits, decode
-from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
+from service.engine.encoders import NO_ENCODER, Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import ClientGone, NotReady
 from service.ray_serve.cluster import Cluster, RayUnavailable, caller
 from service.ray_serve.loads import LOADS
@@ -213,7 +213,8 @@ class RayEncoders:
 
     def _refuse(self, frames: Iterable[QueuedFrame]) -> None:
         for frame in frames:
-            _fail(frame, NotReady(f"No frame can be encoded now: {self.state}.", {"encoder": self.state}))
+            text = f"No frame can be encoded now: {self.state}."
+            _fail(frame, NotReady(text, {"encoder": self.state}, NO_ENCODER))
 
     def _add(self, frames: Iterable[QueuedFrame]) -> None:
         if self._stop.is_set():
@@ -334,7 +335,7 @@ class RayEncoders:
             if frame.attempts == ATTEMPTS:
                 self._sent.discard(frame)
                 text = f"The frame was lost {ATTEMPTS} times with the process that encoded it: {error}"[:500]
-                _fail(frame, NotReady(text, {"encoder": self.state}))
+                _fail(frame, NotReady(text, {"encoder": self.state}, NO_ENCODER))
             else:
                 self._loop.call_later(BACKOFF * 2 ** (frame.attempts - 1), self._back, frame)
 

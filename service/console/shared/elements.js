@@ -86,6 +86,18 @@ export function Progress({ done, total, label }) {
   return html`<progress class="progress" aria-label=${label} max=${total || 1} value=${total ? done : undefined}></progress>`;
 }
 
+/** Whether the service is ready, and takes writes. */
+export function Ready({ service: { ready, degraded } }) {
+  const [tone, word] = !ready ? ["bad", "not ready"] : degraded ? ["warn", "degraded"] : ["good", "ready"];
+  return html`<${Pill} tone=${tone}>${word}<//>`;
+}
+
+/** Why the service, which answers, takes no writes. */
+export function Degraded({ service }) {
+  if (!service?.degraded) return null;
+  return html`<p class="notice" role="alert"><strong>Writes are refused, queries are answered.</strong> ${service.degraded}</p>`;
+}
+
 export function Pill({ tone = "", title, children }) {
   return html`<span class=${`pill ${tone}`} title=${title}>${children}</span>`;
 }

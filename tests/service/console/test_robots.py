@@ -125,6 +125,26 @@ def test_what_is_out_of_service_is_an_alarm(admin: Operator) -> None:
     expect(alarms).to_contain_text("A page is torn.")
 
 
+@pytest.mark.parametrize("view", ["home", "service"])
+def test_a_service_that_takes_no_writes_says_so_and_is_not_called_unready(
+    admin: Operator, keyed: Server, view: str
+) -> None:
+    told = keyed.client.get("/v1/service").json()
+    told |= {"degraded": "The disk is full.", "checks": told["checks"] | {"disk": "The disk is full."}}
+    admin.page.route("**/v1/service", lambda route: route.fulfill(json=told))
+    page = admin.go(view)
+    banner = page.get_by_role("alert")
+    expect(banner).to_have_text("Writes are refused, queries are answered. The disk is full.")
+    expect(page.locator("main .pill").filter(has_text=re.compile("^(ready|not ready|degraded)$"))).to_have_text(
+        "degraded"
+    )
+    told |= {"degraded": None, "checks": told["checks"] | {"disk": "ok"}}
+    page.reload()
+    admin.settle(view)
+    expect(page.locator("main .pill").filter(has_text=re.compile("^ready$"))).to_be_visible()
+    expect(banner).to_have_count(0)
+
+
 @pytest.mark.thorough
 def test_the_alarms_of_maps_are_shown_while_they_are_raised_and_after(admin: Operator, keyed: Server) -> None:
     name = "alarmed"
