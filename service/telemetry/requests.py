@@ -20,8 +20,9 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors.faults import Stopping
-from service.errors.problems import problem_response
+from core.errors import PlacerecError
+from service.errors.faults import ClientGone, Fault, Stopping
+from service.errors.problems import kind_of, problem_response
 from service.telemetry.metrics import Metrics
 
 TRACEPARENT = re.compile(rb"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?")
@@ -226,7 +227,7 @@ class Telemetry:
             await problem_response(Request(inner), stopped)(inner, receive, send_marked)
         except Exception as error:  # a defect of the service: it is logged, but its text is not sent
             if status:
-                log.exception("the answer broke off", extra={"request_id": state["request_id"]})
+                _note_broken(error, state)
             else:
                 await problem_response(Request(inner), error)(inner, receive, send_marked)
         finally:
@@ -294,6 +295,17 @@ class Telemetry:
                 **state.get("noted", {}),
             },
         )
+
+
+def _note_broken(error: Exception, state: dict[str, Any]) -> None:
+    """Log that an answer ended before its end; what is foreseen, as a disk that fails, needs no traceback."""
+    cause = error.__cause__  # the framework raises another one from what it cannot answer any more
+    if isinstance(cause, ClientGone):
+        state["problem"] = kind_of(cause).slug  # for the line of the request
+    elif isinstance(cause, Fault | PlacerecError):
+        log.error("the answer broke off: %s", cause, extra={"request_id": state["request_id"]})
+    else:
+        log.error("the answer broke off", exc_info=error, extra={"request_id": state["request_id"]})
 
 
 def _mark(message: Message, request_id: str, trace: Trace | None) -> None:
