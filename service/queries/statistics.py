@@ -60,6 +60,7 @@ from service.queries.histories.tables import (
     read_usual,
 )
 from service.queries.histories.usual_scores import UsualScores
+from service.queries.lost_robots import LostRobot, LostRobots, forget_lost, put_changes, read_lost
 from service.queries.recent_answers import RecentAnswers
 
 MOST_WAITING = 50_000
@@ -116,6 +117,8 @@ class QueryStatistics:
         self._written: set[MapKey] = set()
         self.recent = RecentAnswers(ledger if shared else None)
         """The latest answers."""
+        self.watch = LostRobots()
+        """What robots are told, and so which are lost."""
         self.lost = 0
         """How many counts were dropped because the ledger refuses."""
         self._writing = threading.Lock()  # held while counts are on their way from memory to the ledger
@@ -223,6 +226,7 @@ class QueryStatistics:
         """
         with self._writing:
             self._write_counts()
+            self._write_alarms()
         self.recent.flush()
 
     def _flush_if_room(self) -> None:
@@ -246,6 +250,14 @@ class QueryStatistics:
             raise
         with self._lock:
             self._written |= taken.keys()
+
+    @once_more_if_replaced
+    def _write_alarms(self) -> None:
+        changes = self.watch.changes
+        if changes:
+            with self._ledger.transaction("write down which robots are lost") as connection:
+                put_changes(connection, changes, datetime.now(UTC))
+            self.watch.written(changes)
 
     def _run(self) -> None:
         while not self._stop.wait(self._seconds):
@@ -337,6 +349,20 @@ class QueryStatistics:
             one: {hour: counts for hour, counts in sorted(hours.items()) if hour >= oldest}
             for one, hours in found.items()
         }
+
+    @once_more_if_replaced
+    def lost_robots(self) -> list[LostRobot]:
+        """The robots of all maps that are lost, and those that were within the last days; the latest first."""
+        self._flush_if_room()
+        with self._ledger.transaction(READ) as connection:
+            return read_lost(connection, self.watch.changes)
+
+    @once_more_if_replaced
+    def forget_lost_robots(self, key: MapKey) -> None:
+        """Delete the alarms of robots of a map."""
+        self.watch.forget(key)
+        with self._ledger.transaction("forget which robots were lost") as connection:
+            forget_lost(connection, key)
 
     # Histories
 

@@ -61,6 +61,17 @@ export function Verdict({ verdict }) {
   return html`<span class=${`verdict ${verdict}`}><span aria-hidden="true">${SIGNS[verdict]}</span> ${verdict}</span>`;
 }
 
+/** What a frame says by itself, and what its run makes of it, which is what the robot was told; without a run the first alone. */
+export function Verdicts({ verdict, run }) {
+  if (!run) return html`<${Verdict} verdict=${verdict} />`;
+  return html`
+    <span class="verdicts">
+      <span><${Verdict} verdict=${verdict} /> <span class="small faint">this frame alone</span></span>
+      <span><${Verdict} verdict=${run} /> <span class="small faint">the run</span></span>
+    </span>
+  `;
+}
+
 const VERDICTS = ["recognized", "ambiguous", "unknown"];
 
 /** Shares of the verdicts as a bar. */

@@ -28,7 +28,7 @@ export default function Home() {
     <//>
     <${Degraded} service=${service.data} />
     <${Shown} resource=${fleet}>${(data) => html`
-      <${Alarms} found=${[...troubles(maps.data, service.data), ...backupTroubles(backups.data), ...alarmsOf(data.robots), ...mapAlarmsOf(data.alarms)]} />
+      <${Alarms} found=${[...troubles(maps.data, service.data), ...backupTroubles(backups.data), ...alarmsOf(data.lost), ...mapAlarmsOf(data.alarms)]} />
       <${Today} fleet=${data} backlogs=${maps.data?.backlogs} />
       <section class="stack">
         <div class="spread"><h2>Robots</h2>${data.robots.length > MOST_ROBOTS && html`<a href=${href("robots")}>All ${integer(data.robots.length)}</a>`}</div>
@@ -94,7 +94,7 @@ function Alarms({ found }) {
       ${present.length === 0 && html`<p class="faint">None: no robot has been lost for ${LOST_ALARM} s, and nothing is out of service.</p>`}
       ${found.length > 0 && html`
         <ul class="stack">
-          ${found.map((one) => html`<li class="row" key=${one.key || one.text.replace(/\d+/g, "")}><${Pill} tone=${one.tone}>${KINDS[one.tone]}<//> <a href=${one.address}>${one.text}</a>${one.of && html` <span class="faint">in ${one.of}</span>`}${one.why && html` <span class="faint small">${one.why}</span>`}${one.since && html` <span class="faint small nowrap"><${Moment} at=${one.since} /></span>`}</li>`)}
+          ${[...present, ...found.filter((one) => one.tone === "good")].map((one) => html`<li class="row" key=${one.key || one.text.replace(/\d+/g, "")}><${Pill} tone=${one.tone}>${KINDS[one.tone]}<//> <a href=${one.address}>${one.text}</a>${one.of && html` <span class="faint">in ${one.of}</span>`}${one.why && html` <span class="faint small">${one.why}</span>`}${one.since && html` <span class="faint small nowrap"><${Moment} at=${one.since} /></span>`}</li>`)}
         </ul>
       `}
     </section>
