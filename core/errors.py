@@ -8,7 +8,12 @@ from __future__ import annotations
 
 
 class PlacerecError(Exception):
-    """Base of all errors below."""
+    """Base of all errors below.
+
+    public: the text for those who may not know the addresses, paths and peers of an installation; None: it names none.
+    """
+
+    public: str | None = None
 
 
 # Images
@@ -63,6 +68,8 @@ class UnfitIntrinsics(PlacerecError):
 
 class InvalidModel(PlacerecError):
     """A network definition, a weights file or a vocabulary cannot be used."""
+
+    public = "A model cannot be used; the log of the service says which, and why."
 
 
 class MissingWeights(InvalidModel):

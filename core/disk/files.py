@@ -127,12 +127,17 @@ def primary_code(error: sqlite3.Error) -> int | None:
     return None if code is None else code & 0xFF
 
 
+def is_full(error: sqlite3.Error) -> bool:
+    """Whether SQLite finds no room on the disk."""
+    return getattr(error, "sqlite_errorcode", None) in _SQLITE_IS_FULL
+
+
 def _named(error: OSError | sqlite3.Error, action: str, database: str) -> Exception:
     if isinstance(error, OSError):
         if error.errno in DISK_IS_FULL:
             return StorageFull(f"The disk is full ({error.strerror}): could not {action}. Make room and try again.")
         return StorageFailure(f"The disk refused to {action}: {error.strerror or error}.")
-    if getattr(error, "sqlite_errorcode", None) in _SQLITE_IS_FULL:
+    if is_full(error):
         return StorageFull(f"The disk is full: could not {action}. Make room and try again.")
     if primary_code(error) in _SQLITE_IS_DAMAGED or str(error).startswith("Could not decode to UTF-8"):
         return Damage(f"{database} cannot be read: {error}")
@@ -165,13 +170,13 @@ def disk_errors(action: str, database: str = "map.sqlite") -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Write, sync and delete a small file in a folder.
+    """Write, sync and delete a small file in the data directory.
 
     Raises:
         StorageFull, StorageFailure: the disk refuses.
     """
     probe = folder / f".probe-{secrets.token_hex(4)}"
-    with disk_errors(f"write to {folder}"):
+    with disk_errors("write to the data directory"):
         try:
             probe.write_bytes(b"\x00" * 4096)
             sync_file(probe)

@@ -1,7 +1,8 @@
-"""Room on a disk that is held back, so that what is on it can still be deleted when it is full.
+"""Room on a disk that is held back, so that what is on it can still be read and deleted when it is full.
 
 A deletion writes before anything is freed: a database notes it in its log.  So on a disk without a free byte nothing
-could be deleted by those who want to make room.
+could be deleted by those who want to make room.  A database that is opened needs a little room as well, be it for
+reading alone: for the index of its log, which lies in a file beside it.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ import logging
 import os
 import shutil
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,9 +24,36 @@ FILE = "RESERVE"
 ROOMY = 4
 """The reserve is made where so many times its size is free."""
 
+LENT = 256 << 10
+"""Bytes that are freed for what opens a database."""
+
 T = TypeVar("T")
 
+_lenders: set[Path] = set()
+
 log = logging.getLogger(__name__)
+
+
+def lend_from(folder: Path) -> None:
+    """Have the reserve of a folder lend room to databases in it that are opened; the folder is this process's own."""
+    _lenders.add(folder.absolute())
+
+
+@contextmanager
+def lent_to(path: Path) -> Iterator[bool]:
+    """Free a little of the room that is held back above a file, for the block; whether there was any."""
+    found = next((folder / FILE for folder in path.absolute().parents if folder in _lenders), None)
+    size = 0
+    with suppress(OSError):
+        if found is not None and (size := found.stat().st_size):
+            os.truncate(found, max(0, size - LENT))
+            log.warning("the disk is full: %s is opened with room that is held back", path.name)
+    yield size > 0
+    with suppress(OSError):
+        if found is not None and size:  # what is left of it is held back again
+            left = shutil.disk_usage(found.parent).free
+            with found.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, min(size, os.fstat(file.fileno()).st_size + left))
 
 
 class Reserve:

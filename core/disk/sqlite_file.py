@@ -17,8 +17,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from core.disk.files import Damage
+from core.disk.files import Damage, is_full
 from core.disk.permissions import make_private
+from core.disk.reserve import lent_to
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 
 log = logging.getLogger(__name__)
@@ -57,6 +58,8 @@ def connect(
 ) -> sqlite3.Connection:
     """A connection without implicit transactions; any thread may use it, one at a time.
 
+    On a full disk a file that is there is opened with room that is held back (:mod:`core.disk.reserve`).
+
     Args:
         settings: pragmas to set, in this order.
         timeout: seconds to wait for another process's lock.
@@ -67,11 +70,24 @@ def connect(
     """
     if mode == "rwc":
         make_private(path)  # SQLite gives its logs the same permissions
+    try:
+        return _connected(path, mode, settings, timeout)
+    except sqlite3.OperationalError as error:
+        if not is_full(error):
+            raise
+        with lent_to(path) as lent:
+            if not lent:
+                raise
+            return _connected(path, mode, settings, timeout)
+
+
+def _connected(path: Path, mode: Mode, settings: Mapping[str, str | int], timeout: float) -> sqlite3.Connection:
     address = f"{path.absolute().as_uri()}?mode={mode}"
     connection = sqlite3.connect(address, uri=True, timeout=timeout, isolation_level=None, check_same_thread=False)
     try:
         for name, value in settings.items():
             connection.execute(f"PRAGMA {name} = {value}")
+        connection.execute("PRAGMA schema_version").fetchall()  # reads the file, which makes that of the log's index
     except BaseException:
         connection.close()
         raise

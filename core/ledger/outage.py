@@ -21,11 +21,13 @@ class Unreachable(StoreUnavailable):
 
     Args:
         server: its name, with which the text begins.
+        text: what it does; the words of others, which may name addresses, follow a colon.
     """
 
     def __init__(self, server: str, text: str) -> None:
         super().__init__(f"{server} {text}")
         self.server = server
+        self.public = f"{server} {text.partition(': ')[0].removesuffix('.')}."
 
 
 class Outage:

@@ -86,7 +86,7 @@ class SqliteLedger:
             DataDirectoryTooNew, DataDirectoryTooOld: its tables are of a version that is not read.
             StorageFull, StorageFailure: the disk refuses.
         """
-        with disk_errors(f"open {file.path}", file.path.name):
+        with disk_errors(f"open {file.path.name}", file.path.name):
             try:
                 return cls(file.open_or_replace() if replace_damaged else file.open(), file.path.name)
             except UnreadVersion as error:

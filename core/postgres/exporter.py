@@ -46,7 +46,7 @@ class PostgresExporter:
             UnknownMap: the map was deleted before it was read.
             StorageFull, StorageFailure.
         """
-        with disk_errors(f"write {path}"), self._keeping_objects(), self._viewing() as (connection, state):
+        with disk_errors("write the map as a file"), self._keeping_objects(), self._viewing() as (connection, state):
             source = _Source(connection, state.record, Form(state.record).frame_bytes, self._objects)
             return write_archive(source, path, advance, expect)
 

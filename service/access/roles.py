@@ -50,6 +50,11 @@ class Principal:
         """Whether maps may learn from its runs."""
         return self.role == "admin" or (self.learn and covers(self.role, "enrol"))
 
+    @property
+    def confided(self) -> bool:
+        """Whether it may know addresses, paths and peers of the installation: with an admin's key for all maps."""
+        return self == OWNER or (self.key_id is not None and self.role == "admin" and self.maps is None)
+
     def may_use(self, *map_ids: str | None) -> bool:
         """Whether it may use all of these maps; None, for what belongs to no map, needs a key for all maps."""
         return self.maps is None or all(map_id in self.maps for map_id in map_ids)

@@ -17,6 +17,7 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from core.disk.reserve import lend_from
 from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import Keys
@@ -245,6 +246,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         MissingExtra: the state is in PostgreSQL, and what speaks to it is not installed.
     """
     chosen = settings if settings is not None else read_settings()
+    lend_from(chosen.data_dir)
     database = open_database(chosen)
     store = Keys.of(chosen.data_dir, database)
     chosen.check_exposure(has_keys=not as_owner and _has_keys(store))

@@ -58,6 +58,9 @@ class RuntimeCollector(Collector):
             usage = shutil.disk_usage(runtime.settings.data_dir)
             yield _gauge("placerec_disk_free_bytes", "Free bytes on the disk of the data directory.", usage.free)
             yield _gauge("placerec_disk_bytes", "Size of the disk of the data directory in bytes.", usage.total)
+        yield _gauge(
+            "placerec_degraded", "1 if the service takes no writes for want of room, else 0.", int(runtime.degraded)
+        )
         yield _gauge("placerec_stopping", "1 if the service is about to stop, else 0.", int(runtime.stopping))
 
     def _jobs(self) -> Metric:

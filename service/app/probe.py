@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
-from core.errors import PlacerecError
+from core.errors import PlacerecError, StorageFull
+from service.errors.problems import told
 from service.worker_threads import in_thread
 
 ANSWER_SECONDS = 1.0
@@ -14,6 +16,28 @@ ANSWER_SECONDS = 1.0
 
 WRONG_SECONDS = 1.0
 """How long it counts that something is wrong."""
+
+
+class Outcome(NamedTuple):
+    """The outcome of a check.
+
+    text: "ok", or what is wrong.
+    public: the same for those who may not know addresses, paths and peers of the installation.
+    is_full: whether nothing is wrong but that there is no room to write.
+    """
+
+    text: str = "ok"
+    public: str = "ok"
+    is_full: bool = False
+
+    @classmethod
+    def of(cls, state: str, public: str) -> Outcome:
+        """That of a state, "ok" or what is wrong."""
+        return cls() if state == "ok" else cls(state, public)
+
+    def told(self, confided: bool) -> str:
+        """The text for those who may know addresses, or for those who may not."""
+        return self.text if confided else self.public
 
 
 class Probe:
@@ -26,23 +50,23 @@ class Probe:
     """
 
     def __init__(self, check: Callable[[], None], seconds: float, silent: str) -> None:
-        self._check, self._seconds, self._silent = check, seconds, silent
-        self._task: asyncio.Task[str] | None = None
+        self._check, self._seconds, self._silent = check, seconds, Outcome(silent, silent)
+        self._task: asyncio.Task[Outcome] | None = None
         self._began = 0.0
 
-    async def outcome(self) -> str:
-        """ "ok", or what is wrong, within ``ANSWER_SECONDS``."""
+    async def outcome(self) -> Outcome:
+        """The outcome of the latest check, within ``ANSWER_SECONDS``."""
         task = self._task
-        seconds = self._seconds if task is None or not task.done() or task.result() == "ok" else WRONG_SECONDS
+        seconds = self._seconds if task is None or not task.done() or task.result() == Outcome() else WRONG_SECONDS
         if task is None or (task.done() and time.monotonic() - self._began > seconds):
             self._began = time.monotonic()
             task = self._task = asyncio.create_task(in_thread(self._run))
         await asyncio.wait({task}, timeout=ANSWER_SECONDS)
         return task.result() if task.done() else self._silent
 
-    def _run(self) -> str:
+    def _run(self) -> Outcome:
         try:
             self._check()
         except PlacerecError as error:
-            return str(error)
-        return "ok"
+            return Outcome(str(error), told(error, False), isinstance(error, StorageFull))
+        return Outcome()

@@ -35,14 +35,21 @@ async def check_liveness() -> Health:
 
 @router.get("/readyz", responses=problem_documentation(NotReady))
 async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readiness:
-    """Check that the service can answer queries: the encoder reproduces its golden values and the disk is writable.
+    """Check that the service can answer queries: the encoder reproduces its golden values, and maps can be read.
 
-    A damaged map does not make the service unready; it is listed here if the key may use it.
+    A full disk takes no writes, but does not make the service unready: it is `degraded`, and says why. A damaged map
+    does not either; it is listed here if the key may use it. Addresses are named to admins alone.
     """
-    checks = await runtime.check_readiness()
+    found = await runtime.check_readiness()
+    found.require(principal.confided)
     damaged = runtime.engine.maps.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
-    return Readiness(checks=checks, encoder=runtime.settings.encoder, quarantined=quarantined)
+    return Readiness(
+        degraded=None if found.degraded is None else found.degraded.told(principal.confided),
+        checks=found.told_checks(principal.confided),
+        encoder=runtime.settings.encoder,
+        quarantined=quarantined,
+    )
 
 
 @router.get(
@@ -50,8 +57,9 @@ async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readi
     response_class=Response,
     responses={200: {"description": "The text format of Prometheus.", "content": {"text/plain": {}}}},
 )
-async def read_metrics(engine: EngineDep) -> Response:
+async def read_metrics(engine: EngineDep, runtime: RuntimeDep) -> Response:
     """Read the metrics for Prometheus."""
+    await runtime.check_readiness()  # one of them says whether it is degraded
     return Response(await in_thread(engine.metrics.expose), media_type=CONTENT_TYPE_LATEST)
 
 

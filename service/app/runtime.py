@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING
@@ -16,10 +18,11 @@ from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
 from service.access.keyring import Keyring
 from service.administration.audit_trail import AuditTrail
-from service.app.probe import Probe
+from service.app.probe import Outcome, Probe
 from service.backups.backups import Backups
+from service.engine.encoders import NO_ENCODER
 from service.engine.engine import Engine
-from service.errors.faults import NotReady
+from service.errors.faults import KeysUnreadable, NotReady
 from service.jobs.job import Job
 from service.jobs.jobs import Jobs
 from service.learning import lessons, new_ground
@@ -57,6 +60,44 @@ CHECK_SECONDS, PICTURES_CHECK_SECONDS = 1.0, 5.0
 """The disk, the database and the object store are checked at most this often."""
 
 log = logging.getLogger("placerec.runtime")
+
+
+DISPENSABLE = frozenset({"pictures", "others"})
+"""Checks that a service answers queries without."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the checks of a service have found.
+
+    checks: the outcome of each, by its name.
+    """
+
+    checks: Mapping[str, Outcome]
+
+    @property
+    def lacking(self) -> Mapping[str, Outcome]:
+        """The checks without which it cannot answer queries; room to write is none of them."""
+        bad = {name: one for name, one in self.checks.items() if one != Outcome() and not one.is_full}
+        return {name: one for name, one in bad.items() if name not in DISPENSABLE}
+
+    @property
+    def degraded(self) -> Outcome | None:
+        """Why it takes no writes, though it answers; None: it takes them."""
+        return next((one for one in self.checks.values() if one.is_full), None)
+
+    def told(self, confided: bool) -> str:
+        """What it lacks to answer queries, in a sentence; empty: nothing."""
+        return "; ".join(f"{name}: {one.told(confided)}" for name, one in self.lacking.items())
+
+    def told_checks(self, confided: bool) -> dict[str, str]:
+        """Each check, "ok" or what is wrong."""
+        return {name: one.told(confided) for name, one in self.checks.items()}
+
+    def require(self, confided: bool) -> None:
+        """Raise NotReady if it cannot answer queries, with what its reader may know."""
+        if lacking := self.told(confided):
+            raise NotReady(f"The service is not ready: {lacking.removesuffix('.')}.", self.told_checks(confided))
 
 
 class Runtime:
@@ -107,7 +148,9 @@ class Runtime:
         self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
-        self._not_ready = ""
+        self.degraded = False
+        """Whether it has no room to write, as of the latest look."""
+        self._noted = "the service is ready"
         maps, folder = self.engine.maps, partial(check_writable, settings.data_dir)
         own = settings.engine == "files"
         self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
@@ -222,41 +265,43 @@ class Runtime:
             await to_thread.run_sync(self.shared.close)
         await to_thread.run_sync(self.engine.close)
 
-    async def check_readiness(self) -> dict[str, str]:
-        """The outcome of each check by its name; each is "ok", but for pictures, which queries do without, and others,
-        which says how services differ.
-
-        Raises:
-            NotReady: at least one is not "ok".
-        """
-        encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
-        checks = {"encoder": encoder if encoder != "ok" else encoders}
-        checks["maps"] = "ok" if self._database is None else await self._database.outcome()
+    async def check_readiness(self) -> Condition:
+        """Check whether the service can answer queries, and take writes."""
+        checks = {"encoder": self._encoder()}
+        checks["maps"] = Outcome() if self._database is None else await self._database.outcome()
         checks["disk"] = await self._disk.outcome()
         if self.shared is not None:
-            checks["replica"] = self.shared.replica.state
-            checks["keys"] = "ok" if self._keyring is None else self._keyring.state
+            checks["replica"] = Outcome.of(self.shared.replica.state, "It is cut off from the other services.")
+            checks["keys"] = Outcome.of("ok" if self._keyring is None else self._keyring.state, KeysUnreadable.public)
         if self.stopping:
-            checks["service"] = "it is stopping"
-        bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
-        self._note_readiness("; ".join(bad))
+            checks["service"] = Outcome("it is stopping", "it is stopping")
         if self.settings.objects is not None:
             checks["pictures"] = await self._pictures.outcome()
         if self.shared is not None:
-            checks["others"] = self.shared.differences.state
-        if bad:
-            raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
-        return checks
+            others = self.shared.differences
+            checks["others"] = Outcome.of(others.state, others.public_state)
+        found = Condition(checks)
+        self._note_readiness(found)
+        self.degraded = found.degraded is not None
+        return found
 
-    def _note_readiness(self, bad: str) -> None:
+    def _encoder(self) -> Outcome:
+        """The state of the default encoder, and of what computes it."""
+        if self.engine.encoder_state == "ok":
+            return Outcome.of(self.engine.queue.encoders.state, NO_ENCODER)
+        return Outcome(self.engine.encoder_state, self.engine.public_encoder_state)
+
+    def _note_readiness(self, found: Condition) -> None:
         """Log when it becomes another one; that the encoder is being loaded is no news."""
+        bad, full = found.told(confided=True), found.degraded
         if bad == "encoder: loading":
             return
-        before, self._not_ready = self._not_ready, bad
-        if bad and bad != before:
-            log.warning("the service is not ready: %s", bad)
-        elif before and not bad:
-            log.info("the service is ready")
+        now = f"the service is not ready: {bad}" if bad else "the service is ready"
+        if not bad and full is not None:
+            now += f", but takes no writes: {full.text}"
+        before, self._noted = self._noted, now
+        if now != before:
+            log.log(logging.WARNING if bad or full else logging.INFO, "%s", now)
 
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:

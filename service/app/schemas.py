@@ -28,7 +28,10 @@ class Readiness(BaseModel):
     """The service is ready for requests."""
 
     status: Literal["ready"] = "ready"
-    checks: dict[str, str]
+    degraded: str | None = Field(
+        default=None, description="Why it answers queries but takes no writes, as on a full disk; null: it takes them."
+    )
+    checks: dict[str, str] = Field(description="Each is `ok`, or a sentence that says what is wrong.")
     encoder: str
     quarantined: list[QuarantinedMap]
 

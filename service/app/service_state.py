@@ -16,7 +16,6 @@ from core.maps import MapRecord
 from core.places import Timestamp
 from service.access.roles import Principal
 from service.app.runtime import Runtime
-from service.errors.faults import NotReady
 from service.http.bodies import UploadMemory
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.settings import Settings
@@ -108,6 +107,7 @@ STATE_EXAMPLE: dict[str, Any] = {
     "started_at": "2026-11-22T09:00:00Z",
     "uptime_seconds": 812.4,
     "ready": True,
+    "degraded": None,
     "checks": {"encoder": "ok", "maps": "ok", "disk": "ok"},
     "queue": {"waiting": 1, "limit": 32},
     "storage": {"busy": 0, "waiting": 0, "threads": 8},
@@ -150,6 +150,7 @@ class ServiceState(BaseModel):
     started_at: Timestamp
     uptime_seconds: float
     ready: bool
+    degraded: str | None = Field(description="As that of `/readyz`: why it takes no writes; null: it takes them.")
     checks: dict[str, str] = Field(
         description="Those of `/readyz`; each is `ok`, or a sentence that says what is wrong."
     )
@@ -176,7 +177,7 @@ async def read_service(
 
     Memory, disk and settings are shown to a key of the role `admin` that is not limited to maps.
     """
-    checks, ready = await _checks(runtime)
+    found = await runtime.check_readiness()
     settings, engine = runtime.settings, runtime.engine
     limiter = to_thread.current_default_thread_limiter()
     states = runtime.jobs.counts()
@@ -189,8 +190,9 @@ async def read_service(
         encoder=settings.encoder,
         started_at=runtime.started_at,
         uptime_seconds=round(time.monotonic() - runtime.started, 3),
-        ready=ready,
-        checks=checks,
+        ready=not found.lacking,
+        degraded=None if found.degraded is None else found.degraded.told(principal.confided),
+        checks=found.told_checks(principal.confided),
         queue=QueueState(waiting=engine.queue.waiting, limit=settings.queue_length),
         storage=ThreadsState(
             busy=limiter.borrowed_tokens,
@@ -207,13 +209,6 @@ async def read_service(
         disk=await in_thread(_disk, settings.data_dir) if manages else None,
         settings=settings.model_dump(mode="json") if manages else None,
     )
-
-
-async def _checks(runtime: Runtime) -> tuple[dict[str, str], bool]:
-    try:
-        return await runtime.check_readiness(), True
-    except NotReady as error:
-        return error.checks, False
 
 
 def _requests(runtime: Runtime) -> RequestsState:

@@ -215,6 +215,9 @@ class Encoders(Protocol):
         """Cancel all waiting frames and end; blocks."""
 
 
+NO_ENCODER = "No frame can be encoded now; the log of the service says why."
+"""What those are told of a state that is not "ok" who may not know the addresses of an installation."""
+
 MakeEncoders = Callable[[Limits, Metrics], Encoders]
 """Makes the encoders, given the largest frame that is decoded and where to count."""
 

@@ -36,6 +36,7 @@ from service.engine.rehearsal import rehearse
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Answered, Searches, search_ahead
 from service.engine.stores import OpenStore
+from service.errors.problems import told
 from service.events.events import Events
 from service.malloc import return_free_memory
 from service.settings import Settings
@@ -122,8 +123,9 @@ class Engine:
         self.review_keeper = ReviewKeeper()
         self.reserve = Reserve(settings.data_dir, settings.disk_reserve_bytes)
         """Room for what deletes something."""
-        self.encoder_state = "loading"
-        """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
+        self.encoder_state = self.public_encoder_state = "loading"
+        """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used; the second
+        for those who may not know addresses and paths."""
         self._locks = MapLocks()
         self._loading: asyncio.Task[None] | None = None
         self._map_collector = MapCollector(self._count_places, lambda: len(self.maps.quarantined()))
@@ -157,17 +159,17 @@ class Engine:
             if self.settings.rehearsal:
                 await in_thread(rehearse, encoder)
         except PlacerecError as error:
-            self.encoder_state = str(error)
+            self.encoder_state, self.public_encoder_state = str(error), told(error, False)
             log.error("the default encoder cannot be used: %s", error)
         except Exception:
-            self.encoder_state = "it cannot be loaded; the log says why"
+            self.encoder_state = self.public_encoder_state = "it cannot be loaded; the log says why"
             log.exception("the default encoder cannot be loaded")
         else:
             # Objects that are loaded by now live as long as the process: the garbage collector can skip them.
             gc.collect()
             gc.freeze()
             await in_thread(return_free_memory)  # what loading took and needs no more
-            self.encoder_state = "ok"
+            self.encoder_state = self.public_encoder_state = "ok"
             log.info("ready", extra={"encoder": identity, "seconds": round(time.perf_counter() - began, 2)})
 
     # Maps

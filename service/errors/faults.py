@@ -10,7 +10,12 @@ from typing import ClassVar
 
 
 class Fault(Exception):
-    """Base of all classes below; its text explains to the caller, in a sentence, the fault and the remedy."""
+    """Base of all classes below; its text explains to the caller, in a sentence, the fault and the remedy.
+
+    public: as that of :class:`core.errors.PlacerecError`.
+    """
+
+    public: str | None = None
 
 
 class MalformedBody(Fault):
@@ -65,11 +70,12 @@ class NotReady(Fault):
 
     Args:
         checks: the result of each check, "ok" or what is wrong.
+        public: as that of all errors; it stands for what is wrong, too.
     """
 
-    def __init__(self, detail: str, checks: dict[str, str]) -> None:
+    def __init__(self, detail: str, checks: dict[str, str], public: str | None = None) -> None:
         super().__init__(detail)
-        self.checks = checks
+        self.checks, self.public = checks, public
 
 
 class EncoderNotInstalled(Fault):
@@ -234,6 +240,8 @@ class TooManyKeys(Fault):
 
 class KeysUnreadable(Fault):
     """The file of the keys is damaged, missing or unreadable, so nobody is let in."""
+
+    public = "The keys cannot be read, so nobody is let in; the log of the service says why."
 
 
 class RateExceeded(Fault):

@@ -280,11 +280,23 @@ def declared(error: Exception) -> Exception:
     return error
 
 
-def problem_of(error: Exception, instance: str | None = None, request_id: str | None = None) -> Problem:
-    """The problem object of an exception; that of an unexpected exception says only that it happened."""
+def told(error: Exception, confided: bool) -> str:
+    """The text of an error, for those who may know the addresses of an installation or for those who may not."""
+    public: str | None = getattr(error, "public", None)
+    return str(error) if confided or public is None else public
+
+
+def problem_of(
+    error: Exception, instance: str | None = None, request_id: str | None = None, confided: bool = True
+) -> Problem:
+    """The problem object of an exception; that of an unexpected exception says only that it happened.
+
+    Args:
+        confided: whether its reader may know addresses, paths and peers of the installation.
+    """
     error = declared(error)
     kind = kind_of(error)
-    detail = str(error) or kind.title
+    detail = told(error, confided) or kind.title
     if kind is INTERNAL:
         detail = "An unexpected error occurred; it is in the log under the request id."
     if isinstance(error, HTTPException):
@@ -293,7 +305,8 @@ def problem_of(error: Exception, instance: str | None = None, request_id: str | 
     if isinstance(error, faults.InvalidRequest) and error.errors:
         extras["errors"] = error.errors
     if isinstance(error, faults.NotReady):
-        extras["checks"] = error.checks
+        hidden = error.public is not None and not confided
+        extras["checks"] = {name: detail if hidden and found != "ok" else found for name, found in error.checks.items()}
     return Problem(
         type=kind.type,
         title=kind.title,
@@ -320,9 +333,13 @@ def invalid_request(found: Iterable[Mapping[str, Any]]) -> faults.InvalidRequest
 def request_problem(request: Request, error: Exception) -> Problem:
     """The problem object of an exception that a request raised."""
     # Not request.url, which fails for a malformed Host header.
-    return problem_of(
-        error, quote(request.scope["path"], safe=PATH_CHARACTERS), getattr(request.state, "request_id", None)
-    )
+    path, request_id = quote(request.scope["path"], safe=PATH_CHARACTERS), getattr(request.state, "request_id", None)
+    return problem_of(error, path, request_id, is_confided(request.state))
+
+
+def is_confided(state: Any) -> bool:
+    """Whether the caller of a request, by its state, may know addresses; not before it is known who it is."""
+    return getattr(getattr(state, "principal", None), "confided", False)
 
 
 def problem_response(request: Request, error: Exception) -> Response:

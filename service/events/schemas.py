@@ -53,7 +53,11 @@ class QueryEvent(Event):
     kind: ClassVar[EventKind] = "query"
 
     operation: str | None = Field(description="The operation that was called, such as query or send_frame.")
-    verdict: Verdict
+    verdict: Verdict = Field(description="Of this frame alone.")
+    run: Verdict | None = Field(
+        default=None,
+        description="Of the run that the frame belongs to, after it: what the robot was told; null: none.",
+    )
     probability: float | None
     place: str | None = Field(description="Id of the place; non-null only if recognized.")
     best: str | None = Field(description="Id of the best match, with any verdict.")
@@ -74,6 +78,7 @@ class QueryEvent(Event):
         "longer than 2000 characters.",
     )
     file: str | None = Field(default=None, description="The name of the file part that the frame was.")
+    trial: bool = Field(default=False, description="Whether a person tried it in the console; then it is not counted.")
     milliseconds: dict[str, float]
     revision: int | None = Field(description="The revision of the map that answered.")
     explanation: str | None = Field(

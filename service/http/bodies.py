@@ -80,7 +80,7 @@ class Intake:
         idle: float = math.inf,
     ) -> None:
         self.limit, self.deadline, self.idle = limit, deadline, idle
-        self.size, self.complete = 0, False
+        self.size, self.complete, self.answered = 0, False, False
         self.holding = Holding(self._give_way)
         """The bytes of this body that are held in memory."""
         self._digest_headers: tuple[str, ...] = ("Content-Digest",)
@@ -99,12 +99,12 @@ class Intake:
             BodyTooLarge: the body is longer than the limit, or its Content-Length is.
             MemoryFull: the uploads under way leave no room for the body, or not any more.
             DeadlineExceeded: the body did not arrive in time.
-            ClientGone: the connection was closed before the end of the body.
+            ClientGone: the connection was closed before the end of the body, and nothing was answered yet.
             UnsupportedCoding: the body is compressed.
             InvalidRequest: its digest is malformed.
             DigestMismatch: the whole body has another digest; this comes in place of its last bytes.
         """
-        if self.complete:
+        if self.complete or self.answered:  # who sends an answer only waits for the client to go away
             return await self._next(None)
         digests = self._stated_digests()
         self._check(self._announced)
@@ -114,9 +114,13 @@ class Intake:
         try:
             message = await self._next(min(left, self.idle))
         except TimeoutError:
+            if self.answered:
+                return await self._next(None)
             if self.idle < left:
                 raise DeadlineExceeded(f"No byte of the body arrived for {self.idle:g} seconds.") from None
             raise DeadlineExceeded("The body did not arrive in time.") from None
+        if self.answered:
+            return message
         if message["type"] != "http.request":
             raise ClientGone("The connection was closed before the end of the body.")
         arrived = len(message.get("body", b""))
@@ -206,8 +210,13 @@ class BodyLimit:
         idle = self.settings.read_timeout
         intake = Intake(scope, receive, self.settings.max_json_bytes, deadline, self.memory, idle)
         state["intake"] = intake
+
+        async def sending(message: Message) -> None:
+            intake.answered = True
+            await send(message)
+
         try:
-            await self.app(scope, intake, send)
+            await self.app(scope, intake, sending)
         finally:
             state["bytes_in"] = intake.size
             self.memory.release(intake.holding)

@@ -12,7 +12,7 @@ import logging
 import math
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sqlalchemy import bindparam, select, update
@@ -56,6 +56,9 @@ READ_SECONDS = 30.0
 CLOCK_SECONDS = 2.0
 """A clock that is off by more is reported."""
 
+Difference = tuple[str, str, str]
+"""What differs, in a sentence; the same without the address of another service; and the values."""
+
 log = logging.getLogger("placerec.shared")
 
 _WRITE = Statement(update(REPLICAS).where(REPLICAS.c.id == bindparam("service")).values(settings=bindparam("text")))
@@ -66,6 +69,7 @@ class ReplicaDifferences:
     """Tells the other services what this one has, and compares it with what they have.
 
     state: "ok", or what differs, in a sentence.
+    public_state: the same without the addresses of the others.
 
     Args:
         replica: the id of this service.
@@ -76,7 +80,7 @@ class ReplicaDifferences:
         self._catalogue = EncoderCatalogue(settings.models_directory)
         self._written: str | None = None
         self._mine, self._read = dict[str, Any](), -math.inf
-        self.state = "ok"
+        self.state = self.public_state = "ok"
 
     def compare(self) -> None:
         """Tell and compare.
@@ -101,7 +105,8 @@ class ReplicaDifferences:
         ]
         if found and (late := _off_by(found[0][2], sent, answered)):
             away = f"{abs(late):.0f} s {'behind' if late > 0 else 'ahead of'} PostgreSQL's"
-            differences.append((f"The clock of this machine is {away}", "keys expire by it"))
+            off = f"The clock of this machine is {away}"
+            differences.append((off, off, "keys expire by it"))
         self._note(differences)
 
     def _read_mine(self) -> dict[str, Any]:
@@ -110,22 +115,26 @@ class ReplicaDifferences:
         where = f"{socket.gethostname()}:{self._settings.port}"
         return {"at": where, "version": importlib.metadata.version("placerec"), "encoders": encoders, **chosen}
 
-    def _note(self, differences: list[tuple[str, str]]) -> None:
+    def _note(self, differences: list[Difference]) -> None:
         before = self.state
-        self.state = "; ".join(difference for difference, _ in differences) + "." if differences else "ok"
+        self.state, self.public_state = (_together(one[at] for one in differences) for at in (0, 1))
         if self.state == before:
             return
         if not differences:
             log.info("the services are alike again")
-        for difference, details in differences:
+        for difference, _, details in differences:
             log.warning("%s: %s", difference, details)
 
 
-def _differences(mine: Mapping[str, Any], theirs: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
+def _together(sentences: Iterable[str]) -> str:
+    return f"{said}." if (said := "; ".join(sentences)) else "ok"
+
+
+def _differences(mine: Mapping[str, Any], theirs: Mapping[str, Any], name: str) -> list[Difference]:
     """The differing settings, and their values."""
-    other = f"{name} ({theirs.get('at')})"
+    said, other = "{} is not that of {}", f"{name} ({theirs.get('at')})"
     return [
-        (f"{key} is not that of {other}", f"{value} here, {theirs.get(key)} there")
+        (said.format(key, other), said.format(key, "another service"), f"{value} here, {theirs.get(key)} there")
         for key, value in mine.items()
         if key != "at" and theirs.get(key) != value
     ]

@@ -87,11 +87,11 @@ class StagedForm:
         """
         self._path = folder / "form"
         try:
-            with disk_errors(f"read {folder}"):
+            with disk_errors("read frames that wait"):
                 listed = json.loads((folder / "parts").read_bytes())
             self.parts = [StagedPart(**part) for part in listed]
         except (ValueError, TypeError) as error:
-            raise StorageFailure(f"{folder / 'parts'} is damaged: {error}.") from error
+            raise StorageFailure(f"The frames that wait are damaged: {error}.") from error
 
     def read(self, part: StagedPart) -> FormPart:
         """A part with its bytes.
@@ -99,11 +99,11 @@ class StagedForm:
         Raises:
             StorageFailure: the bytes cannot be read, or differ from those that arrived.
         """
-        with disk_errors(f"read {self._path}"), self._path.open("rb") as file:
+        with disk_errors("read frames that wait"), self._path.open("rb") as file:
             file.seek(part.offset)
             data = file.read(part.size)
         if hashlib.sha256(data).hexdigest() != part.sha256:
-            raise StorageFailure(f"{self._path}: the part {part.name[:80]!r} is damaged.")
+            raise StorageFailure(f"The part {part.name[:80]!r} of the frames that wait is damaged.")
         return FormPart(part.name, part.filename, part.content_type, data, part.oversized)
 
 
@@ -141,7 +141,7 @@ class Staging:
         Raises:
             StorageFull, StorageFailure: the disk refuses.
         """
-        with disk_errors(f"remove {self._folder / name}"):
+        with disk_errors("remove frames that waited"):
             if (self._folder / name).exists():
                 shutil.rmtree(self._folder / name)
         with self._lock:

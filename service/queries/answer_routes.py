@@ -29,6 +29,7 @@ router = APIRouter(
 ANSWER_EXAMPLE: dict[str, Any] = {
     "at": "2026-11-22T18:02:31.977000Z",
     "verdict": "recognized",
+    "run": None,
     "probability": 0.97,
     "place": "p7",
     "change": CHANGE_EXAMPLE,
@@ -64,7 +65,11 @@ class RecentAnswerView(BaseModel):
     model_config = ConfigDict(json_schema_extra={"examples": [ANSWER_EXAMPLE]})
 
     at: Timestamp
-    verdict: Verdict
+    verdict: Verdict = Field(description="Of this frame alone.")
+    run: Verdict | None = Field(
+        default=None,
+        description="Of the run that the frame belongs to, after it: what the robot was told; null: none.",
+    )
     probability: float | None
     place: str | None = Field(description="Id of the place, if it was recognized.")
     change: ChangeView | None = None
@@ -105,7 +110,8 @@ class RecentAnswerView(BaseModel):
 
 
 _SAME = (
-    "at", "verdict", "probability", "place", "change", "pose", "score", "margin", "decision", "threshold", "reason",
+    "at", "verdict", "run", "probability", "place", "change", "pose", "score", "margin", "decision", "threshold",
+    "reason",
 )  # fmt: skip
 
 
@@ -172,7 +178,7 @@ def list_answers(
     """List the latest answers of a map, and how many there were in each of the last 24 hours.
 
     The answers are held in memory, so a restart forgets them; the counts are stored on disk. The caller is shown to
-    admins.
+    admins. What a person tries in the console is neither listed nor counted.
     """
     key = map_key(engine.maps.get(map_id))
     stored = statistics.recent.of_map(key)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from core.errors import PlacerecError
+from core.judgement.verdict import Verdict
 from core.maps import Map
 from core.upkeep.histories import PlacePeriod
 from service.engine.engine import Engine
@@ -13,6 +14,7 @@ from service.queries.counts import PassedBy
 from service.queries.given_answers import GivenAnswer, QueriedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics, map_key
+from service.telemetry.requests import is_trial
 
 
 def follow_answer(
@@ -27,10 +29,11 @@ def follow_answer(
     count: bool = True,
     review: bool = True,
     passed: PassedBy | None = None,
+    run: Verdict | None = None,
 ) -> None:
     """Count an answer, send it to the listeners of its map, if any, and store the frame if the map's settings say so.
 
-    Nobody is waited for.
+    Nobody is waited for.  What a person tries in the console is not counted: it is no robot.
 
     Args:
         frame: the bytes of the frame's file; listeners see a picture of it only if the map stores pictures.
@@ -40,12 +43,14 @@ def follow_answer(
         count: whether the answer says something of the map, in whose statistics it is counted.
         review: whether the map may store the frame.
         passed: the place that a run was sure to be at.
+        run: the verdict of the run that the frame belongs to, after it; None: it belongs to none.
     """
-    record, given = map_.record, GivenAnswer.of(answer, queried, milliseconds)
-    engine.metrics.observe_answer(record.id, answer.verdict, answer.score)
+    record, given, counts = map_.record, GivenAnswer.of(answer, queried, milliseconds, run), not is_trial()
+    if counts:
+        engine.metrics.observe_answer(record.id, answer.verdict, answer.score)
     if "search" in answer.milliseconds:
         engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
-    if count:
+    if count and counts:
         _count(engine, statistics, record.id, answer, given, passed)
     is_stored = review and record.review is not None and answer.verdict in record.review.verdicts
     if not is_stored and not engine.events.heard(record.id):
@@ -69,6 +74,7 @@ def _count(
         key = map_key(engine.maps.find(map_id))
         statistics.observe(key, given.verdict, given.best, given.score, given.decision, _period(answer), passed)
         statistics.recent.add(key, given)
+        statistics.watch.observe(key, given)
 
 
 def _period(answer: QueryAnswer) -> PlacePeriod | None:

@@ -11,6 +11,7 @@ from core.judgement.verdict import Verdict
 from service.access.audit import ASKER, Asker
 from service.events.schemas import QueryEvent
 from service.queries.schemas import ChangeView, EstimatedPose, QueryAnswer
+from service.telemetry.requests import is_trial
 
 MOST_MATCHES = 5
 """Matches that are stored of one answer, the best ones."""
@@ -46,6 +47,7 @@ class GivenAnswer(NamedTuple):
     milliseconds: of the answer and of its request.
     revision: of the map that answered.
     asker: the caller, and its request.
+    run: the verdict of the run that the frame belongs to, after it; None: it belongs to none.
     """
 
     at: datetime
@@ -64,15 +66,21 @@ class GivenAnswer(NamedTuple):
     revision: int | None
     asker: Asker
     change: ChangeView | None = None
+    run: Verdict | None = None
 
     @classmethod
     def of(
-        cls, answer: QueryAnswer, frame: QueriedFrame, milliseconds: Mapping[str, float] | None = None
+        cls,
+        answer: QueryAnswer,
+        frame: QueriedFrame,
+        milliseconds: Mapping[str, float] | None = None,
+        run: Verdict | None = None,
     ) -> GivenAnswer:
         """An answer that is being given now.
 
         Args:
             milliseconds: of the whole request, where the answer does not say it.
+            run: as of the fields.
         """
         return cls(
             datetime.now(UTC),
@@ -91,7 +99,13 @@ class GivenAnswer(NamedTuple):
             answer.revision,
             ASKER.get(),
             answer.change,
+            run,
         )
+
+    @property
+    def told(self) -> Verdict:
+        """The verdict that the robot was told: of its run or, without one, of the frame."""
+        return self.verdict if self.run is None else self.run
 
     @property
     def best(self) -> str | None:
@@ -121,6 +135,7 @@ class GivenAnswer(NamedTuple):
             frame=self.frame.number,
             question=question if short else None,
             file=file,
+            trial=is_trial(),
             milliseconds=dict(self.milliseconds),
             explanation=explanation,
         )
@@ -136,7 +151,7 @@ class GivenAnswer(NamedTuple):
         return next((rank for rank, (found, _) in enumerate(self.matches, start=1) if found == place_id), None)
 
 
-_SAME = ("at", "verdict", "probability", "place", "best", "score", "decision", "threshold", "reason", "revision")
+_SAME = ("at", "verdict", "run", "probability", "place", "best", "score", "decision", "threshold", "reason", "revision")
 
 REVIEWED = {
     "request_id", "key", "operation", "verdict", "probability", "best", "score", "decision", "threshold", "reason",

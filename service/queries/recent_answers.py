@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 
 from pydantic import ConfigDict, TypeAdapter
 from sqlalchemy import Column, Index, MetaData, Table, bindparam, delete, insert, select
 from sqlalchemy.sql import ColumnElement
 
+from core.errors import StorageFull
 from core.ledger import Ledger, Statement, Tables
 from core.ledger.statements import among, integer, text
 from service.queries.given_answers import GivenAnswer, MapKey
@@ -94,7 +96,8 @@ class RecentAnswers:
         if self._ledger is None:
             with self._lock:
                 return list(reversed(self._stored.get(key, ())))
-        self.flush()
+        with suppress(StorageFull):  # what has no room waits in memory, and is left out
+            self.flush()
         found = self._ledger.execute("read the latest answers", _READ, id=key[0], made=key[1], most=MOST_OF_MAP)
         return [_JSON.validate_json(answer) for (answer,) in found]
 

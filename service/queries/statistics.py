@@ -14,7 +14,7 @@ from contextlib import suppress
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 
-from core.errors import PlacerecError, UnknownMap
+from core.errors import PlacerecError, StorageFull, UnknownMap
 from core.judgement.change import UsualScore
 from core.judgement.verdict import Verdict
 from core.ledger import Ledger
@@ -60,6 +60,7 @@ from service.queries.histories.tables import (
     read_usual,
 )
 from service.queries.histories.usual_scores import UsualScores
+from service.queries.lost_robots import LostRobot, LostRobots, forget_lost, put_changes, read_lost
 from service.queries.recent_answers import RecentAnswers
 
 MOST_WAITING = 50_000
@@ -116,6 +117,8 @@ class QueryStatistics:
         self._written: set[MapKey] = set()
         self.recent = RecentAnswers(ledger if shared else None)
         """The latest answers."""
+        self.watch = LostRobots()
+        """What robots are told, and so which are lost."""
         self.lost = 0
         """How many counts were dropped because the ledger refuses."""
         self._writing = threading.Lock()  # held while counts are on their way from memory to the ledger
@@ -223,7 +226,13 @@ class QueryStatistics:
         """
         with self._writing:
             self._write_counts()
+            self._write_alarms()
         self.recent.flush()
+
+    def _flush_if_room(self) -> None:
+        """The same before something is read; what has no room on the disk waits in memory, and is left out."""
+        with suppress(StorageFull):
+            self.flush()
 
     def _write_counts(self) -> None:
         with self._lock:
@@ -241,6 +250,14 @@ class QueryStatistics:
             raise
         with self._lock:
             self._written |= taken.keys()
+
+    @once_more_if_replaced
+    def _write_alarms(self) -> None:
+        changes = self.watch.changes
+        if changes:
+            with self._ledger.transaction("write down which robots are lost") as connection:
+                put_changes(connection, changes, datetime.now(UTC))
+            self.watch.written(changes)
 
     def _run(self) -> None:
         while not self._stop.wait(self._seconds):
@@ -283,14 +300,14 @@ class QueryStatistics:
     @once_more_if_replaced
     def read(self, key: MapKey) -> Statistics:
         """The statistics of a map, including the counts that are not written yet."""
-        self.flush()
+        self._flush_if_room()
         with self._ledger.transaction(READ) as connection:
             return read_counts(connection, key)
 
     @once_more_if_replaced
     def of_place(self, key: MapKey, place_id: str) -> PlaceCount:
         """The counts of one place of a map, including those that are not written yet."""
-        self.flush()
+        self._flush_if_room()
         return read_place(self._ledger, key, place_id)
 
     def hours(self, key: MapKey) -> list[HourCount]:
@@ -333,12 +350,26 @@ class QueryStatistics:
             for one, hours in found.items()
         }
 
+    @once_more_if_replaced
+    def lost_robots(self) -> list[LostRobot]:
+        """The robots of all maps that are lost, and those that were within the last days; the latest first."""
+        self._flush_if_room()
+        with self._ledger.transaction(READ) as connection:
+            return read_lost(connection, self.watch.changes)
+
+    @once_more_if_replaced
+    def forget_lost_robots(self, key: MapKey) -> None:
+        """Delete the alarms of robots of a map."""
+        self.watch.forget(key)
+        with self._ledger.transaction("forget which robots were lost") as connection:
+            forget_lost(connection, key)
+
     # Histories
 
     @once_more_if_replaced
     def histories(self, key: MapKey) -> Histories:
         """How the places of a map answered over time, including what is not written yet."""
-        self.flush()
+        self._flush_if_room()
         with self._ledger.transaction(READ) as connection:
             return read_histories(connection, key)
 

@@ -22,7 +22,14 @@ from typing import Any, TypeVar
 
 from core.frames.images import Limits, decode
 from core.frames.masks import range_in
-from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded, narrow_values
+from service.engine.encoders import (
+    NO_ENCODER,
+    Encoded,
+    QueuedFrame,
+    WaitingFrames,
+    deadline_exceeded,
+    narrow_values,
+)
 from service.errors.faults import ClientGone, NotReady
 from service.ray_serve.cluster import Cluster, RayUnavailable, caller
 from service.ray_serve.loads import LOADS
@@ -214,7 +221,8 @@ class RayEncoders:
 
     def _refuse(self, frames: Iterable[QueuedFrame]) -> None:
         for frame in frames:
-            _fail(frame, NotReady(f"No frame can be encoded now: {self.state}.", {"encoder": self.state}))
+            text = f"No frame can be encoded now: {self.state}."
+            _fail(frame, NotReady(text, {"encoder": self.state}, NO_ENCODER))
 
     def _add(self, frames: Iterable[QueuedFrame]) -> None:
         if self._stop.is_set():
@@ -336,7 +344,7 @@ class RayEncoders:
             if frame.attempts == ATTEMPTS:
                 self._sent.discard(frame)
                 text = f"The frame was lost {ATTEMPTS} times with the process that encoded it: {error}"[:500]
-                _fail(frame, NotReady(text, {"encoder": self.state}))
+                _fail(frame, NotReady(text, {"encoder": self.state}, NO_ENCODER))
             else:
                 self._loop.call_later(BACKOFF * 2 ** (frame.attempts - 1), self._back, frame)
 

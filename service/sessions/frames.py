@@ -119,10 +119,13 @@ async def process_frame(
         if session.notable:  # it began at another service, or before a restart
             session.notes, session.notable = new_notes(map_, session.id, principal), False
         if session.notes is not None:
-            given = GivenAnswer.of(single, queried)
+            given = GivenAnswer.of(single, queried, run=answer.verdict)
             await in_thread(_note, sessions, session, run, map_, data, options, answered.answer, seen, given)
     total = {"total": answer.milliseconds["total"]}
-    follow_answer(engine, statistics, map_, single, data, queried, milliseconds=total, passed=_passed(answer))
+    follow_answer(
+        engine, statistics, map_, single, data, queried,
+        milliseconds=total, passed=_passed(answer), run=answer.verdict,
+    )  # fmt: skip
     tell_belief(engine, map_, session, answer)
     return answer
 

@@ -38,7 +38,7 @@ from service.errors.faults import (
     StreamTaken,
     UnknownSession,
 )
-from service.errors.problems import Problem, problem_of, problem_response
+from service.errors.problems import Problem, is_confided, problem_of, problem_response
 from service.http.bodies import parse_json
 from service.http.event_stream import CHECK_SECONDS
 from service.http.schemas import validated
@@ -187,7 +187,8 @@ async def _never() -> None:
 
 
 async def _send_problem(socket: WebSocket, error: Exception) -> None:
-    problem: Problem = problem_of(error, socket.scope["path"], socket.scope["state"]["request_id"])
+    request_id, confided = socket.scope["state"]["request_id"], is_confided(socket.state)
+    problem: Problem = problem_of(error, socket.scope["path"], request_id, confided)
     await socket.send_json({"problem": problem.model_dump(exclude_none=True)})
 
 

@@ -22,6 +22,7 @@ from sqlalchemy import Column, MetaData, Table, bindparam, delete, func, select
 from sqlalchemy.sql.elements import ClauseElement
 
 from core.disk.sqlite_file import DURABLE
+from core.errors import StorageFull
 from core.ledger import Ledger, Statement, Tables
 from core.ledger.disposable import DisposableLedger, once_more_if_replaced
 from core.ledger.sqlite import file_of
@@ -229,7 +230,8 @@ class LoadHistory:
         Raises:
             StorageFull, StorageFailure: the ledger refuses, or cannot be reached.
         """
-        self.write()
+        with suppress(StorageFull):  # what has no room waits in memory, and is left out
+            self.write()
         newest = self._present()
         step = -(-minutes // MOST_POINTS)
         return step, _points(self._read(newest - minutes + 1, newest), step)

@@ -20,8 +20,9 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors.faults import Stopping
-from service.errors.problems import problem_response
+from core.errors import PlacerecError
+from service.errors.faults import ClientGone, Fault, Stopping
+from service.errors.problems import kind_of, problem_response
 from service.telemetry.metrics import Metrics
 
 TRACEPARENT = re.compile(rb"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?")
@@ -76,10 +77,11 @@ def read_trace(headers: Iterable[tuple[bytes, bytes]]) -> Trace | None:
 
 @dataclass(frozen=True)
 class Origin:
-    """The ids of the request for which something is done."""
+    """The request for which something is done: its ids, and whether the console has sent it."""
 
     request_id: str
     trace_id: str | None
+    by_console: bool = False
 
 
 origin: ContextVar[Origin | None] = ContextVar("origin", default=None)
@@ -95,7 +97,14 @@ METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}
 
 CONSOLE = b"x-placerec-console"
-"""The header by which the console marks its requests, which the latencies that it shows leave out."""
+"""The header by which the console marks its requests, which the latencies that it shows leave out, as do the counts of
+answers: a person in front of it is no robot."""
+
+
+def is_trial() -> bool:
+    """Whether a person tries something in the console now."""
+    return (request := origin.get()) is not None and request.by_console
+
 
 LONGEST_PATH = 300
 LONGEST_TEXT, LONGEST_TRACEBACK = 4096, 32_768
@@ -192,7 +201,8 @@ class Telemetry:
         state["request_id"], state["started"] = request_id(scope["headers"]), time.monotonic()
         trace = state["trace"] = read_trace(scope["headers"])
         state["trace_id"] = trace.trace_id if trace is not None else None
-        token = origin.set(Origin(state["request_id"], state["trace_id"]))
+        by_console = any(name == CONSOLE for name, _ in scope["headers"])
+        token = origin.set(Origin(state["request_id"], state["trace_id"], by_console))
         self.metrics.under_way.inc()
         try:
             await (self._stream if scope["type"] == "websocket" else self._answer)(scope, receive, send)
@@ -226,7 +236,7 @@ class Telemetry:
             await problem_response(Request(inner), stopped)(inner, receive, send_marked)
         except Exception as error:  # a defect of the service: it is logged, but its text is not sent
             if status:
-                log.exception("the answer broke off", extra={"request_id": state["request_id"]})
+                _note_broken(error, state)
             else:
                 await problem_response(Request(inner), error)(inner, receive, send_marked)
         finally:
@@ -263,9 +273,8 @@ class Telemetry:
         state = scope["state"]
         route = getattr(scope.get("route"), "path", UNMATCHED)
         counted = method if method in METHODS else "OTHER"
-        by_console = any(name == CONSOLE for name, _ in scope["headers"])
         seconds = time.monotonic() - state["started"]
-        self.metrics.observe_request(route, counted, status, seconds, by_console=by_console)
+        self.metrics.observe_request(route, counted, status, seconds, by_console=is_trial())
         if "problem" in state:
             self.metrics.problems.labels(state["problem"]).inc()
         self._log("request", scope, method, status, {"bytes_in": state.get("bytes_in", 0), "bytes_out": sent})
@@ -294,6 +303,17 @@ class Telemetry:
                 **state.get("noted", {}),
             },
         )
+
+
+def _note_broken(error: Exception, state: dict[str, Any]) -> None:
+    """Log that an answer ended before its end; what is foreseen, as a disk that fails, needs no traceback."""
+    cause = error.__cause__  # the framework raises another one from what it cannot answer any more
+    if isinstance(cause, ClientGone):
+        state["problem"] = kind_of(cause).slug  # for the line of the request
+    elif isinstance(cause, Fault | PlacerecError):
+        log.error("the answer broke off: %s", cause, extra={"request_id": state["request_id"]})
+    else:
+        log.error("the answer broke off", exc_info=error, extra={"request_id": state["request_id"]})
 
 
 def _mark(message: Message, request_id: str, trace: Trace | None) -> None:

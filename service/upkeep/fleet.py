@@ -23,6 +23,7 @@ from service.queries.answers import StatisticsDep
 from service.queries.counts import HourCount
 from service.queries.given_answers import GivenAnswer, MapKey
 from service.queries.histories.tables import AlarmState
+from service.queries.lost_robots import LISTED_FOR, LostRobot, robot_of
 from service.queries.schemas import EstimatedPose
 from service.queries.statistics import QueryStatistics, map_key
 from service.sessions.routes import SessionsDep
@@ -41,6 +42,9 @@ MOST_VERDICTS = 20
 
 CLEARED_FOR = timedelta(days=1)
 """Alarms that were cleared are told for this time."""
+
+SILENT_FOR = timedelta(hours=1)
+"""A robot without an open session that has been silent for so long is lost no longer: it is not there."""
 
 FLEET_EXAMPLE: dict[str, Any] = {
     "at": "2026-11-22T18:02:40Z",
@@ -77,6 +81,19 @@ FLEET_EXAMPLE: dict[str, Any] = {
             "sentence": "12 places have changed. Add a look of each place as it is now.",
         }
     ],
+    "lost": [
+        {
+            "map": "lab",
+            "name": "robot-7",
+            "session": "s-4f2a9c01d37be586",
+            "camera": "front",
+            "place": "p7",
+            "raised": True,
+            "since": "2026-11-22T18:02:02Z",
+            "cleared_at": None,
+            "last_at": "2026-11-22T18:02:39Z",
+        }
+    ],
 }
 
 
@@ -101,9 +118,12 @@ class FleetRobot(BaseModel):
     )
     place: str | None = Field(description="The place at which it was last recognized; null if that is not known.")
     pose: EstimatedPose | None = Field(description="The pose that was estimated there.")
-    recognized_at: Timestamp | None = Field(description="When a frame of it was last recognized by itself.")
+    recognized_at: Timestamp | None = Field(
+        description="When it was last told that it was recognized: by its run or, without one, by the frame."
+    )
     lost_since: Timestamp | None = Field(
-        description="The time of the first of its latest answers, none of which was recognized; null if it is not lost."
+        description="The time of the first of its latest answers, none of which told it a place (less than three in a "
+        "row do not count once it is an alarm); null if it is not lost."
     )
     verdicts: list[Verdict] = Field(description="Of its latest single frames, the latest first.")
     answers: int = Field(description="How many of the latest answers of the map are its own.")
@@ -120,6 +140,22 @@ class FleetAlarm(BaseModel):
     sentence: str = Field(description="What has happened, and what to do about it.")
 
 
+class FleetLost(BaseModel):
+    """A robot that was told no place for half a minute, until it was told one three times in a row."""
+
+    map: str
+    name: str | None = Field(description="The name of its key; null without one. Only for keys of the role enrol.")
+    session: str | None = Field(description="The session of its run; null: it asked without one.")
+    camera: str | None
+    place: str | None = Field(
+        description="The place that it was told last, before it was lost; null if that is not known."
+    )
+    raised: bool = Field(description="False: it is recognized again, or its run is over.")
+    since: Timestamp = Field(description="When it was first told no place.")
+    cleared_at: Timestamp | None = Field(description="When it was recognized again; null: it was not.")
+    last_at: Timestamp | None = Field(description="When its last frame came, as far as that is known.")
+
+
 class FleetState(BaseModel):
     """Robots, the one that was heard last first, and the maps that the key may use and that were asked, by id."""
 
@@ -131,6 +167,9 @@ class FleetState(BaseModel):
     alarms: list[FleetAlarm] = Field(
         description="Of all maps that the key may use: those that are raised, then those cleared within a day."
     )
+    lost: list[FleetLost] = Field(
+        description="Robots that are lost, then those that were within a day, the latest first."
+    )
 
 
 @router.get("", responses=problem_documentation(errors.StorageFull))
@@ -139,13 +178,15 @@ def read_fleet(
 ) -> FleetState:
     """Read where the robots of all maps are, how long they have been lost, how many answers each hour had, and alarms.
 
-    A robot is an open session; what a key has asked without one, or in one that is over, is one robot, too, unless the
-    key has an open session. It is known by the latest answers of its map, which a restart may forget.
+    What counts is what a robot was told: in a session the verdict of its run, not that of a frame alone. What a person
+    tries in the console is no robot. A robot is an open session; what a key has asked without one, or in one that is
+    over, is one robot, too, unless the key has an open session. It is known by the latest answers of its map, which a
+    restart may forget.
     """
     private = covers(principal.role, "enrol")
     open_sessions = _by_map(sessions.all())
-    hours = statistics.hours_of_all()
-    maps, robots = [], []
+    hours, alarms = statistics.hours_of_all(), statistics.lost_robots()
+    maps, robots, lost, now = [], [], [], datetime.now(UTC)
     for map_id, made in sorted({*open_sessions, *hours}):
         if not principal.may_use(map_id):
             continue
@@ -154,11 +195,19 @@ def read_fleet(
             if map_key(map_) == (map_id, made):
                 found = open_sessions.get((map_id, made), [])
                 maps.append(FleetMap(map=map_id, sessions=len(found), hours=hours.get((map_id, made), [])))
-                robots += _robots(map_, found, statistics, private)
+                groups = _groups(map_, found, statistics)
+                of_map = [one for one in alarms if one.map == (map_id, made)]
+                robots += _robots(map_, found, groups, of_map, private)
+                lost += [told for one in of_map if (told := _lost(one, found, groups, now, private)) is not None]
     robots.sort(key=lambda one: one.last_at, reverse=True)
-    now = datetime.now(UTC)
-    alarms = _alarms(engine, statistics.alarms_of_all(now - CLEARED_FOR), principal)
-    return FleetState(at=now, maps=maps, robots=robots[:MOST_ROBOTS], alarms=alarms)
+    lost.sort(key=lambda one: (one.raised, one.since), reverse=True)
+    return FleetState(
+        at=now,
+        maps=maps,
+        robots=robots[:MOST_ROBOTS],
+        alarms=_alarms(engine, statistics.alarms_of_all(now - CLEARED_FOR), principal),
+        lost=lost[:MOST_ROBOTS],
+    )
 
 
 def _alarms(engine: Engine, states: Iterable[AlarmState], principal: Principal) -> list[FleetAlarm]:
@@ -188,33 +237,49 @@ def _by_map(sessions: Iterable[Session]) -> dict[MapKey, list[Session]]:
     return found
 
 
-def _robots(map_: Map, sessions: list[Session], statistics: QueryStatistics, private: bool) -> list[FleetRobot]:
-    """The robots of one map."""
-    present = {session.id: session for session in sessions}
+Groups = dict[str, list[GivenAnswer]]
+"""The answers of each robot, the latest first, by its name (:func:`service.queries.lost_robots.robot_of`)."""
+
+
+def _groups(map_: Map, sessions: list[Session], statistics: QueryStatistics) -> Groups:
+    """The robots of one map: each open session, and each asker that has none open."""
+    present = {session.id for session in sessions}
     names = {session.key for session in sessions if session.key is not None}
-    groups: dict[tuple[str | None, ...], list[GivenAnswer]] = {(one,): [] for one in present}
+    groups: Groups = {f"session {one}": [] for one in present}
     for answer in statistics.recent.of_map(map_key(map_)):
-        name = _name(answer)
-        if answer.frame.session in present:
-            groups[answer.frame.session,].append(answer)
-        elif name is None or name not in names:
-            asker = (name,) if name is not None else (None, answer.frame.camera, answer.asker.client)
-            groups.setdefault(("asker", *asker), []).append(answer)
-    found = (_robot(map_, present.get(one[0] or ""), answers, private) for one, answers in groups.items())
+        session = answer.frame.session if answer.frame.session in present else None
+        if session is not None or _name(answer) is None or _name(answer) not in names:
+            groups.setdefault(robot_of(answer, session), []).append(answer)
+    return groups
+
+
+def _robots(
+    map_: Map, sessions: list[Session], groups: Groups, alarms: list[LostRobot], private: bool
+) -> list[FleetRobot]:
+    """The robots of one map."""
+    present = {f"session {session.id}": session for session in sessions}
+    lost = {one.robot: one.since for one in alarms if one.until is None}
+    found = (_robot(map_, present.get(name), answers, lost.get(name), private) for name, answers in groups.items())
     return [robot for robot in found if robot is not None]
 
 
-def _robot(map_: Map, session: Session | None, answers: list[GivenAnswer], private: bool) -> FleetRobot | None:
-    """A robot by its session and its latest answers, the latest first; None before its first frame."""
+def _robot(
+    map_: Map, session: Session | None, answers: list[GivenAnswer], alarm: datetime | None, private: bool
+) -> FleetRobot | None:
+    """A robot by its session and its latest answers, the latest first; None before its first frame.
+
+    Args:
+        alarm: since when it is lost, if that is an alarm.
+    """
     came = None if session is None else session.last_frame_came
     if not answers and came is None:
         return None
     last = answers[0] if answers else None
     name = _name(last) if session is None else session.key
-    recognized = next((number for number, one in enumerate(answers) if one.verdict == "recognized"), None)
+    recognized = next((number for number, one in enumerate(answers) if one.told == "recognized"), None)
     where = None if recognized is None else answers[recognized]
     last_at = last.at if last is not None else datetime.fromtimestamp(came or 0, UTC)
-    verdict = None if last is None else last.verdict
+    verdict = None if last is None else last.told
     place, pose = (None, None) if where is None else (where.place, where.pose)
     unrecognized = answers[:recognized]
     lost_since = unrecognized[-1].at if unrecognized else None
@@ -233,9 +298,32 @@ def _robot(map_: Map, session: Session | None, answers: list[GivenAnswer], priva
         place=place,
         pose=pose,
         recognized_at=None if where is None else where.at,
-        lost_since=lost_since,
+        lost_since=lost_since if alarm is None else alarm,
         verdicts=[one.verdict for one in answers[:MOST_VERDICTS]],
         answers=len(answers),
+    )
+
+
+def _lost(alarm: LostRobot, sessions: list[Session], groups: Groups, now: datetime, private: bool) -> FleetLost | None:
+    """An alarm as it is told; None if it is over for longer than a day."""
+    answers = groups.get(alarm.robot, [])
+    session = next((one for one in sessions if f"session {one.id}" == alarm.robot), None)
+    came = None if session is None else session.last_frame_came
+    last_at = answers[0].at if answers else None if came is None else datetime.fromtimestamp(came, UTC)
+    is_there = session is not None or (last_at is not None and now - last_at < SILENT_FOR)
+    raised = alarm.until is None and is_there
+    if not raised and (alarm.until or alarm.since) < now - LISTED_FOR:
+        return None
+    return FleetLost(
+        map=alarm.map[0],
+        name=alarm.key if private else None,
+        session=alarm.session,
+        camera=alarm.camera,
+        place=alarm.place,
+        raised=raised,
+        since=alarm.since,
+        cleared_at=alarm.until,
+        last_at=last_at,
     )
 
 

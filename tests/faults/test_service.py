@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import signal
 import sys
@@ -119,6 +120,15 @@ def wait_for_readiness(server: Server, status: int) -> httpx.Response:
     return response
 
 
+def degraded_soon(server: Server, expected: bool = True) -> str | None:
+    """Why the service, which is ready, takes no writes; the probe looks at the disk once a second."""
+    until = time.monotonic() + 60
+    while ((reason := wait_for_readiness(server, 200).json()["degraded"]) is not None) != expected:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    return str(reason) if expected else None
+
+
 @pytest.mark.thorough
 @needs_strace
 @pytest.mark.parametrize(
@@ -128,8 +138,14 @@ def test_a_disk_that_refuses_to_write(server: Server, lab: str, error: str, stat
     with faults(server, f"{WRITES}:error={error}"):
         # SQLite tells of a failed sync as of an I/O error, whatever its cause; a full disk fails as it is written to.
         check_refused(server, status, slug)
-        assert "disk" in wait_for_readiness(server, 503).json()["detail"]
+        if error == "EIO":
+            assert "disk" in wait_for_readiness(server, 503).json()["detail"]
+        else:
+            assert "The disk is full" in (degraded_soon(server) or "")
+            assert server.client.get("/v1/service").json()["ready"]
+            assert re.search(r"^placerec_degraded 1\.0$", server.client.get("/metrics").text, re.MULTILINE)
     check_recovered(server)
+    degraded_soon(server, expected=False)
 
 
 @needs_strace

@@ -61,6 +61,17 @@ export function Verdict({ verdict }) {
   return html`<span class=${`verdict ${verdict}`}><span aria-hidden="true">${SIGNS[verdict]}</span> ${verdict}</span>`;
 }
 
+/** What a frame says by itself, and what its run makes of it, which is what the robot was told; without a run the first alone. */
+export function Verdicts({ verdict, run }) {
+  if (!run) return html`<${Verdict} verdict=${verdict} />`;
+  return html`
+    <span class="verdicts">
+      <span><${Verdict} verdict=${verdict} /> <span class="small faint">this frame alone</span></span>
+      <span><${Verdict} verdict=${run} /> <span class="small faint">the run</span></span>
+    </span>
+  `;
+}
+
 const VERDICTS = ["recognized", "ambiguous", "unknown"];
 
 /** Shares of the verdicts as a bar. */
@@ -84,6 +95,18 @@ export function Bar({ share, label, tone = "" }) {
 
 export function Progress({ done, total, label }) {
   return html`<progress class="progress" aria-label=${label} max=${total || 1} value=${total ? done : undefined}></progress>`;
+}
+
+/** Whether the service is ready, and takes writes. */
+export function Ready({ service: { ready, degraded } }) {
+  const [tone, word] = !ready ? ["bad", "not ready"] : degraded ? ["warn", "degraded"] : ["good", "ready"];
+  return html`<${Pill} tone=${tone}>${word}<//>`;
+}
+
+/** Why the service, which answers, takes no writes. */
+export function Degraded({ service }) {
+  if (!service?.degraded) return null;
+  return html`<p class="notice" role="alert"><strong>Writes are refused, queries are answered.</strong> ${service.degraded}</p>`;
 }
 
 export function Pill({ tone = "", title, children }) {

@@ -1,7 +1,7 @@
 // Robots of all maps as the service knows them, what is wrong with them, and how they are shown in a row.
 import { get, may } from "./api.js";
 import { Name, Pill, Verdict } from "./elements.js";
-import { duration } from "./formats.js";
+import { duration, exact } from "./formats.js";
 import { useResource } from "./resource.js";
 import { href } from "./router.js";
 import { html } from "./view.js";
@@ -10,8 +10,6 @@ import { html } from "./view.js";
 export const SILENT_AFTER = 10;
 /** Seconds for which a robot may be lost before that is an alarm. */
 export const LOST_ALARM = 30;
-/** Seconds after which a robot that was lost, and then silent, is no alarm any more. */
-const FORGOTTEN_AFTER = 3600;
 const EVERY = 3000;
 
 /** The fleet, read again every few seconds; each robot has `label`, and `heard` and `lost`, seconds by the service's clock. */
@@ -23,22 +21,28 @@ async function readFleet(signal) {
   const fleet = await get("/fleet", {}, { signal });
   const now = new Date(fleet.at).getTime();
   const since = (moment) => (moment ? Math.max(0, (now - new Date(moment).getTime()) / 1000) : null);
-  const robots = fleet.robots.map((one) => {
+  const told = (one, from) => {
     const heard = since(one.last_at);
-    return { ...one, label: one.name || one.camera || one.session || "without a key", heard, lost: since(one.lost_since), silent: heard > SILENT_AFTER };
-  });
-  return { ...fleet, robots };
+    return { ...one, label: one.name || one.camera || one.session || "without a key", heard, lost: since(from), silent: heard > SILENT_AFTER };
+  };
+  return { ...fleet, robots: fleet.robots.map((one) => told(one, one.lost_since)), lost: fleet.lost.map((one) => told(one, one.since)) };
 }
 
-/** What is wrong with robots: {tone, text, address}, the worst first. */
-export function alarmsOf(robots) {
-  const found = [];
-  for (const one of robots) {
-    if (one.lost === null || one.heard > FORGOTTEN_AFTER) continue;
-    if (one.silent) found.push({ tone: "warn", text: `${one.label} was lost, and has been silent for ${duration(one.heard)}`, ...whereOf(one) });
-    else if (one.lost >= LOST_ALARM) found.push({ tone: "bad", text: `${one.label} lost for ${duration(one.lost)}`, ...whereOf(one) });
-  }
-  return found.sort((one, other) => one.tone.localeCompare(other.tone));
+/** Robots that are lost, or were within a day: {tone, text, why, since, address}, the worst first. */
+export function alarmsOf(lost) {
+  const found = lost.map((one) => {
+    const common = { key: `lost ${one.map} ${one.label} ${one.session} ${one.since}`, ...whereOf(one) };
+    if (!one.raised) return { ...common, tone: "good", text: `${one.label} was lost`, why: endOf(one), since: one.cleared_at || one.last_at };
+    if (one.silent) return { ...common, tone: "warn", text: `${one.label} was lost, and has been silent for ${duration(one.heard)}` };
+    return { ...common, tone: "bad", text: `${one.label} lost for ${duration(one.lost)}` };
+  });
+  return found.sort((one, other) => TONES.indexOf(one.tone) - TONES.indexOf(other.tone));
+}
+
+const TONES = ["bad", "warn", "good"];
+
+function endOf({ since, cleared_at: cleared }) {
+  return cleared ? `from ${exact(since)} until it was recognized again, ${exact(cleared)}` : `since ${exact(since)}, and was not recognized before its run ended`;
 }
 
 export const ALARMS = { worse_places: "Places that get worse", changed_places: "Places that have changed", quiet_stretches: "Stretches that nobody drives any more" };

@@ -1,7 +1,7 @@
 // The answers that are stored: searched, saved as CSV, and the run of a session replayed on the plan.
 import { get } from "../shared/api.js";
 import { saveCsv } from "../shared/csv.js";
-import { Dialog, ExactMoment, Facts, Field, Head, Loading, Name, Nothing, Verdict } from "../shared/elements.js";
+import { Dialog, ExactMoment, Facts, Field, Head, Loading, Name, Nothing, Verdict, Verdicts } from "../shared/elements.js";
 import { clock, counted, decimal, exact, integer, metres, milliseconds, percent, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -55,7 +55,7 @@ function fits(one, text, least, most) {
 }
 
 const COLUMNS = [
-  ["at", (one) => one.at], ["verdict", (one) => one.verdict], ["probability", (one) => one.probability], ["place", (one) => one.place],
+  ["at", (one) => one.at], ["verdict", (one) => one.verdict], ["run", (one) => one.run], ["probability", (one) => one.probability], ["place", (one) => one.place],
   ["best", (one) => one.matches[0]?.place], ["score", (one) => one.score], ["margin", (one) => one.margin], ["decision", (one) => one.decision],
   ["threshold", (one) => one.threshold], ["reason", (one) => one.reason],
   ...["x", "y", "z", "latitude", "longitude", "heading", "spread"].map((name) => [name, (one) => one.pose?.[name]]),
@@ -68,12 +68,13 @@ function Table({ map, items, session }) {
   return html`
     <div class="table" tabindex="0" role="region" aria-label="Answers">
       <table>
-        <thead><tr><th>When</th><th>Verdict</th><th class="number">Probability</th><th>Best match</th><th class="number">Score</th><th>Asked by</th><th>Run</th><th class="number">Took</th><th><span class="hidden">More</span></th></tr></thead>
+        <thead><tr><th>When</th><th>This frame alone</th><th>The run</th><th class="number">Probability</th><th>Best match</th><th class="number">Score</th><th>Asked by</th><th>Run</th><th class="number">Took</th><th><span class="hidden">More</span></th></tr></thead>
         <tbody>
           ${items.slice(0, most).map((one) => html`
             <tr key=${`${one.request_id} ${one.at}`}>
               <td class="nowrap"><time datetime=${one.at} title=${exact(one.at)}>${clock(one.at)}</time></td>
               <td><${Verdict} verdict=${one.verdict} /></td>
+              <td>${one.run ? html`<${Verdict} verdict=${one.run} />` : html`<span class="faint">–</span>`}</td>
               <td class="number">${percent(one.probability)}</td>
               <td>${one.matches.length > 0 ? html`<a href=${href("maps", map, "places", one.matches[0].place)}>${one.matches[0].place}</a>` : html`<span class="faint">${one.reason || "–"}</span>`}</td>
               <td class="number">${decimal(one.score)}</td>
@@ -94,7 +95,8 @@ function Table({ map, items, session }) {
 function Details({ map, answer }) {
   return html`
     <${Facts} rows=${[
-      ["Verdict", html`<${Verdict} verdict=${answer.verdict} /> ${percent(answer.probability, 1)}`],
+      ["This frame alone", html`<${Verdict} verdict=${answer.verdict} /> ${percent(answer.probability, 1)}`],
+      answer.run && ["The run", html`<${Verdict} verdict=${answer.run} /> <span class="faint">as the robot was told</span>`],
       ["Asked", html`<${ExactMoment} at=${answer.at} />`],
       ["Place", answer.place || "–"],
       ["Pose", answer.pose ? `${poseText(answer.pose)} ± ${metres(answer.pose.spread)}` : "–"],
@@ -187,7 +189,7 @@ function Here({ map, answer, number, of }) {
   return html`
     <div class="stack" aria-live="off">
       <div class="spread"><strong>${clock(answer.at)}</strong><span class="faint">${integer(number)} of ${integer(of)}${answer.frame !== null && html`, frame ${integer(answer.frame)}`}</span></div>
-      <div class="spread"><${Verdict} verdict=${answer.verdict} /><span>${percent(answer.probability)}</span></div>
+      <div class="spread"><${Verdicts} verdict=${answer.verdict} run=${answer.run} /><span>${percent(answer.probability)}</span></div>
       ${best ? html`<${Thumbnail} map=${map} place=${best} /><p><a href=${href("maps", map, "places", best)}>${best}</a> <span class="faint">best match, ${decimal(answer.score)}</span></p>` : html`<p class="faint">${answer.reason || "no match"}</p>`}
       <p class="faint small">${answer.pose ? `${poseText(answer.pose)} ± ${metres(answer.pose.spread)}` : "without a pose"}</p>
     </div>

@@ -1,7 +1,7 @@
 // The home page: what goes wrong, where robots are, how many answers they get, and what waits for a person.
 import { all, everyMap, get, may } from "../shared/api.js";
 import { mapNames } from "../shared/chosen_map.js";
-import { Head, Moment, Nothing, Pill, VerdictMix } from "../shared/elements.js";
+import { Degraded, Head, Moment, Nothing, Pill, Ready, VerdictMix } from "../shared/elements.js";
 import { alarmsOf, LOST_ALARM, mapAlarmsOf, RobotTable, useFleet } from "../shared/fleet.js";
 import { bytes, integer, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
@@ -24,10 +24,11 @@ export default function Home() {
   const backups = useResource((signal) => (may("admin") && everyMap.value ? get("/backups", {}, { signal }) : Promise.resolve(null)), [], { every: 60_000 });
   return html`
     <${Head} title="Home" note=${maps.data && `${integer(maps.data.items.length)} ${maps.data.items.length === 1 ? "map" : "maps"}`}>
-      ${service.data && html`<a href=${href("service")}><${Pill} tone=${service.data.ready ? "good" : "bad"}>${service.data.ready ? "ready" : "not ready"}<//></a>`}
+      ${service.data && html`<a href=${href("service")}><${Ready} service=${service.data} /></a>`}
     <//>
+    <${Degraded} service=${service.data} />
     <${Shown} resource=${fleet}>${(data) => html`
-      <${Alarms} found=${[...troubles(maps.data, service.data), ...backupTroubles(backups.data), ...alarmsOf(data.robots), ...mapAlarmsOf(data.alarms)]} />
+      <${Alarms} found=${[...troubles(maps.data, service.data), ...backupTroubles(backups.data), ...alarmsOf(data.lost), ...mapAlarmsOf(data.alarms)]} />
       <${Today} fleet=${data} backlogs=${maps.data?.backlogs} />
       <section class="stack">
         <div class="spread"><h2>Robots</h2>${data.robots.length > MOST_ROBOTS && html`<a href=${href("robots")}>All ${integer(data.robots.length)}</a>`}</div>
@@ -63,7 +64,7 @@ function troubles(maps, service) {
     if (index.problem) found.push({ tone: "bad", text: `The index of ${id} failed`, why: index.problem, address: href("maps") });
   }
   for (const [name, told] of Object.entries(service?.checks || {})) {
-    if (told !== "ok") found.push({ tone: "bad", text: `${name}: ${told}`, address: href("service") });
+    if (told !== "ok" && told !== service.degraded) found.push({ tone: "bad", text: `${name}: ${told}`, address: href("service") });
   }
   const disk = service?.disk;
   if (disk && 1 - disk.free / disk.total > FULL) found.push({ tone: "warn", text: `The disk is ${percent(1 - disk.free / disk.total)} full`, why: `${bytes(disk.free)} are free`, address: href("service") });
@@ -93,7 +94,7 @@ function Alarms({ found }) {
       ${present.length === 0 && html`<p class="faint">None: no robot has been lost for ${LOST_ALARM} s, and nothing is out of service.</p>`}
       ${found.length > 0 && html`
         <ul class="stack">
-          ${found.map((one) => html`<li class="row" key=${one.key || one.text.replace(/\d+/g, "")}><${Pill} tone=${one.tone}>${KINDS[one.tone]}<//> <a href=${one.address}>${one.text}</a>${one.of && html` <span class="faint">in ${one.of}</span>`}${one.why && html` <span class="faint small">${one.why}</span>`}${one.since && html` <span class="faint small nowrap"><${Moment} at=${one.since} /></span>`}</li>`)}
+          ${[...present, ...found.filter((one) => one.tone === "good")].map((one) => html`<li class="row" key=${one.key || one.text.replace(/\d+/g, "")}><${Pill} tone=${one.tone}>${KINDS[one.tone]}<//> <a href=${one.address}>${one.text}</a>${one.of && html` <span class="faint">in ${one.of}</span>`}${one.why && html` <span class="faint small">${one.why}</span>`}${one.since && html` <span class="faint small nowrap"><${Moment} at=${one.since} /></span>`}</li>`)}
         </ul>
       `}
     </section>

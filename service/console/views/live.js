@@ -1,6 +1,6 @@
 // The queries of a map as they are answered: verdict, probability, who asked, and why.
 import { epoch, follow, get, key, may } from "../shared/api.js";
-import { Bar, Dialog, ExactMoment, Facts, Field, Head, Name, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
+import { Bar, Dialog, ExactMoment, Facts, Field, Head, Name, Nothing, Pill, Trouble, Verdicts } from "../shared/elements.js";
 import { changeText, clock, decimal, exact, integer, metres, percent, poseText } from "../shared/formats.js";
 import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
@@ -112,14 +112,14 @@ function Gap({ missed }) {
 }
 
 function Line({ map, event, open }) {
-  const { verdict, probability, place, best, key, camera, session, picture } = event;
+  const { verdict, run, probability, place, best, key, camera, session, picture, trial } = event;
   const shown = place || best;
-  const others = key && [camera, session].filter(Boolean).join(" · ");
+  const others = [...(key ? [camera, session] : []), trial && "tried in a console, not counted"].filter(Boolean).join(" · ");
   return html`
     <li>
       <time datetime=${event.at} title=${exact(event.at)}>${clock(event.at)}</time>
       <span class="who">${key ? html`<strong><${Name} text=${key} /></strong>` : html`<span class="faint">${camera || session || "–"}</span>`}${others && html` <span class="small faint">${others}</span>`}</span>
-      <${Verdict} verdict=${verdict} />
+      <${Verdicts} verdict=${verdict} run=${run} />
       <span class="probability"><${Bar} share=${probability ?? 0} tone=${verdict} label=${`Probability ${percent(probability)}`} /> <span class="small">${percent(probability)}</span></span>
       <span class="what">
         ${picture && html`<span class="picture"><img src=${picture} alt="The frame" /></span>`}
@@ -142,7 +142,7 @@ function Details({ map, event, close }) {
   };
   return html`
     <${Dialog} title="An answer" close=${close} wide>
-      <div class="spread"><p class="large"><${Verdict} verdict=${verdict} /> ${place || ""}</p><p class="large">${percent(probability, 1)}</p></div>
+      <div class="spread"><p class="large"><${Verdicts} verdict=${verdict} run=${event.run} /> ${place || ""}</p><p class="large">${percent(probability, 1)}</p></div>
       <div class="pair">
         ${picture ? html`<img src=${picture} alt="The frame" />` : html`<span class="picture"><span class="faint">the frame was not sent here</span></span>`}
         ${best ? html`<${Thumbnail} map=${map} place=${best} />` : html`<span class="picture"><span class="faint">no match</span></span>`}

@@ -2,7 +2,7 @@
 import { everyMap, get, may } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
 import { saveCsv } from "../shared/csv.js";
-import { Bar, Facts, Head, Moment, Pill } from "../shared/elements.js";
+import { Bar, Degraded, Facts, Head, Moment, Ready } from "../shared/elements.js";
 import { bytes, duration, integer, milliseconds } from "../shared/formats.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { Result } from "../shared/result.js";
@@ -12,8 +12,9 @@ export default function Service() {
   const state = useResource((signal) => get("/service", {}, { signal }), [], { every: 3000 });
   return html`
     <${Head} title="Service" note=${state.data && html`placerec ${state.data.version}, started <${Moment} at=${state.data.started_at} />`}>
-      ${state.data && html`<${Pill} tone=${state.data.ready ? "good" : "bad"}>${state.data.ready ? "ready" : "not ready"}<//>`}
+      ${state.data && html`<${Ready} service=${state.data} />`}
     <//>
+    <${Degraded} service=${state.data} />
     <${Shown} resource=${state}>${(data) => html`<${State} data=${data} />`}<//>
   `;
 }
@@ -21,7 +22,7 @@ export default function Service() {
 function State({ data }) {
   const { queue, storage, requests, jobs, sessions, maps, memory, disk, checks } = data;
   const notReady = requests.operations.find((one) => one.path === "/readyz")?.errors ?? 0; // an answer, not a failure
-  const bad = Object.entries(checks).filter(([, told]) => told !== "ok");
+  const bad = Object.entries(checks).filter(([, told]) => told !== "ok" && told !== data.degraded);
   return html`
     ${bad.map(([name, told]) => html`<p class="notice"><strong>${name}</strong>: ${told}</p>`)}
     <dl class="figures panel">

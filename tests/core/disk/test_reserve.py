@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from core.disk.reserve import FILE, Reserve
+from core.disk.reserve import FILE, Reserve, lend_from
+from core.disk.sqlite_file import connect
 from core.errors import StorageFull
 
 SIZE = 256 << 10
@@ -41,6 +44,27 @@ def writing(folder: Path, size: int) -> None:
         (folder / "log").write_bytes(bytes(size))
     except OSError as error:
         raise StorageFull(str(error)) from error
+
+
+def test_a_full_disk_has_room_to_open_databases_with(small_disk: Path) -> None:
+    """For reading, too, SQLite makes a file for the index of its log; without any room it is not opened."""
+    paths = [small_disk / "maps" / name for name in ("one", "two")]
+    paths[0].parent.mkdir()
+    for path in paths:
+        with closing(connect(path, "rwc")) as made:
+            made.execute("CREATE TABLE places (id TEXT)")
+            made.execute("INSERT INTO places VALUES ('p1')")
+    Reserve(small_disk, SIZE).hold()
+    fill(small_disk)
+    with pytest.raises(sqlite3.OperationalError):
+        connect(paths[0])
+    lend_from(small_disk)
+    opened = [connect(path) for path in paths]
+    for one in opened:
+        assert one.execute("SELECT id FROM places").fetchall() == [("p1",)]
+    assert os.statvfs(small_disk).f_bavail == 0 and 0 < (small_disk / FILE).stat().st_size < SIZE, "it is held again"
+    for one in opened:
+        one.close()
 
 
 def test_a_full_disk_has_room_to_delete_with(small_disk: Path) -> None:

@@ -34,9 +34,20 @@ def robot(name: str, **fields: Any) -> dict[str, Any]:
     }
 
 
-def tell(page: Page, *robots: dict[str, Any]) -> None:
-    """Let the service say that these are the robots."""
-    fleet = {"at": NOW.isoformat(), "maps": [], "robots": list(robots), "alarms": []}
+def lost(name: str, **fields: Any) -> dict[str, Any]:
+    """A robot that is lost, but for some fields; moments are seconds before now."""
+    told: dict[str, Any] = {"map": LAB, "name": name, "session": None, "camera": None, "place": "monday-03"}
+    told |= {"raised": True, "since": 30, "cleared_at": None, "last_at": 1} | fields
+    return told | {
+        moment: (NOW - timedelta(seconds=told[moment])).isoformat()
+        for moment in ("since", "cleared_at", "last_at")
+        if told[moment] is not None
+    }
+
+
+def tell(page: Page, *robots: dict[str, Any], alarms: tuple[dict[str, Any], ...] = ()) -> None:
+    """Let the service say that these are the robots, and which of them are lost."""
+    fleet = {"at": NOW.isoformat(), "maps": [], "robots": list(robots), "alarms": [], "lost": list(alarms)}
     page.route("**/v1/fleet", lambda route: route.fulfill(json=fleet))
 
 
@@ -79,20 +90,34 @@ def test_a_view_that_was_left_before_its_code_came_stays_away(admin: Operator) -
     assert admin.unforeseen() == []
 
 
-def test_a_robot_that_is_lost_is_an_alarm_after_thirty_seconds(admin: Operator) -> None:
-    lost = {"verdict": "unknown", "verdicts": ["unknown"]}
+def test_robots_that_are_lost_are_alarms_and_stay_listed_when_they_are_found(admin: Operator) -> None:
+    unknown = {"verdict": "unknown", "verdicts": ["unknown"]}
     tell(
         admin.page,
-        robot("robot-1", **lost, lost_since=29),
-        robot("robot-7", **lost, lost_since=30),
-        robot("robot-8", **lost, lost_since=400, last_at=300),
+        robot("robot-1", **unknown, lost_since=29),
+        robot("robot-7", **unknown, lost_since=30),
+        robot("robot-8", **unknown, lost_since=400, last_at=300),
         robot("robot-9", last_at=300),
+        alarms=(
+            lost("robot-7"),
+            lost("robot-8", since=400, last_at=300),
+            lost("robot-5", since=7200, raised=False, cleared_at=3600),
+            lost("robot-6", since=7200, raised=False, last_at=None),
+        ),
     )
     page = admin.go("home")
     found = page.get_by_role("region", name="Alarms").get_by_role("listitem")
-    alarms = found.filter(has_text="robot-")  # others are of maps, which come later
+    alarms = found.filter(has_text="robot-")  # others are of maps
     expect(alarms).to_have_text(
-        [re.compile("robot-7 lost for 30 s in lab"), re.compile("robot-8 was lost, and has been silent for 5 min")]
+        [
+            re.compile("alarm robot-7 lost for 30 s in lab"),
+            re.compile("notice robot-8 was lost, and has been silent for 5 min"),
+            re.compile(
+                "cleared robot-5 was lost in lab from 2026-11-22 16:02:40 UTC until it was recognized again, "
+                "2026-11-22 17:02:40 UTC"
+            ),
+            re.compile("cleared robot-6 was lost in lab since 2026-11-22 16:02:40 UTC, and was not recognized before"),
+        ]
     )
     rows = page.get_by_role("region", name="Robots").get_by_role("row")
     for name, state in {"robot-1": "lost for 29 s", "robot-8": "silent for 5 min", "robot-9": "silent"}.items():
@@ -123,6 +148,26 @@ def test_what_is_out_of_service_is_an_alarm(admin: Operator) -> None:
     alarms = page.get_by_role("region", name="Alarms")
     expect(alarms).to_contain_text("attic is damaged and out of service")
     expect(alarms).to_contain_text("A page is torn.")
+
+
+@pytest.mark.parametrize("view", ["home", "service"])
+def test_a_service_that_takes_no_writes_says_so_and_is_not_called_unready(
+    admin: Operator, keyed: Server, view: str
+) -> None:
+    told = keyed.client.get("/v1/service").json()
+    told |= {"degraded": "The disk is full.", "checks": told["checks"] | {"disk": "The disk is full."}}
+    admin.page.route("**/v1/service", lambda route: route.fulfill(json=told))
+    page = admin.go(view)
+    banner = page.get_by_role("alert")
+    expect(banner).to_have_text("Writes are refused, queries are answered. The disk is full.")
+    expect(page.locator("main .pill").filter(has_text=re.compile("^(ready|not ready|degraded)$"))).to_have_text(
+        "degraded"
+    )
+    told |= {"degraded": None, "checks": told["checks"] | {"disk": "ok"}}
+    page.reload()
+    admin.settle(view)
+    expect(page.locator("main .pill").filter(has_text=re.compile("^ready$"))).to_be_visible()
+    expect(banner).to_have_count(0)
 
 
 @pytest.mark.thorough
@@ -201,6 +246,26 @@ def test_a_run_is_replayed_on_the_plan(visit: Visit, run: tuple[str, list[dict[s
     replay.get_by_role("button", name="Play").wait_for()
     page.get_by_role("button", name="Leave the run").click()
     replay.wait_for(state="detached")
+
+
+def test_answers_name_what_a_frame_said_alone_and_what_the_run_made_of_it(
+    visit: Visit, keyed: Server, run: tuple[str, list[dict[str, Any]]]
+) -> None:
+    session, _ = run
+    told = keyed.client.get(f"/v1/maps/{LAB}/answers", params={"session": session}).json()
+    assert all(one["run"] is not None for one in told["items"])
+    told["items"][0] |= {"verdict": "recognized", "run": "unknown"}
+    told["items"] = told["items"][:1]
+    operator = visit("query")
+    operator.page.route("**/answers?*", lambda route: route.fulfill(json=told))
+    page = operator.go(f"maps/{LAB}/answers")
+    table = page.get_by_role("region", name="Answers")
+    expect(table.get_by_role("columnheader")).to_contain_text(["When", "This frame alone", "The run"])
+    expect(table.get_by_role("cell").nth(1)).to_contain_text("recognized")
+    expect(table.get_by_role("cell").nth(2)).to_contain_text("unknown")
+    page.get_by_role("button", name=re.compile("More of the answer")).click()
+    facts = page.get_by_role("dialog")
+    expect(facts).to_contain_text(re.compile("This frame alone.*recognized.*The run.*unknown.*as the robot was told"))
 
 
 @pytest.mark.thorough

@@ -233,6 +233,43 @@ def test_what_is_deleted_on_a_full_file_system_makes_room(tmp_path: Path, small_
     assert server.stop() == 0
 
 
+@pytest.mark.thorough
+def test_a_service_on_a_full_file_system_answers_queries_even_if_it_starts_there(
+    tmp_path: Path, small_disk: Path
+) -> None:
+    """Also from maps that nobody has opened before; writes are refused, and taken again as soon as there is room."""
+    install_coarse_encoder(tmp_path / "models")
+    settings = {"data_dir": small_disk / "data", "models_dir": tmp_path / "models", "encoder": COARSE}
+    settings |= {"disk_reserve_bytes": 1 << 19, "statistics_seconds": 1}
+    server = Server(tmp_path, settings).wait()
+    for map_id in ("lab", "yard"):
+        server.create_map(map_id)
+        assert server.enrol(map_id, "p1", jpeg(1)).status_code == 201
+    for _ in range(2):
+        assert server.stop() == 0
+        found = os.statvfs(small_disk)
+        with (small_disk / "ballast").open("ab") as ballast:
+            ballast.write(bytes(found.f_bavail * found.f_frsize))
+        server = Server(tmp_path, settings).wait()
+        assert "The disk is full" in server.client.get("/readyz").json()["degraded"]
+        for map_id in ("lab", "yard"):
+            assert server.query(map_id, jpeg(1))["matches"][0]["place"]["id"] == "p1"
+            for path in ("", "/places", "/answers", "/health", "/places/p1/matches", "/review"):
+                assert server.client.get(f"/v1/maps/{map_id}{path}").status_code == 200, path
+            assert_problem(server.enrol(map_id, "refused", jpeg(2)), 507, "storage-full")
+        for path in ("/v1/maps", "/v1/fleet", "/v1/jobs", "/v1/service", "/v1/service/history", "/metrics"):
+            assert server.client.get(path).status_code == 200, path
+    (small_disk / "ballast").unlink()
+    until = time.monotonic() + 60
+    while server.client.get("/readyz").json()["degraded"] is not None and time.monotonic() < until:
+        time.sleep(0.1)
+    assert server.enrol("yard", "taken", jpeg(2)).status_code == 201
+    assert set(server.places("yard")) == {"p1", "taken"}
+    assert server.client.post("/v1/maps/yard/verify").json()["ok"]
+    assert server.stop() == 0
+    assert "Traceback" not in server.log_file.read_text()
+
+
 def needs_no_sync(path: str) -> bool:
     """The history of the load is written when a minute ends, whatever is answered then, and may lose its last one."""
     return is_sqlite_index(path) or Path(path).name.startswith(history.FILE)
