@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
 from core.geometry.keypoints import Keypoints
 from core.judgement.background import GUARD_FACTOR
-from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
+from core.judgement.calibration import (
+    FEWEST_OF_A_KIND,
+    FittedCalibration,
+    Kinds,
+    Target,
+    adjust_calibration,
+    fit_map_calibration,
+)
 from core.judgement.trials import StagedTrials, Trial, gathered, joined_stages
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot, own_poses
@@ -27,7 +34,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE
 from core.recognition.comparison import MapComparison
 from core.recognition.question import Verifier
-from core.recognition.stages import Candidates, agree, neighborhood_of
+from core.recognition.stages import Candidates, agree, calibration_of, neighborhood_of
 from core.recognition.verification import verify_candidates
 
 Item = TypeVar("Item")
@@ -40,6 +47,9 @@ TOGETHER = 16
 
 FEW_FRAMES = 50
 """A calibration from fewer frames comes with a warning."""
+
+MOST_DRAWN = 60
+"""Strangers that are drawn from a map at most."""
 
 FROM_ITSELF = (
     "The frames are the map's own: one walk in one light. A second visit differs more, so the probabilities are too "
@@ -226,6 +236,29 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
     return LabelledQueries(len(queried), made())
 
 
+def strangers_from_map(map_: Map, snapshot: Snapshot, most: int = MOST_DRAWN) -> LabelledQueries:
+    """Strangers that are drawn from the map itself: its frames, each asked without its place and what is around it.
+
+    Only places are left that are known to be elsewhere: those with a pose, as the frame has one, or of its traverse.
+
+    Args:
+        most: the largest number of queries; they are spread evenly over the map.
+    """
+    near, where = _SamePlace(map_, snapshot), snapshot.whereabouts
+    queried = spread(np.flatnonzero(snapshot.alive).tolist(), most)
+    nothing = np.zeros(snapshot.rows, np.bool_)
+
+    def made() -> Iterator[LabelledQuery]:
+        for row in queried:
+            elsewhere = where.kind == where.kind[row]
+            if not near.has_pose(row):
+                elsewhere = (where.sequence == where.sequence[row]) | (where.track == where.track[row])
+            absent = near(row, GUARD_FACTOR) | ~elsewhere
+            yield LabelledQuery(*_stored(snapshot, row), nothing, absent, nothing, _keypoints(map_, row))
+
+    return LabelledQueries(len(queried), made())
+
+
 def run_trials(
     map_: Map,
     encoder: Encoder,
@@ -324,6 +357,8 @@ def adjust_to_labels(
 ) -> FittedCalibration:
     """The encoder's calibration, adjusted to a map's answers to labelled queries; nothing is stored.
 
+    Labels of one kind move the map's own one, where it has one (:func:`core.judgement.calibration.adjust_calibration`).
+
     Raises:
         CalibrationImpossible: there are too few.
         StorageFailure: the map's files cannot be read.
@@ -331,7 +366,19 @@ def adjust_to_labels(
     """
     base = encoder.calibration
     trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=0)
-    return adjust_calibration(trials.answered(base), base, source)
+    return adjust_calibration(trials.answered(base), base, source, present=calibration_of(map_, encoder))
+
+
+def one_sided(kinds: Kinds) -> str | None:
+    """A sentence on frames of which too few are of one kind, so that a calibration cannot rest on them; None: enough."""
+    if kinds.enough:
+        return None
+    known, strangers = kinds
+    what = "strangers" if strangers < known else "places of the map"
+    return (
+        f"It rests on {known} frames of places of the map and {strangers} of strangers: these tell nothing of {what}. "
+        f"At least {FEWEST_OF_A_KIND} of each are needed."
+    )
 
 
 def calibration_warnings(found: FittedCalibration, method: str, target: Target | None, aligned: int = 0) -> list[str]:
@@ -343,6 +390,8 @@ def calibration_warnings(found: FittedCalibration, method: str, target: Target |
     """
     warned = {"map": FROM_ITSELF, "labels": FROM_DOUBT, "runs": FROM_RUNS}
     warnings = [warned[method]] if method in warned else []
+    if (lopsided := one_sided(Kinds.of(found.trials))) is not None:
+        warnings.append(f"{lopsided} The curve that was in force stays, and no answer becomes likelier.")
     if aligned:
         warnings.append(
             f"Which place {aligned} of the frames show is known from an alignment alone, not from poses of their own: "
