@@ -22,8 +22,8 @@ WORSE = 0.01
 """From this rise of the mean error of both kinds a calibration is worse than the one before."""
 
 WORSE_FOR_STRANGERS = 0.2
-"""The same of strangers alone, whatever it does for places of the map: theirs was at most 0.03 in the calibrations by
-runs and traverses of ``benchmarks.learning``, and 0.2 to 0.9 where labels had shown no stranger."""
+"""The same of strangers alone, whatever it does for places of the map.  It was at most 0.16 in the calibrations by runs
+of ``benchmarks.learning.calibration`` (in fog), and from 0.2 to 0.9 where labels had shown no stranger."""
 
 SURE = 2.0
 """A rise counts that is more than this many of its standard errors: that of a few answers may be chance."""
@@ -49,8 +49,8 @@ class HeldOutChange(BaseModel):
 
     known: KindChange | None = Field(description="Of frames whose place is in the map; null without any.")
     strangers: KindChange | None = Field(
-        description="Of frames of places that the map lacks; with labels, some are the map's own, asked without the "
-        "places around them. Null without any."
+        description="Of frames whose place the map lacks, or that were asked in the map without their place. Null "
+        "without any."
     )
     worse: str | None = Field(description="Why the calibration is not stored; null: it may be.")
 

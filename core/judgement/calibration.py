@@ -342,9 +342,9 @@ def adjust_calibration(
     In no case more answers are recognized in the map without their place, or off the map, than before; with fewer than
     ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.
 
-    With fewer than ``FEWEST_OF_A_KIND`` strangers no answer becomes likelier: known places say nothing of strangers, but
-    where their answers are wrong more often than stated, all are less likely, and the curve is shifted down.  With fewer
-    known places nothing changes.
+    With fewer than ``FEWEST_OF_A_KIND`` strangers no answer becomes likelier: known places say nothing of strangers.
+    Where their answers are wrong more often than stated, the curve is shifted down.  With fewer known places nothing
+    changes.
 
     Args:
         trials: judged with ``base``, each frame in the map as it is, and perhaps in the map without its place, too.
@@ -577,8 +577,8 @@ def _check(trials: Trials, target: Target) -> None:
         )
     if not Kinds.of(trials).enough:
         raise CalibrationImpossible(
-            f"A calibration rests on at least {FEWEST_OF_A_KIND} frames of places of the map and as many of places that "
-            f"it lacks; here are {int(trials.known.sum())} and {strangers}."
+            f"A calibration rests on at least {FEWEST_OF_A_KIND} frames of places of the map and as many of places "
+            f"that it lacks; here are {int(trials.known.sum())} and {strangers}."
         )
     area = auc_roc(trials.decision, trials.right) or 0.0
     if area < LEAST_AREA:

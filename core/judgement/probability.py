@@ -175,7 +175,9 @@ def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike, down: bo
 
     options = {"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000}
     if down:
-        found = minimize(lambda b: loss(np.array([0.0, -abs(b[0])])), np.zeros(1), method="Nelder-Mead", options=options)
+        found = minimize(
+            lambda b: loss(np.array([0.0, -abs(b[0])])), np.zeros(1), method="Nelder-Mead", options=options
+        )
         return 1.0, -abs(float(found.x[0]))
     found = minimize(loss, np.zeros(2), method="Nelder-Mead", options=options)
     return float(np.exp(found.x[0])), float(found.x[1])

@@ -48,9 +48,6 @@ TOGETHER = 16
 FEW_FRAMES = 50
 """A calibration from fewer frames comes with a warning."""
 
-MOST_DRAWN = 60
-"""Strangers that are drawn from a map at most."""
-
 FROM_ITSELF = (
     "The frames are the map's own: one walk in one light. A second visit differs more, so the probabilities are too "
     "high; calibrate from a second traverse or from labelled frames as soon as there are any."
@@ -236,29 +233,6 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
     return LabelledQueries(len(queried), made())
 
 
-def strangers_from_map(map_: Map, snapshot: Snapshot, most: int = MOST_DRAWN) -> LabelledQueries:
-    """Strangers that are drawn from the map itself: its frames, each asked without its place and what is around it.
-
-    Only places are left that are known to be elsewhere: those with a pose, as the frame has one, or of its traverse.
-
-    Args:
-        most: the largest number of queries; they are spread evenly over the map.
-    """
-    near, where = _SamePlace(map_, snapshot), snapshot.whereabouts
-    queried = spread(np.flatnonzero(snapshot.alive).tolist(), most)
-    nothing = np.zeros(snapshot.rows, np.bool_)
-
-    def made() -> Iterator[LabelledQuery]:
-        for row in queried:
-            elsewhere = where.kind == where.kind[row]
-            if not near.has_pose(row):
-                elsewhere = (where.sequence == where.sequence[row]) | (where.track == where.track[row])
-            absent = near(row, GUARD_FACTOR) | ~elsewhere
-            yield LabelledQuery(*_stored(snapshot, row), nothing, absent, nothing, _keypoints(map_, row))
-
-    return LabelledQueries(len(queried), made())
-
-
 def run_trials(
     map_: Map,
     encoder: Encoder,
@@ -354,10 +328,14 @@ def adjust_to_labels(
     queries: LabelledQueries,
     source: str,
     advance: ProgressCallback = lambda _done, _total: None,
-) -> FittedCalibration:
+) -> tuple[FittedCalibration, StagedTrials]:
     """The encoder's calibration, adjusted to a map's answers to labelled queries; nothing is stored.
 
     Labels of one kind move the map's own one, where it has one (:func:`core.judgement.calibration.adjust_calibration`).
+
+    Returns:
+        The calibration, and the answers to strangers that are drawn from the map: to the labelled frames in the map
+        without their places.  None of them has a part in it.
 
     Raises:
         CalibrationImpossible: there are too few.
@@ -365,12 +343,15 @@ def adjust_to_labels(
         Others: what ``advance`` raises.
     """
     base = encoder.calibration
-    trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=0)
-    return adjust_calibration(trials.answered(base), base, source, present=calibration_of(map_, encoder))
+    trials = run_trials(map_, encoder, snapshot, queries, base, advance)
+    drawn = ~trials.two.known & np.isin(trials.two.frame, trials.two.frame[trials.two.known])
+    asked = trials.take(~drawn).answered(base)
+    found = adjust_calibration(asked, base, source, present=calibration_of(map_, encoder))
+    return found, trials.take(drawn)
 
 
 def one_sided(kinds: Kinds) -> str | None:
-    """A sentence on frames of which too few are of one kind, so that a calibration cannot rest on them; None: enough."""
+    """A sentence on frames of which too few are of one kind for a calibration to rest on them; None: enough."""
     if kinds.enough:
         return None
     known, strangers = kinds

@@ -29,8 +29,6 @@ from core.recognition.calibration import (
     queries_from_labels,
     queries_from_map,
     queries_from_traverse,
-    run_trials,
-    strangers_from_map,
 )
 from core.recognition.calibration import (
     calibrate_map as fit_calibration,
@@ -281,18 +279,14 @@ def measure(
     queries = _queries(map_, snapshot, order, encoded, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    adjusted = (order.method, order.beside) == ("labels", "encoder")
+    adjusted, drawn = (order.method, order.beside) == ("labels", "encoder"), None
     if adjusted:
-        found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
+        found, drawn = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
     else:
         found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
     method, target = ("adjusted", None) if adjusted else (order.method, order.target)
     warnings = calibration_warnings(found, method, target, queries.aligned)
-    strangers = None
-    if order.method in ("labels", "frames"):  # which may have no strangers, or such that resemble no place of the map
-        drawn = strangers_from_map(map_, snapshot)
-        strangers = run_trials(map_, encoder, snapshot, drawn, encoder.calibration, advance, without_place=0)
-    return _report(map_, encoder, order, found, warnings, strangers), found.trials
+    return _report(map_, encoder, order, found, warnings, drawn), found.trials
 
 
 def _report(
@@ -301,15 +295,15 @@ def _report(
     order: CalibrationOrder,
     found: FittedCalibration,
     warnings: list[str],
-    strangers: StagedTrials | None = None,
+    drawn: StagedTrials | None = None,
 ) -> CalibrationReport:
     """The report on a calibration.
 
     Args:
-        strangers: answers to strangers that had no part in it, beside those that it was fitted to.
+        drawn: answers to strangers that had no part in it, beside those that it was fitted to.
     """
     previous = calibration_of(map_, encoder)
-    change = held_out_change(found, previous, strangers)
+    change = held_out_change(found, previous, drawn)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,

@@ -109,8 +109,8 @@ class MapView(BaseModel):
         "null if the encoder is not installed."
     )
     calibration_doubt: str | None = Field(
-        description="Why its own calibration is not to be trusted: it rests on frames of one kind alone, of known places "
-        "or of strangers, or on too few of them. Null: nothing is known against it."
+        description="Why its own calibration is not to be trusted: it rests on frames of one kind alone, of known "
+        "places or of strangers, or on too few of them. Null: nothing is known against it."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
     storage: StorageStatus = Field(description="The size of the map on disk.")

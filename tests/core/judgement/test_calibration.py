@@ -363,7 +363,9 @@ def test_labels_of_one_kind_make_no_answer_likelier(
     found = adjust_calibration(asked, TIMID, "labels", target).calibration
     scores = np.linspace(-0.2, 0.4, 61)
     for verified in (np.nan, 0.0, 12.0, 60.0):
-        any_answer = Trials(scores, np.full(61, np.inf), scores > 9, scores > 9, np.arange(61), evidence=np.full(61, verified))
+        any_answer = Trials(
+            scores, np.full(61, np.inf), scores > 9, scores > 9, np.arange(61), evidence=np.full(61, verified)
+        )
         before, after = (any_answer.probabilities(one) for one in (TIMID, found))
         assert bool((after > before + 1e-9).any()) == rises
         if falls or not rises:
