@@ -175,6 +175,10 @@ class CalibrationImpossible(PlacerecError):
     """The queries do not suffice for a calibration: they are too few, or right answers look like wrong ones."""
 
 
+class CalibrationWorse(PlacerecError):
+    """A calibration would make answers worse that had no part in it, or have strangers believed."""
+
+
 # Storage
 
 

@@ -43,6 +43,11 @@ SMALLEST_DEVIATION = 1e-6
 FEWEST_OUTCOMES = 10
 """A map's calibration needs at least this many right and this many wrong answers."""
 
+FEWEST_OF_A_KIND = 3
+"""Frames of places of the map, and strangers, that trials need to tell how probable an answer is.  Those of one kind do
+not: they were chosen by what they show, and of known places alone nearly all answers are right, whatever strangers
+get."""
+
 LEAST_AREA = 0.6
 """Least area under the ROC of right against wrong answers; below it the decision value hardly separates them."""
 
@@ -230,13 +235,48 @@ class Measurement(BaseModel):
     points: list[Point] = Field(description="The precision-recall and ROC curves, by rising threshold.")
 
 
+class HeldOutAnswers(NamedTuple):
+    """The answers to n queries, each by a calibration in which it had no part.
+
+    probability: float64 [n].
+    right: bool [n], whether the best match was right.
+    """
+
+    probability: Values
+    right: Flags
+
+
 @dataclass(frozen=True)
 class FittedCalibration:
-    """A calibration fitted to trials on a map, the measurements of the fit, and the trials."""
+    """A calibration fitted to trials on a map, and the measurements of the fit.
+
+    trials: the answers by the calibration.
+    staged: what it was fitted to.
+    held_out: the answers in the cross-validation.
+    """
 
     calibration: Calibration
     measurement: Measurement
     trials: Trials
+    staged: StagedTrials
+    held_out: HeldOutAnswers
+
+
+class Kinds(NamedTuple):
+    """How many frames of trials show places of the map, and how many were asked in the map without their places."""
+
+    known: int
+    strangers: int
+
+    @classmethod
+    def of(cls, trials: Trials) -> Kinds:
+        """Count the frames of trials."""
+        return cls(*(len(np.unique(trials.frame[chosen])) for chosen in (trials.known, ~trials.known)))
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are enough of each to tell how probable an answer is."""
+        return min(self) >= FEWEST_OF_A_KIND
 
 
 def fit_map_calibration(
@@ -286,7 +326,11 @@ def _of_stages(trials: StagedTrials, base: Calibration, target: Target, times: f
 
 
 def adjust_calibration(
-    trials: Trials | StagedTrials, base: Calibration, source: str, target: Target | None = None
+    trials: Trials | StagedTrials,
+    base: Calibration,
+    source: str,
+    target: Target | None = None,
+    present: Calibration | None = None,
 ) -> FittedCalibration:
     """Adjust a calibration to few trials on one map, which may be the doubtful ones.
 
@@ -296,14 +340,18 @@ def adjust_calibration(
     decision value that is as probable as the old one was, or higher, and the margin stays.
 
     In no case more answers are recognized in the map without their place, or off the map, than before; with fewer than
-    ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.  Known places alone make every answer
-    likelier, and say nothing of strangers.
+    ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.
+
+    With fewer than ``FEWEST_OF_A_KIND`` strangers no answer becomes likelier: known places say nothing of strangers.
+    Where their answers are wrong more often than stated, the curve is shifted down.  With fewer known places nothing
+    changes.
 
     Args:
         trials: judged with ``base``, each frame in the map as it is, and perhaps in the map without its place, too.
         source: recorded in the calibration.
         target: a precision, for which the threshold rises if it has to; None: none.  Only for trials that were not
             chosen by their answers.
+        present: what is kept, in place of ``base``, where there are too few of a kind; None: the base is.
 
     Raises:
         CalibrationImpossible: there are too few trials, or the calibration has no curve.
@@ -316,15 +364,20 @@ def adjust_calibration(
             if base.curve is not None
             else "The encoder's calibration has no curve that could be adjusted."
         )
+    if present is not None and present.curve is not None and not Kinds.of(staged.two).enough:
+        base = present
     return _measured(staged, lambda chosen: _adjusted(staged.take(chosen), base, target), source)
 
 
 def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None) -> Calibration:
     assert base.curve is not None
-    two = trials.two
-    curve = moved_curve(base.curve, two.decision, two.imagined, two.right, share_of_leads(two.margin, base))
+    two, kinds = trials.two, Kinds.of(trials.two)
+    if kinds.known < FEWEST_OF_A_KIND:
+        return base
+    down, leads = not kinds.enough, share_of_leads(two.margin, base)
+    curve = moved_curve(base.curve, two.decision, two.imagined, two.right, leads, down)
     moved = base.model_copy(update={"curve": curve})
-    moved = moved.model_copy(update={"geometry": _adjusted_terms(trials.three, moved, curve)})
+    moved = moved.model_copy(update={"geometry": _adjusted_terms(trials.three, moved, curve, down)})
     strangers = ~two.known
     lowest = base.threshold if int(strangers.sum()) < FEWEST_OUTCOMES else -np.inf
     before = int(trials.answered(base).recognized(base)[strangers].sum())
@@ -332,11 +385,12 @@ def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None) ->
     return _reaching(trials, moved, target, least, lowest, before).calibration
 
 
-def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve) -> GeometryTerms | None:
+def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve, down: bool = False) -> GeometryTerms | None:
     """The terms of evidence, moved as far as the trials that were verified demand.
 
     Args:
         curve: of two stages.
+        down: as of :func:`core.judgement.probability.movement`.
     """
     verified = ~np.isnan(trials.evidence)
     if base.geometry is None or not verified.any():
@@ -344,7 +398,7 @@ def _adjusted_terms(trials: Trials, base: Calibration, curve: Curve) -> Geometry
     some = trials.take(verified)
     leads = share_of_lead(some.margin, some.imagined)
     odds = base.geometry.log_odds(curve.log_odds(some.decision, some.imagined), some.evidence, leads)
-    stretch, shift = movement(odds, some.right, share_of_leads(some.margin, base))
+    stretch, shift = movement(odds, some.right, share_of_leads(some.margin, base), down)
     return GeometryTerms(
         support=stretch * base.geometry.support,
         slope=stretch * base.geometry.slope,
@@ -433,6 +487,7 @@ def _measured(trials: StagedTrials, fit: Callable[[Flags], Calibration], source:
     frames = len(np.unique(two.frame))
     known, right = two.known, two.right
     points = curve_points(two.decision, known, right)
+    held, held_out = _cross_validated(trials, fit)
     measurement = Measurement(
         frames=frames,
         trials=len(two),
@@ -442,11 +497,11 @@ def _measured(trials: StagedTrials, fit: Callable[[Flags], Calibration], source:
         auc_pr=auc_pr(two.decision, right),
         auc_roc=auc_roc(two.decision, known),
         auc_roc_right=auc_roc(two.decision, right) or 0.0,
-        cross_validated=_cross_validated(trials, fit),
+        cross_validated=held,
         points=_thinned(points),
     )
     named = calibration.model_copy(update={"source": source, "frames": frames})
-    return FittedCalibration(named, measurement, trials.answered(calibration))
+    return FittedCalibration(named, measurement, trials.answered(calibration), trials, held_out)
 
 
 def blocks_of(frame: NDArray[np.int64], count: int = BLOCKS) -> list[Flags]:
@@ -462,17 +517,18 @@ def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
     Raises:
         CalibrationImpossible: the blocks besides one do not suffice for a calibration.
     """
-    return _cross_validated(StagedTrials.of(trials), lambda chosen: _fitted(trials.take(chosen), base, target))
+    return _cross_validated(StagedTrials.of(trials), lambda chosen: _fitted(trials.take(chosen), base, target))[0]
 
 
-def _cross_validated(trials: StagedTrials, fit: Callable[[Flags], Calibration]) -> Held:
+def _cross_validated(trials: StagedTrials, fit: Callable[[Flags], Calibration]) -> tuple[Held, HeldOutAnswers]:
     recognized, right, probabilities = (np.zeros(len(trials)) for _ in range(3))
     for block in blocks_of(trials.two.frame):
         calibration = fit(~block)
         held = trials.take(block).answered(calibration)
         recognized[block], probabilities[block] = held.recognized(calibration), held.probabilities(calibration)
         right[block] = held.right
-    return held_figures(replace(trials.two, right=right > 0), recognized > 0, probabilities)
+    figures = held_figures(replace(trials.two, right=right > 0), recognized > 0, probabilities)
+    return figures, HeldOutAnswers(probabilities, right > 0)
 
 
 def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> Held:
@@ -518,6 +574,11 @@ def _check(trials: Trials, target: Target) -> None:
     if target.rule != "precision" and strangers < FEWEST_OUTCOMES:
         raise CalibrationImpossible(
             f"This rule rests on at least {FEWEST_OUTCOMES} frames of places that the map lacks; here are {strangers}."
+        )
+    if not Kinds.of(trials).enough:
+        raise CalibrationImpossible(
+            f"A calibration rests on at least {FEWEST_OF_A_KIND} frames of places of the map and as many of places "
+            f"that it lacks; here are {int(trials.known.sum())} and {strangers}."
         )
     area = auc_roc(trials.decision, trials.right) or 0.0
     if area < LEAST_AREA:

@@ -129,14 +129,21 @@ def _loss(
     return float((counted * (np.logaddexp(0, odds) - targets * odds)).sum())
 
 
-def moved_curve(curve: Curve, decisions: ArrayLike, imagined: ArrayLike, right: ArrayLike, factors: ArrayLike) -> Curve:
+def moved_curve(
+    curve: Curve,
+    decisions: ArrayLike,
+    imagined: ArrayLike,
+    right: ArrayLike,
+    factors: ArrayLike,
+    down: bool = False,
+) -> Curve:
     """A curve whose log odds are stretched and shifted as far as outcomes demand it, but no farther.
 
     Args:
         decisions: [n], decision values; imagined: [n], shares of imagined places.
-        right, factors: as of :func:`movement`.
+        right, factors, down: as of :func:`movement`.
     """
-    stretch, shift = movement(curve.log_odds(decisions, imagined), right, factors)
+    stretch, shift = movement(curve.log_odds(decisions, imagined), right, factors, down)
     return Curve(
         slope=stretch * curve.slope,
         intercept=stretch * curve.intercept + shift,
@@ -145,7 +152,7 @@ def moved_curve(curve: Curve, decisions: ArrayLike, imagined: ArrayLike, right: 
     )
 
 
-def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike) -> tuple[float, float]:
+def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike, down: bool = False) -> tuple[float, float]:
     """The most probable stretch a and shift b of log odds, a · odds + b, given the outcomes.
 
     Before them log a and b are normal about 0 with the deviations ``STRETCH`` and ``SHIFT``.  So few outcomes move log
@@ -155,6 +162,7 @@ def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike) -> tuple
         log_odds: [n], that an answer is right, before rivals under the margin take from them.
         right: bool [n], whether the best match was right.
         factors: [n], in (0, 1], by which the probability of the log odds is multiplied to be that of the answer.
+        down: only shift them, and only down: a is 1, and b at most 0.
     """
     from scipy.optimize import minimize  # here, because it takes long to import
 
@@ -165,5 +173,11 @@ def movement(log_odds: ArrayLike, right: ArrayLike, factors: ArrayLike) -> tuple
         likelihood = np.where(y, np.log(stated), np.log1p(-stated)).sum()
         return float((moved[0] / STRETCH) ** 2 / 2 + (moved[1] / SHIFT) ** 2 / 2 - likelihood)
 
-    found = minimize(loss, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000})
+    options = {"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000}
+    if down:
+        found = minimize(
+            lambda b: loss(np.array([0.0, -abs(b[0])])), np.zeros(1), method="Nelder-Mead", options=options
+        )
+        return 1.0, -abs(float(found.x[0]))
+    found = minimize(loss, np.zeros(2), method="Nelder-Mead", options=options)
     return float(np.exp(found.x[0])), float(found.x[1])

@@ -15,6 +15,7 @@ from core.ledger.postgres import PostgresLedger
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.postgres import rows
 from core.postgres.forms import Form
+from core.postgres.review import PostgresReview
 
 if TYPE_CHECKING:
     from core.postgres.pictures.objects import Objects
@@ -28,14 +29,25 @@ class PostgresExporter:
     Args:
         viewing: begins a transaction that reads the map, whose state comes with it.
         state: a value that is the same as long as nothing is written to the map.
+        review: the frames of the map that are stored for review.
         database: in which the map is.
         objects: where pictures may be besides; None: nowhere.
     """
 
     def __init__(
-        self, viewing: Viewing, state: Callable[[], object], database: PostgresLedger, objects: Objects | None
+        self,
+        viewing: Viewing,
+        state: Callable[[], object],
+        review: PostgresReview,
+        database: PostgresLedger,
+        objects: Objects | None,
     ) -> None:
-        self._viewing, self.state, self._database, self._objects = viewing, state, database, objects
+        self._viewing, self._state, self._review = viewing, state, review
+        self._database, self._objects = database, objects
+
+    def state(self) -> object:
+        """A value that is the same as long as nothing is written to the map, and no frame of the review labelled."""
+        return self._state(), self._review.labels_state()
 
     def write(
         self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
@@ -47,7 +59,7 @@ class PostgresExporter:
             StorageFull, StorageFailure.
         """
         with disk_errors("write the map as a file"), self._keeping_objects(), self._viewing() as (connection, state):
-            source = _Source(connection, state.record, Form(state.record).frame_bytes, self._objects)
+            source = _Source(connection, state.record, Form(state.record).frame_bytes, self._review, self._objects)
             return write_archive(source, path, advance, expect)
 
     def _keeping_objects(self) -> AbstractContextManager[object]:

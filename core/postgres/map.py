@@ -56,7 +56,7 @@ class PostgresMap(LedgerMap):
         self._paused = threading.local()
         super().__init__()
         self.review = PostgresReview(state.number, self._reading, database, objects)
-        self.exporter = PostgresExporter(self.viewing, lambda: self.state, database, objects)
+        self.exporter = PostgresExporter(self.viewing, lambda: self.state, self.review, database, objects)
 
     @property
     def record(self) -> MapRecord:

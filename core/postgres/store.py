@@ -144,10 +144,17 @@ class PostgresStore(ABC, Generic[MapT]):
                 raise MapExists(f"There is already a map {map_id!r}.")
             number = record.create(connection, made, f"{IMPORTED}{secrets.token_hex(8)}", listed=False)
         try:
-            writing = self._map(map_id, number).writing
+            made_map = self._map(map_id, number)
             layout = layout_of(archive.manifest)
             importing = Importing(
-                archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors
+                archive,
+                layout,
+                advance,
+                check_picture,
+                most_picture_bytes,
+                made_map.writing,
+                made_map.review,
+                check_descriptors,
             )
             importing.fill()
             before_listing(importing.places)

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
 from core.geometry.keypoints import Keypoints
 from core.judgement.background import GUARD_FACTOR
-from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
+from core.judgement.calibration import (
+    FEWEST_OF_A_KIND,
+    FittedCalibration,
+    Kinds,
+    Target,
+    adjust_calibration,
+    fit_map_calibration,
+)
 from core.judgement.trials import StagedTrials, Trial, gathered, joined_stages
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot, own_poses
@@ -27,7 +34,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE
 from core.recognition.comparison import MapComparison
 from core.recognition.question import Verifier
-from core.recognition.stages import Candidates, agree, neighborhood_of
+from core.recognition.stages import Candidates, agree, calibration_of, neighborhood_of
 from core.recognition.verification import verify_candidates
 
 Item = TypeVar("Item")
@@ -321,8 +328,14 @@ def adjust_to_labels(
     queries: LabelledQueries,
     source: str,
     advance: ProgressCallback = lambda _done, _total: None,
-) -> FittedCalibration:
+) -> tuple[FittedCalibration, StagedTrials]:
     """The encoder's calibration, adjusted to a map's answers to labelled queries; nothing is stored.
+
+    Labels of one kind move the map's own one, where it has one (:func:`core.judgement.calibration.adjust_calibration`).
+
+    Returns:
+        The calibration, and the answers to strangers that are drawn from the map: to the labelled frames in the map
+        without their places.  None of them has a part in it.
 
     Raises:
         CalibrationImpossible: there are too few.
@@ -330,8 +343,23 @@ def adjust_to_labels(
         Others: what ``advance`` raises.
     """
     base = encoder.calibration
-    trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=0)
-    return adjust_calibration(trials.answered(base), base, source)
+    trials = run_trials(map_, encoder, snapshot, queries, base, advance)
+    drawn = ~trials.two.known & np.isin(trials.two.frame, trials.two.frame[trials.two.known])
+    asked = trials.take(~drawn).answered(base)
+    found = adjust_calibration(asked, base, source, present=calibration_of(map_, encoder))
+    return found, trials.take(drawn)
+
+
+def one_sided(kinds: Kinds) -> str | None:
+    """A sentence on frames of which too few are of one kind for a calibration to rest on them; None: enough."""
+    if kinds.enough:
+        return None
+    known, strangers = kinds
+    what = "strangers" if strangers < known else "places of the map"
+    return (
+        f"It rests on {known} frames of places of the map and {strangers} of strangers: these tell nothing of {what}. "
+        f"At least {FEWEST_OF_A_KIND} of each are needed."
+    )
 
 
 def calibration_warnings(found: FittedCalibration, method: str, target: Target | None, aligned: int = 0) -> list[str]:
@@ -343,6 +371,8 @@ def calibration_warnings(found: FittedCalibration, method: str, target: Target |
     """
     warned = {"map": FROM_ITSELF, "labels": FROM_DOUBT, "runs": FROM_RUNS}
     warnings = [warned[method]] if method in warned else []
+    if (lopsided := one_sided(Kinds.of(found.trials))) is not None:
+        warnings.append(f"{lopsided} The curve that was in force stays, and no answer becomes likelier.")
     if aligned:
         warnings.append(
             f"Which place {aligned} of the frames show is known from an alignment alone, not from poses of their own: "

@@ -104,7 +104,7 @@ class Map(LedgerMap):
         self.indexer: Indexer | None = None
         super().__init__()
         self.review = ReviewFrames(folder / REVIEW_FILE, record.id, self._expect_open)
-        self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
+        self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded, self.review)
 
     # Opening and closing
 

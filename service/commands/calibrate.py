@@ -222,6 +222,8 @@ def _show(report: dict[str, Any]) -> None:
     calibration, measured, held = report["calibration"], report["measurement"], report["measurement"]["cross_validated"]
     for warning in report["warnings"]:
         remark(warning)
+    if report["change"] is not None and report["change"]["worse"] is not None:
+        remark(f"It would not be stored. {report['change']['worse']}")
     done = "is calibrated" if report["stored"] else "would be calibrated"
     say(
         f"The map {report['map']} {done} by {measured['frames']} frames: threshold {number(calibration['threshold'])}, "
@@ -238,6 +240,10 @@ def _show(report: dict[str, Any]) -> None:
         ("Brier score", held["reliability"]["brier"]),
     ):
         figures.add_row(name, number(value), "", "")
+    for name in ("known", "strangers"):
+        if (kind := (report["change"] or {}).get(name)) is not None:
+            figures.add_row(f"error, {name}: before", number(kind["before"]["error"]), "", "")
+            figures.add_row(f"error, {name}: after", number(kind["after"]["error"]), "", "")
     show(figures)
     points = table("#threshold", "#precision", "#recall", "#false accepts", title="Thresholds alone, on all frames")
     shown = measured["points"]

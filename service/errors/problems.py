@@ -115,6 +115,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
     errors.NoThumbnail: Kind(404, "no-thumbnail", "The map keeps no picture of the place"),
     errors.CalibrationImpossible: Kind(422, "calibration-impossible", "The map cannot be calibrated with these frames"),
+    errors.CalibrationWorse: Kind(409, "calibration-worse", "The calibration would make answers worse"),
     errors.RevisionMismatch: Kind(412, "revision-mismatch", "The map has changed"),
     # Jobs and upkeep
     faults.ImagesMissing: Kind(409, "images-missing", "The map does not keep all its images"),

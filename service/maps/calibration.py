@@ -15,8 +15,9 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from core import errors
 from core.errors import RevisionMismatch
+from core.judgement.acceptance import held_out_change
 from core.judgement.calibration import FittedCalibration, Target, adjust_calibration
-from core.judgement.trials import Trials, joined_stages
+from core.judgement.trials import StagedTrials, Trials, joined_stages
 from core.judgement.verdict import Calibration
 from core.maps import Map, Snapshot
 from core.method.encoder import Encoder
@@ -54,6 +55,7 @@ from service.http.uploads import FORM, check_part, is_file, json_part, media_typ
 from service.jobs.context import JobContext, creation_time, encode_after_requests, progress_of
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
+from service.maps.calibration_preview import storable
 from service.maps.schemas import MOST_FRAMES, CalibrationOrder, CalibrationReport
 from service.places.map_events import tell_map
 from service.queries.answers import StatisticsDep
@@ -84,6 +86,7 @@ router = APIRouter(
         errors.RevisionMismatch,
         UnsupportedMediaType,
         errors.CalibrationImpossible,
+        errors.CalibrationWorse,
         errors.InvalidImage,
         errors.NoRegions,
         QueueFull,
@@ -136,7 +139,8 @@ async def calibrate_map(
     all of them, or those stored for review and labelled; or those of robots' runs. With a form, they are new frames:
     each is a file part, and a part `calibration` holds the same JSON with a label for each frame. The threshold, the
     margin and the probability curve follow from the answers; the reported quality is cross-validated. If the answers
-    are too few or too poor to calibrate the map, the request is refused and the map keeps its calibration.
+    are too few or too poor to calibrate the map, or answers that had no part in it would become worse, the request is
+    refused and the map keeps its calibration.
     """
     map_ = await engine.map(map_id)
     expected = expected_revision(if_match, map_.record.revision)
@@ -165,7 +169,7 @@ async def calibrate_map(
     report, trials = await in_thread(measure, map_, encoder, order, encoded, advance, known, ran)
     await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
-        await in_thread(store, map_, report.calibration, replaces, expected)
+        await in_thread(store, map_, storable(report), replaces, expected)
         tell_map(engine, map_, "calibrated")
     return report
 
@@ -275,28 +279,41 @@ def measure(
     queries = _queries(map_, snapshot, order, encoded, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    adjusted = (order.method, order.beside) == ("labels", "encoder")
+    adjusted, drawn = (order.method, order.beside) == ("labels", "encoder"), None
     if adjusted:
-        found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
+        found, drawn = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
     else:
         found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
     method, target = ("adjusted", None) if adjusted else (order.method, order.target)
     warnings = calibration_warnings(found, method, target, queries.aligned)
-    return _report(map_, encoder, order, found, warnings), found.trials
+    return _report(map_, encoder, order, found, warnings, drawn), found.trials
 
 
 def _report(
-    map_: Map, encoder: Encoder, order: CalibrationOrder, found: FittedCalibration, warnings: list[str]
+    map_: Map,
+    encoder: Encoder,
+    order: CalibrationOrder,
+    found: FittedCalibration,
+    warnings: list[str],
+    drawn: StagedTrials | None = None,
 ) -> CalibrationReport:
+    """The report on a calibration.
+
+    Args:
+        drawn: answers to strangers that had no part in it, beside those that it was fitted to.
+    """
+    previous = calibration_of(map_, encoder)
+    change = held_out_change(found, previous, drawn)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
         method=order.method,
         target=order.target,
-        stored=not order.dry_run,
+        stored=not order.dry_run and (change is None or change.worse is None),
         calibration=found.calibration,
-        previous=calibration_of(map_, encoder),
+        previous=previous,
         measurement=found.measurement,
+        change=change,
         warnings=warnings,
     )
 
@@ -317,7 +334,8 @@ def _from_runs(map_: Map, encoder: Encoder, ran: Sequence[RunTrials], target: Ta
         )
     own = map_.record.calibration
     base = encoder.calibration if own is None or by_itself(own) else own
-    return adjust_calibration(joined_stages([one.trials for one in ran]), base, RUNS, target)
+    trials = joined_stages([one.trials for one in ran])
+    return adjust_calibration(trials, base, RUNS, target, calibration_of(map_, encoder))
 
 
 def by_itself(calibration: Calibration) -> bool:
@@ -396,8 +414,8 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
     """Calibrate a map as a job; an attempt after a restart begins again unless the calibration was stored already.
 
     Raises:
-        UnknownMap, UnknownSequence, UnknownPlace, EncoderNotInstalled, CalibrationImpossible, RevisionMismatch,
-            StorageFull, StorageFailure: the map keeps its calibration.
+        UnknownMap, UnknownSequence, UnknownPlace, EncoderNotInstalled, CalibrationImpossible, CalibrationWorse,
+            RevisionMismatch, StorageFull, StorageFailure: the map keeps its calibration.
         JobCancelled, JobInterrupted.
     """
     map_ = context.map(engine.maps)
@@ -420,7 +438,7 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
     result = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=result)
-        store(map_, report.calibration, None if replaces is None else Calibration.model_validate(replaces), expected)
+        store(map_, storable(report), None if replaces is None else Calibration.model_validate(replaces), expected)
         tell_map(engine, map_, "calibrated")
     return result
 

@@ -11,17 +11,20 @@ from fastapi import APIRouter, Depends, Query, Response
 from pydantic import BaseModel, Field
 
 from core import errors
-from core.judgement.calibration import Effect, effect_of
+from core.judgement.calibration import Effect, Kinds, effect_of
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
+from core.maps import Map
 from core.places import Timestamp
+from core.recognition.calibration import one_sided
 from service.errors.problems import problem_documentation
 from service.http.headers import entity_tag
 from service.http.routing import EngineDep, MapId, single_values
 from service.http.schemas import Parameters
-from service.maps.schemas import CalibrationReport
+from service.maps.schemas import MOST_FRAMES, CalibrationReport
 from service.queries.answers import StatisticsDep
-from service.queries.statistics import map_key
+from service.queries.statistics import QueryStatistics, map_key
+from service.review.labels import known_frames
 
 log = logging.getLogger("placerec.calibration")
 
@@ -107,3 +110,44 @@ def measured_of(stored: tuple[datetime, str, str] | None) -> tuple[LatestMeasure
     except (KeyError, TypeError, ValueError) as error:
         log.warning("what was measured in calibrating a map cannot be read: %s", error)
         return None
+
+
+def storable(report: CalibrationReport) -> Calibration:
+    """The calibration that was measured, if it may become the map's own: the one judge of all that were fitted.
+
+    Raises:
+        CalibrationWorse: held-out answers speak against it.
+    """
+    if report.change is not None and report.change.worse is not None:
+        raise errors.CalibrationWorse(
+            f"{report.change.worse} The map keeps its calibration. Give more frames, of known places and of strangers; "
+            "a dry run shows these figures."
+        )
+    return report.calibration
+
+
+def calibration_doubt(statistics: QueryStatistics, map_: Map) -> str | None:
+    """Why a map's own calibration is not to be trusted: it rests on frames of one kind, or on too few of one.
+
+    Which frames it rests on is known from the latest measurement, if it was stored, or from the labels of the review.
+
+    Returns:
+        A sentence; None if the map has none of its own, or nothing is known against it.
+    """
+    own = map_.record.calibration
+    if own is None:
+        return None
+    try:
+        found = measured_of(statistics.calibration(map_key(map_)))
+        report = None if found is None else found[0].report
+        if report is not None and report.calibration.curve == own.curve:
+            kinds = Kinds(report.measurement.known, report.measurement.unknown)
+        elif own.source == "labels":
+            places = [frame.place for frame in known_frames(map_, MOST_FRAMES)[0]]
+            kinds = Kinds(len(places) - places.count(None), places.count(None))
+        else:
+            return None
+    except errors.PlacerecError as error:
+        log.warning("what the calibration of %s rests on cannot be read: %s", map_.record.id, error)
+        return None
+    return one_sided(kinds)

@@ -35,7 +35,7 @@ from service.http.schemas import PageParameters
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
-from service.maps.calibration_preview import measured_of
+from service.maps.calibration_preview import calibration_doubt, measured_of, storable
 from service.maps.limits import check_map_count
 from service.maps.schemas import (
     AlarmChanges,
@@ -73,7 +73,9 @@ can have this id."""
 BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
 
 
-def show_map(engine: Engine, map_: Map, last_day: Mapping[MapKey, VerdictCounts] | None) -> MapView:
+def show_map(
+    engine: Engine, statistics: QueryStatistics, map_: Map, last_day: Mapping[MapKey, VerdictCounts] | None
+) -> MapView:
     """A map as JSON.
 
     Args:
@@ -85,6 +87,7 @@ def show_map(engine: Engine, map_: Map, last_day: Mapping[MapKey, VerdictCounts]
         **record.model_dump(exclude={"calibration", "index", "precision", "review"}),
         review=record.review,
         calibration=calibration,
+        calibration_doubt=calibration_doubt(statistics, map_),
         index=map_.index_status(),
         storage=map_.storage_status(),
         places=map_.count_places(),
@@ -137,7 +140,7 @@ def create_map(
     map_.open()
     response.headers["ETag"] = entity_tag(map_.record.revision)
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
-    return show_map(engine, map_, _last_day(statistics, map_))
+    return show_map(engine, statistics, map_, _last_day(statistics, map_))
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
@@ -150,7 +153,7 @@ def list_maps(page: Page, engine: EngineDep, statistics: StatisticsDep, principa
     items, last_day = [], _last_day(statistics)
     for record in records:
         try:
-            items.append(show_map(engine, engine.maps.find(record.id), last_day))
+            items.append(show_map(engine, statistics, engine.maps.find(record.id), last_day))
         except (errors.UnknownMap, errors.MapQuarantined):
             continue  # it was deleted or found to be damaged since it was listed
     damaged = engine.maps.quarantined().items()
@@ -173,7 +176,7 @@ def read_map(map_id: MapId, engine: EngineDep, statistics: StatisticsDep, respon
     """Read a map's settings, calibration and size; send its ETag as `If-Match` when you edit the map."""
     map_ = engine.maps.get(map_id)
     response.headers["ETag"] = entity_tag(map_.record.revision)
-    return show_map(engine, map_, _last_day(statistics, map_))
+    return show_map(engine, statistics, map_, _last_day(statistics, map_))
 
 
 @router.patch(
@@ -181,7 +184,12 @@ def read_map(map_id: MapId, engine: EngineDep, statistics: StatisticsDep, respon
     dependencies=[Depends(json_body)],
     openapi_extra=json_patch(MapChanges),
     responses=problem_documentation(
-        *BODY_PROBLEMS, errors.UnknownMap, errors.RevisionMismatch, errors.InvalidField, errors.StorageFull
+        *BODY_PROBLEMS,
+        errors.UnknownMap,
+        errors.RevisionMismatch,
+        errors.InvalidField,
+        errors.CalibrationWorse,
+        errors.StorageFull,
     ),
 )
 def edit_map(
@@ -196,7 +204,7 @@ def edit_map(
 
     A calibration that is set here becomes the map's own (`"source": "manual"`); values that are left out are those
     of the calibration in force. `null` restores the encoder's default. With `measured_at` it is the one that the latest
-    calibrate has found.
+    calibrate has found, and with `restore` one that the map had before, whole.
     """
     map_ = engine.maps.get(map_id)
     expected = expected_revision(if_match, map_.record.revision)
@@ -209,14 +217,14 @@ def edit_map(
         except errors.PlacerecError as error:  # the map is edited; the next frame that is stored shrinks it again
             log.warning("frames stored beyond the new limits stay for now: %s", error, extra={"map": map_id})
     response.headers["ETag"] = entity_tag(edited.revision)
-    return show_map(engine, map_, _last_day(statistics, map_))
+    return show_map(engine, statistics, map_, _last_day(statistics, map_))
 
 
 def _settings_changes(engine: Engine, statistics: QueryStatistics, map_: Map, changes: MapChanges) -> dict[str, Any]:
     """The values that a merge patch sets; null stands for the default of its field.
 
     Raises:
-        InvalidField, RevisionMismatch.
+        InvalidField, RevisionMismatch, CalibrationWorse.
     """
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
@@ -254,23 +262,26 @@ def _measured_calibration(statistics: QueryStatistics, map_: Map, at: datetime) 
 
     Raises:
         RevisionMismatch: it was measured at another time, or nothing was.
+        CalibrationWorse: held-out answers speak against it.
     """
     found = measured_of(statistics.calibration(map_key(map_)))
     if found is None or found[0].at != at or found[0].report.encoder != map_.record.encoder:
         raise errors.RevisionMismatch("The map was measured again meanwhile; read its calibration again.")
-    return found[0].report.calibration
+    return storable(found[0].report)
 
 
 def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:
     if changes is None:
         return None
+    if changes.restore is not None:
+        return changes.restore
     record = map_.record
     default = engine.default_calibration(record.encoder)
     base = record.calibration or default
     if base is None:
         raise errors.InvalidField(f"The encoder {record.encoder} is not installed, so its calibration is not known.")
     values = base.model_dump() | {"source": "manual"}
-    for name in changes.model_fields_set:
+    for name in changes.model_fields_set & {"threshold", "margin"}:
         value = getattr(changes, name)
         values[name] = getattr(default or base, name) if value is None else value
     return Calibration(**values)

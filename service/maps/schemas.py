@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.frames.value_ranges import ValueRange
+from core.judgement.acceptance import HeldOutChange
 from core.judgement.background import HIGHEST_DECISION, LOWEST_DECISION
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
@@ -56,6 +57,7 @@ MAP_EXAMPLE: dict[str, Any] = {
         "background_mean": 0.07,
         "background_deviation": 0.014,
     },
+    "calibration_doubt": None,
     "index": {
         "setting": "auto",
         "tier": "exact",
@@ -106,6 +108,10 @@ class MapView(BaseModel):
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
+    )
+    calibration_doubt: str | None = Field(
+        description="Why its own calibration is not to be trusted: it rests on frames of one kind alone, of known "
+        "places or of strangers, or on too few of them. Null: nothing is known against it."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
     storage: StorageStatus = Field(description="The size of the map on disk.")
@@ -171,6 +177,10 @@ class CalibrationChanges(BaseModel):
         description="Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time "
         "at which it was measured, `measured.at` of the calibration. If it was measured again since, this is refused.",
     )
+    restore: Calibration | None = Field(
+        default=None,
+        description="Put back, instead, a calibration that the map had, whole, as it was read: to undo a change.",
+    )
 
     @field_validator("threshold")
     @classmethod
@@ -183,8 +193,8 @@ class CalibrationChanges(BaseModel):
 
     @model_validator(mode="after")
     def _sets_or_stores(self) -> CalibrationChanges:
-        if self.measured_at is not None and len(self.model_fields_set) > 1:
-            raise ValueError("give measured_at alone, or threshold and margin")
+        if (self.measured_at is not None or self.restore is not None) and len(self.model_fields_set) > 1:
+            raise ValueError("give measured_at alone, or restore alone, or threshold and margin")
         return self
 
 
@@ -381,7 +391,7 @@ class CalibrationOrder(BaseModel):
 
 
 class CalibrationReport(BaseModel):
-    """A calibration, and the measurement that it rests on."""
+    """A calibration, the measurement that it rests on, and what it would change."""
 
     map: str
     encoder: str
@@ -391,4 +401,9 @@ class CalibrationReport(BaseModel):
     calibration: Calibration
     previous: Calibration = Field(description="The calibration that was in force before.")
     measurement: Measurement
+    change: HeldOutChange | None = Field(
+        default=None,
+        description="What it changes for answers that had no part in it; a calibration that makes them worse is not "
+        "stored. Null where the calibration in force states no probabilities.",
+    )
     warnings: list[str]

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from core.errors import CalibrationImpossible, PlacerecError, RevisionMismatch
+from core.errors import CalibrationImpossible, CalibrationWorse, PlacerecError, RevisionMismatch
 from core.judgement.calibration import effect_of
 from core.judgement.reliability import reliability
 from core.judgement.trials import StagedTrials, Trials
@@ -21,7 +21,7 @@ from service.engine.engine import Engine
 from service.jobs.context import JobCancelled, JobContext, progress_of
 from service.learning.run_notes import RunNotes
 from service.maps.calibration import ALIGNED, RUNS, by_itself, measure, remember, store
-from service.maps.calibration_preview import measured_of
+from service.maps.calibration_preview import measured_of, storable
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from service.places.map_events import tell_map
 from service.queries.histories.run_trials import RunTrials
@@ -125,12 +125,16 @@ def _offered(
     }
     if before is not None and after.brier >= before.brier:
         return told | {"outcome": "holds"}
+    try:
+        found = storable(report)
+    except CalibrationWorse as error:
+        return told | {"outcome": "holds", "detail": str(error)}
     replaces = map_.record.calibration
     by_person = replaces is not None and not by_itself(replaces)
     if map_.record.learning.calibration == "auto" and not by_person and witnessed:
         report = report.model_copy(update={"stored": True})
         try:
-            store(map_, report.calibration, replaces, None)
+            store(map_, found, replaces, None)
         except RevisionMismatch:
             return told | {"outcome": "holds"}
         remember(statistics, map_, report, asked)

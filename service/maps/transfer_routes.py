@@ -36,6 +36,7 @@ from service.maps.imports import Imports
 from service.maps.limits import check_new_map
 from service.maps.routes import show_map
 from service.maps.schemas import MapView
+from service.queries.answers import StatisticsDep
 from service.worker_threads import in_thread, to_its_end
 
 ExportsDep = Annotated[Exports, Depends(FromState("exports"))]
@@ -163,6 +164,7 @@ async def import_map(
     engine: EngineDep,
     jobs: JobsDep,
     imports: ImportsDep,
+    statistics: StatisticsDep,
     principal: PrincipalDep,
 ) -> Response:
     """Import a map that this or another service exported; it is listed only after all of it was checked.
@@ -200,7 +202,7 @@ async def import_map(
         return accepted(job, settings)
     await imports.build(received)
     map_ = await engine.map(received.map_id)
-    view = await in_thread(show_map, engine, map_, {})  # it has no queries yet
+    view = await in_thread(show_map, engine, statistics, map_, {})  # it has no queries yet
     headers = {
         "ETag": entity_tag(map_.record.revision),
         "Location": f"{settings.root_path}{router.prefix}/{received.map_id}",

@@ -84,7 +84,13 @@ class _Aliasing:
 
 
 def examine_health(
-    map_: Map, encoder: Encoder, statistics: Statistics, trends: TrendsView, seconds: float, limit: int
+    map_: Map,
+    encoder: Encoder,
+    statistics: Statistics,
+    trends: TrendsView,
+    calibration_doubt: str | None,
+    seconds: float,
+    limit: int,
 ) -> MapHealth:
     """Make the health report of a map.
 
@@ -92,6 +98,7 @@ def examine_health(
         encoder: the map's encoder.
         statistics: the counted answers of the map.
         trends: what the histories of its places tell.
+        calibration_doubt: why its own calibration is not to be trusted; None: nothing is known against it.
         seconds: how long to examine the map's frames; of a large map only a part is examined, spread over the map.
         limit: how many places, gaps and stretches are listed at most, each.
 
@@ -132,6 +139,7 @@ def examine_health(
         map=map_.record.id,
         places=len(own),
         complete=all_compared and aliasing.examined == len(aliasing.views),
+        calibration_doubt=calibration_doubt,
         answers=_answers(statistics),
         never_matched=_never_matched(own, aliasing.views, statistics, silent, enough, limit),
         aliasing=_aliasing_view(own, first, aliasing, statistics, limit),

@@ -31,6 +31,7 @@ from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
+from service.maps.calibration_preview import calibration_doubt
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.counts import Statistics
@@ -157,7 +158,8 @@ async def check_health(
     map_ = await engine.map(map_id)
     encoder = await engine.queue.load(map_.record.encoder)
     counted, trends = await in_thread(_counted, map_, statistics, options.limit)
-    examine = partial(examine_health, map_, encoder, counted, trends, options.seconds, options.limit)
+    doubt = await in_thread(calibration_doubt, statistics, map_)
+    examine = partial(examine_health, map_, encoder, counted, trends, doubt, options.seconds, options.limit)
     return await to_thread.run_sync(examine, limiter=one_at_a_time)
 
 

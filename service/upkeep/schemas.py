@@ -372,6 +372,7 @@ HEALTH_EXAMPLE: dict[str, Any] = {
     "map": "lab",
     "places": 111,
     "complete": True,
+    "calibration_doubt": None,
     "answers": {
         "since": "2026-11-01T08:00:00Z",
         "queries": 5120,
@@ -432,6 +433,9 @@ class MapHealth(BaseModel):
     map: str
     places: int
     complete: bool = Field(description="False if the time was up before all of the map was examined.")
+    calibration_doubt: str | None = Field(
+        description="Why the map's own calibration is not to be trusted; null: nothing is known against it."
+    )
     answers: AnswersView
     never_matched: SilentPlaces | None = Field(description="Null as long as the map has not been queried.")
     aliasing: AliasingView

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 from sqlalchemy import bindparam, select
 
-from core.errors import StorageFailure
+from core.errors import StorageFailure, UnknownFrame
 from core.geometry.keypoints import count_of
 from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import read_cameras
@@ -17,10 +19,11 @@ from core.ledger.maps.frames import ObjectReader
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.schema import SEQUENCES
 from core.ledger.statements import Statement
-from core.maps.archives.lines import written_line
-from core.maps.archives.manifest import ArchivedRecord
-from core.maps.archives.writing import ArchivedPlace, Chunks
+from core.maps.archives.lines import AnswerLine, written_line
+from core.maps.archives.manifest import MOST_PART_BYTES, ArchivedRecord
+from core.maps.archives.writing import ArchivedLabel, ArchivedPlace, Chunks
 from core.maps.records import MapRecord
+from core.maps.review import Review, ReviewFrame
 from core.maps.stored_fields import POSE_VALUES, moment_text
 from core.places import Pose
 
@@ -28,6 +31,8 @@ AT_ONCE = 64
 """Places whose pictures, keypoints or descriptors are in memory at a time."""
 
 LINES_AT_ONCE = 1024
+
+log = logging.getLogger(__name__)
 
 _NAMES = Statement(
     select(SEQUENCES.c.code, SEQUENCES.c.name).where(SEQUENCES.c.map == bindparam("map"), SEQUENCES.c.name.is_not(None))
@@ -39,13 +44,19 @@ class LedgerSource(ABC):
 
     Args:
         frame_bytes: the size of one place's descriptors, as the map stores them.
+        review: the frames of the map that are stored for review.
         objects: where pictures may be besides.
     """
 
     def __init__(
-        self, connection: MapConnection, record: MapRecord, frame_bytes: int, objects: ObjectReader | None = None
+        self,
+        connection: MapConnection,
+        record: MapRecord,
+        frame_bytes: int,
+        review: Review,
+        objects: ObjectReader | None = None,
     ) -> None:
-        self.connection, self._objects = connection, objects
+        self.connection, self._objects, self._review = connection, objects, review
         self.record, self.frame_bytes = ArchivedRecord.model_validate(record.model_dump()), frame_bytes
 
     @abstractmethod
@@ -68,6 +79,31 @@ class LedgerSource(ABC):
             if camera.value_range is None:  # which earlier versions do not know
                 del values["value_range"]
             yield written_line({"name": camera.name, **values, "updated_at": moment_text(camera.updated_at)})
+
+    @cached_property
+    def labels(self) -> Sequence[ArchivedLabel]:
+        """The labelled frames of the review that can be read, oldest first; of too many for a part the latest."""
+        found: list[ArchivedLabel] = []
+        size = 0
+        for frame in reversed(self._review.labelled()):
+            try:
+                length = len(self._review.picture(frame.number))
+            except (StorageFailure, UnknownFrame) as error:
+                log.warning("a labelled frame of %s is left out of its export: %s", self.record.id, error)
+                continue
+            if (size := size + length) >= MOST_PART_BYTES:
+                log.warning("the older labelled frames of %s do not fit into its export", self.record.id)
+                break
+            found.append(ArchivedLabel(_label_line(frame), frame.number, length))
+        return found[::-1]
+
+    def labelled(self) -> Iterator[bytes]:
+        """The files of these frames, in their order."""
+        for label in self.labels:
+            try:
+                yield self._review.picture(label.number)
+            except UnknownFrame as error:
+                raise StorageFailure("A labelled frame was thrown away meanwhile; export the map again.") from error
 
     def places(self) -> Iterator[ArchivedPlace]:
         """All places and looks in the order in which they were added."""
@@ -104,6 +140,22 @@ def pieces(group: Sequence[ArchivedPlace], size: int = AT_ONCE) -> Iterator[Sequ
     """A group in pieces of at most ``size`` places."""
     for first in range(0, len(group), size):
         yield group[first : first + size]
+
+
+def _label_line(frame: ReviewFrame) -> bytes:
+    """The line of a labelled frame."""
+    said = frame.label or {}
+    return written_line(
+        {
+            "at": moment_text(frame.at),
+            "bytes": frame.size,
+            "sha256": frame.digest.hex(),
+            "answer": {name: frame.answer[name] for name in AnswerLine.model_fields if name in frame.answer},
+            "label": said["label"],
+            "labelled_at": said["at"],
+            "labelled_by": said["by"],
+        }
+    )
 
 
 def _archived(

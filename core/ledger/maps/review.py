@@ -69,6 +69,7 @@ _PAGES = {
     False: Statement(_PAGE.where(_F.label.is_(None))),
 }
 _LABELLED = Statement(_READ.where(_F.label.is_not(None)).order_by(_F.number))
+_LABEL_SEALS = Statement(select(_F.number, _F.seal).where(_OF_MAP, _F.label.is_not(None)).order_by(_F.number))
 _ALL = Statement(_READ.order_by(_F.number))
 _FIND = Statement(_READ.where(_F.number == bindparam("number")))
 _SIZE = Statement(select(func.count(), func.coalesce(func.sum(_F.size), 0)).where(_OF_MAP))
@@ -153,25 +154,48 @@ class ReviewTable(ABC):
         with self._writing() as connection:
             if renew and (known := connection.one(_BY_DIGEST, digest=digest)) is not None:
                 return _renewed(connection, known, answer)
-            stored = self._picture_to_store(connection, data)
-            ((number,),) = connection.execute(_NEXT)
-            values = {
-                "number": number,
-                "at": moment_text(datetime.now(UTC)),
-                "digest": digest,
-                "size": len(data),
-                "answer": json.dumps(answer),
-                "label": None,
-                "object": stored.name if isinstance(stored, StoredObject) else None,
-            }
-            if not connection.execute(_PUT, **sealed(_COLUMNS, values)):
+            if not self._insert(connection, data, datetime.now(UTC), answer, None):
                 return False
-            if isinstance(stored, StoredObject):
-                self._put_object(stored, data)
-            else:
-                connection.execute(_PUT_PICTURE, number=number, bytes=data)
             self._drop_oldest(connection, setting)
         return True
+
+    def restore(self, data: bytes, at: datetime, answer: Mapping[str, Any], label: Mapping[str, Any]) -> bool:
+        """Store a labelled frame of an export file, under a new number, whatever the limits; False if it is there."""
+        with self._writing() as connection:
+            return self._insert(connection, data, at, answer, label)
+
+    def _insert(
+        self,
+        connection: MapConnection,
+        data: bytes,
+        at: datetime,
+        answer: Mapping[str, Any],
+        label: Mapping[str, Any] | None,
+    ) -> bool:
+        """Store a frame under the next number, unless the same file is stored already; whether it was."""
+        stored = self._picture_to_store(connection, data)
+        ((number,),) = connection.execute(_NEXT)
+        values = {
+            "number": number,
+            "at": moment_text(at),
+            "digest": hashlib.sha256(data).digest(),
+            "size": len(data),
+            "answer": json.dumps(answer),
+            "label": None if label is None else json.dumps(label),
+            "object": stored.name if isinstance(stored, StoredObject) else None,
+        }
+        if not connection.execute(_PUT, **sealed(_COLUMNS, values)):
+            return False
+        if isinstance(stored, StoredObject):
+            self._put_object(stored, data)
+        else:
+            connection.execute(_PUT_PICTURE, number=number, bytes=data)
+        return True
+
+    def labels_state(self) -> object:
+        """A value that is the same as long as no frame gets or loses a label."""
+        with self._reading() as connection:
+            return tuple(connection.execute(_LABEL_SEALS))
 
     def shrink(self, setting: ReviewSetting) -> None:
         with self._writing() as connection:

@@ -12,6 +12,7 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.frames.value_ranges import ValueRange
 from core.geometry.keypoints import MOST_STORED
+from core.judgement.verdict import Verdict
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
 from core.names import LONGEST, TEXT, composed
@@ -68,6 +69,72 @@ class CameraLine(_Line):
     intrinsics: Intrinsics | None
     value_range: ValueRange | None = None
     updated_at: Timestamp
+
+
+Word = Annotated[str, Field(max_length=4096)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Whole = Annotated[int, Field(ge=-LARGEST, le=LARGEST, strict=True)]
+
+
+class MatchLine(_Line):
+    """A match of an answer."""
+
+    place: Word
+    score: Finite
+
+
+class AnswerLine(_Line):
+    """How a frame was answered that is stored for review; of proposals and new ground nothing is said."""
+
+    verdict: Verdict
+    reason: Word | None = None
+    probability: Finite | None = None
+    score: Finite | None = None
+    decision: Finite | None = None
+    threshold: Finite | None = None
+    best: Word | None = None
+    matches: Annotated[list[MatchLine], Field(max_length=100)] = []
+    revision: Whole | None = None
+    camera: Word | None = None
+    session: Word | None = None
+    frame: Whole | None = None
+    file: Word | None = None
+    operation: Word | None = None
+    request_id: Word | None = None
+    key: Word | None = None
+    taken: Timestamp | None = None
+
+
+class ShownLine(_Line):
+    """What a labelled frame shows: a place, perhaps as a look of it, a new place, or none."""
+
+    place: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None = None
+    look: Annotated[str, Field(pattern=f"^{LOOK}$")] | None = None
+    new: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None = None
+    stranger: bool = False
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> Self:
+        if [self.place is not None, self.new is not None, self.stranger].count(True) != 1:
+            raise ValueError("a label says exactly one of place, new and stranger")
+        return self
+
+
+class LabelLine(_Line):
+    """A labelled frame of the review: its file is the next one among those of labelled frames.
+
+    at: the time of the query.
+    bytes, sha256: of the file.
+    labelled_at, labelled_by: when the label was given, and by which key.
+    """
+
+    at: Timestamp
+    bytes: Annotated[int, Field(ge=1, le=MOST_PICTURE_BYTES, strict=True)]
+    sha256: Digest
+    answer: AnswerLine
+    label: ShownLine
+    labelled_at: Timestamp
+    labelled_by: Word | None
 
 
 class Picture(_Line):
@@ -136,7 +203,14 @@ class PlaceLine(_Line):
 
 Kind = TypeVar("Kind", bound=_Line)
 
-_WITHIN: dict[str, type[BaseModel]] = {"pose": Pose, "picture": Picture, "mask": Mask, "intrinsics": Intrinsics}
+_WITHIN: dict[str, type[BaseModel]] = {
+    "pose": Pose,
+    "picture": Picture,
+    "mask": Mask,
+    "intrinsics": Intrinsics,
+    "answer": AnswerLine,
+    "label": ShownLine,
+}
 
 
 def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:

@@ -6,6 +6,8 @@ The file is a plain tar (ustar).  Its members, in this order:
     manifest.sha256             its SHA-256, as sha256sum writes it
     sequences.jsonl             a line per sequence: its name and the ordinal that its next place gets
     cameras.jsonl               a line per camera, with its mask
+    labels.jsonl                a line per labelled frame of the review; this and the next part are left out without any
+    labels.bin                  the files of these frames
     places-000001.jsonl         a line per place, in the order of enrolment
     descriptors-000001.bin      of the same places: descriptor and local descriptors as the map stores them,
                                 without anything between them
@@ -33,9 +35,13 @@ from core.names import TEXT
 from core.places import check_map_id
 
 FORMAT = "placerec map"
-VERSION = 2
+VERSION = 3
+WITHOUT_LABELS = 2
+"""The version of a file without labelled frames, which earlier versions of placerec read as well."""
+
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
+LABELS, LABELLED = "labels.jsonl", "labels.bin"
 GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"), ("keypoints", "bin"))
 """The parts of a group."""
 
@@ -83,13 +89,18 @@ class Manifest(BaseModel):
     parts: Annotated[list[ArchivePart], FailFast()]
 
     @property
+    def labels(self) -> Sequence[ArchivePart]:
+        """The lines and the files of labelled frames; none where there are no such frames."""
+        return self.parts[2:4] if self.version > WITHOUT_LABELS else []
+
+    @property
     def groups(self) -> int:
         """How many groups of places, descriptors, pictures and keypoints there are."""
-        return (len(self.parts) - 2) // len(GROUP_KINDS)
+        return (len(self.parts) - 2 - len(self.labels)) // len(GROUP_KINDS)
 
     def group(self, number: int) -> Sequence[ArchivePart]:
         """Places, descriptors, pictures and keypoints of group ``number``, counted from 0."""
-        first = 2 + number * len(GROUP_KINDS)
+        first = 2 + len(self.labels) + number * len(GROUP_KINDS)
         return self.parts[first : first + len(GROUP_KINDS)]
 
 
@@ -99,11 +110,8 @@ def group_names(number: int) -> list[str]:
 
 
 def written(manifest: Manifest) -> bytes:
-    """The manifest as bytes; equal manifests are always the same bytes.
-
-    The setting of frames stored for review is left out, as these frames are.
-    """
-    content = manifest.model_dump(mode="json", exclude={"map": {"review"}})
+    """The manifest as bytes; equal manifests are always the same bytes."""
+    content = manifest.model_dump(mode="json", exclude={"map": {"review"}} if manifest.map.review is None else None)
     return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
@@ -179,7 +187,7 @@ def read_manifest(text: bytes) -> Manifest:
         raise ArchiveTooNew(
             f"The file was written by a later version of placerec (format {version}, this one knows {VERSION})."
         )
-    if version < VERSION:
+    if version < WITHOUT_LABELS:
         raise InvalidArchive(
             f"The file was written before the first release of placerec (format {version}, this one knows {VERSION}): "
             "enrol its frames again."
@@ -201,11 +209,13 @@ def read_manifest(text: bytes) -> Manifest:
         check_map_id(manifest.map.id)
     except InvalidIdentifier as error:
         raise InvalidArchive(f"{MANIFEST}: {error}") from None
-    names = [SEQUENCES, CAMERAS]
+    names = [SEQUENCES, CAMERAS, *([LABELS, LABELLED] if version > WITHOUT_LABELS else [])]
     for number in range(max(0, manifest.groups)):
         names += group_names(number)
     if [part.name for part in manifest.parts] != names:
         raise InvalidArchive(f"{MANIFEST}: the parts are not those of a map, in their order.")
+    if len({part.rows for part in manifest.labels}) > 1:
+        raise InvalidArchive(f"{MANIFEST}: {LABELS} and {LABELLED} differ in the number of frames.")
     for number in range(manifest.groups):
         if len({part.rows for part in manifest.group(number)}) != 1:
             raise InvalidArchive(f"{MANIFEST}: the parts of group {number + 1} differ in the number of places.")

@@ -19,11 +19,14 @@ from core.errors import StorageFailure
 from core.maps.archives.manifest import (
     CAMERAS,
     FORMAT,
+    LABELLED,
+    LABELS,
     MANIFEST,
     MOST_MANIFEST_BYTES,
     SEAL,
     SEQUENCES,
     VERSION,
+    WITHOUT_LABELS,
     ArchivedRecord,
     ArchivePart,
     Manifest,
@@ -81,6 +84,15 @@ class ArchivedPlace:
     keypoints_bytes: int
 
 
+@dataclass(frozen=True, slots=True)
+class ArchivedLabel:
+    """The line of a labelled frame, its number in the store, and the size of its file in bytes."""
+
+    text: bytes
+    number: int
+    size: int
+
+
 class ArchiveSource(Protocol):
     """The content of a map at one moment; every method may raise StorageFailure and UnknownMap."""
 
@@ -97,6 +109,13 @@ class ArchiveSource(Protocol):
 
     def camera_lines(self) -> Iterator[bytes]:
         """The lines of cameras by name."""
+
+    @property
+    def labels(self) -> Sequence[ArchivedLabel]:
+        """The labelled frames of the review that can be read, oldest first."""
+
+    def labelled(self) -> Chunks:
+        """The files of these frames, in their order."""
 
     def places(self) -> Iterator[ArchivedPlace]:
         """All places in the order of their enrolment."""
@@ -144,13 +163,18 @@ def _planned(source: ArchiveSource) -> Manifest:
     for name, lines in ((SEQUENCES, source.sequence_lines()), (CAMERAS, source.camera_lines())):
         sizes = [len(line) for line in lines]
         parts.append(_unread(name, len(sizes), sum(sizes)))
-    places = 0
+    places, labels = 0, source.labels
+    if labels:
+        parts.append(_unread(LABELS, len(labels), sum(len(label.text) for label in labels)))
+        parts.append(_unread(LABELLED, len(labels), sum(label.size for label in labels)))
+    first = len(parts)
     for rows, text, pictures, records in _grouped(source):
         sizes = [text, rows * source.frame_bytes, pictures, records]
-        names = group_names((len(parts) - 2) // len(sizes))
+        names = group_names((len(parts) - first) // len(sizes))
         parts += [_unread(name, rows, size) for name, size in zip(names, sizes, strict=True)]
         places += rows
-    manifest = Manifest(format=FORMAT, version=VERSION, map=source.record, places=places, parts=parts)
+    version = VERSION if labels else WITHOUT_LABELS
+    manifest = Manifest(format=FORMAT, version=version, map=source.record, places=places, parts=parts)
     if len(written(manifest)) > MOST_MANIFEST_BYTES:
         more = f"{len(parts)} parts, which no import takes"
         raise StorageFailure(f"The map has too many places for one file: {more}.")
@@ -181,6 +205,10 @@ def _write(
         _write_part(file, sequences, source.sequence_lines()),
         _write_part(file, cameras, source.camera_lines()),
     ]
+    if planned.labels:
+        lines, files = planned.labels
+        parts.append(_write_part(file, lines, (label.text for label in source.labels)))
+        parts.append(_write_part(file, files, source.labelled()))
     every, done = source.places(), 0
     for number in range(planned.groups):
         places, frames, pictures, records = planned.group(number)

@@ -20,6 +20,8 @@ from core.storage.database.schema import connection_of
 from core.storage.database.segments import segment_entries
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from core.storage.opening import create_folder
+from core.storage.review import FILE as REVIEW_FILE
+from core.storage.review import ReviewFrames
 from core.storage.writing import AppendingWrite
 
 
@@ -61,8 +63,11 @@ def build(
             yield write
             write.finish()
 
+    review = ReviewFrames(folder / REVIEW_FILE, map_id, lambda: None)
     try:
-        importing = Importing(archive, layout, advance, check_picture, most_picture_bytes, writing, check_descriptors)
+        importing = Importing(
+            archive, layout, advance, check_picture, most_picture_bytes, writing, review, check_descriptors
+        )
         importing.fill()
         for (line,) in driver.execute("PRAGMA quick_check").fetchall():
             if line != "ok":
@@ -70,6 +75,7 @@ def build(
         if sum(segment.rows for segment in segment_entries(connection, layout)) != importing.rows:
             raise Damage(f"{FILE} does not record the rows that were written")
     finally:
+        review.close()
         driver.close()  # SQLite moves its log into the file and deletes it
     sync_file(folder / FILE)
     sync_folder(folder)

@@ -16,6 +16,7 @@ from core.errors import UnknownMap
 from core.ledger.maps import cameras, places
 from core.ledger.maps.archiving import LedgerSource, pieces
 from core.ledger.maps.connection import MapConnection, Reading
+from core.ledger.maps.review import ReviewTable
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.maps.records import MapRecord
 from core.storage.database.connections import FILE, read_now
@@ -35,6 +36,7 @@ class Exporter:
         reading: begins a transaction that reads it.
         opened: returns the open map, or None.
         guarded: turns errors of the disk in its block into ours, and quarantines the map if it is damaged.
+        review: the frames of the map that are stored for review.
     """
 
     def __init__(
@@ -43,13 +45,15 @@ class Exporter:
         reading: Reading,
         opened: Callable[[], OpenMap | None],
         guarded: Callable[[str], AbstractContextManager[None]],
+        review: ReviewTable,
     ) -> None:
         self._folder, self._reading, self._opened, self._guarded = folder, reading, opened, guarded
+        self._review = review
 
     def state(self) -> object | None:
         """An object that is the same as long as nothing is written to the map; None while the map is not open."""
         opened = self._opened()
-        return None if opened is None else opened.database.state
+        return None if opened is None else (opened.database.state, self._review.labels_state())
 
     def write(
         self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
@@ -69,7 +73,7 @@ class Exporter:
             for table, names in (("places", places.unsound(connection)), ("cameras", cameras.unsound(connection))):
                 if names:
                     raise Damage(f"{FILE}: {names[0]!r} of {table} does not match its checksum")
-            source = _Source(connection, state.record, self._folder, layout, self._expect_there)
+            source = _Source(connection, state.record, self._folder, layout, self._review, self._expect_there)
             return write_archive(source, path, advance, expect)
 
     def _files_retained(self) -> AbstractContextManager[None]:
@@ -89,9 +93,10 @@ class _Source(LedgerSource):
         record: MapRecord,
         folder: Path,
         layout: Layout,
+        review: ReviewTable,
         expect_there: Callable[[], None],
     ) -> None:
-        super().__init__(connection, record, layout.frame.itemsize)
+        super().__init__(connection, record, layout.frame.itemsize, review)
         self._expect_there, self._folder, self._layout = expect_there, folder, layout
 
     def expect_there(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from datetime import datetime
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +17,8 @@ from core.ledger.maps.cameras import put_camera
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
-from core.maps.archives.lines import CameraLine, PlaceLine, SequenceLine
+from core.ledger.maps.review import ReviewTable
+from core.maps.archives.lines import CameraLine, LabelLine, PlaceLine, SequenceLine
 from core.maps.archives.reading import Archive
 from core.maps.cameras import CameraRecord
 from core.maps.enrolling import CheckDescriptors, any_descriptors
@@ -53,6 +55,7 @@ class Importing(Unpacking):
 
     Args:
         writing: begins a write to the map.
+        review: where its labelled frames go.
         Others: as of :class:`core.storage.archives.unpacking.Unpacking`.
     """
 
@@ -64,10 +67,11 @@ class Importing(Unpacking):
         check_picture: CheckPicture,
         most_picture_bytes: int,
         writing: Callable[[], AbstractContextManager[ImportWrite]],
+        review: ReviewTable,
         check_descriptors: CheckDescriptors = any_descriptors,
     ) -> None:
         super().__init__(archive, layout, advance, check_picture, most_picture_bytes, check_descriptors)
-        self._writing = writing
+        self._writing, self._review = writing, review
         self.places = 0
         """Places that are stored, their looks apart."""
         self._codes: dict[str, int] = {}  # of sequences, by their names in the file
@@ -113,6 +117,17 @@ class Importing(Unpacking):
         if name != written:
             log.warning("sequence renamed", extra={"map": self.archive.manifest.map.id, "before": written, "now": name})
         return name
+
+    def put_label(self, line: LabelLine, picture: bytes) -> None:
+        told = line.answer.model_dump(exclude_unset=True)
+        answer = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in told.items()}
+        said = {
+            "label": line.label.model_dump(exclude_defaults=True),
+            "at": line.labelled_at.isoformat(),
+            "by": line.labelled_by,
+        }
+        if not self._review.restore(picture, line.at, answer, said):
+            raise InvalidArchive("A labelled frame is listed twice.")
 
     def put_places(self, lines: Sequence[PlaceLine], stored: NDArray[np.void], contents: Iterator[Content]) -> None:
         with self._writing() as write:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from core.errors import InvalidArchive, InvalidImage, InvalidKeypoints
 from core.geometry.keypoints import MOST_STORED, keypoints_of, record_bytes
-from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
+from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, LabelLine, PlaceLine, SequenceLine, read_line
 from core.maps.archives.manifest import ArchivePart, Manifest
 from core.maps.archives.reading import Archive, PartReader
 from core.maps.cameras import MOST_CAMERAS
@@ -31,6 +31,9 @@ TEXT_BYTES = 2 << 20
 
 MOST_PLACE_BYTES = 1 << 30
 """Most bytes of one descriptor with its local descriptors, as float32."""
+
+MOST_LABELS = 10_000
+"""Labelled frames of a map at most: as many as its setting allows it to keep for review."""
 
 LINES_BETWEEN = 1024
 """``advance``, which may end the work, is called after this number of lines of sequences."""
@@ -113,6 +116,10 @@ class Unpacking(ABC):
         """Store all sequences, then all cameras; each iterator is used up."""
 
     @abstractmethod
+    def put_label(self, line: LabelLine, picture: bytes) -> None:
+        """Store a labelled frame of the review."""
+
+    @abstractmethod
     def put_places(self, lines: Sequence[PlaceLine], frames: NDArray[np.void], contents: Iterator[Content]) -> None:
         """Store some places whole, or none of them.
 
@@ -131,6 +138,8 @@ class Unpacking(ABC):
         manifest = self.archive.manifest
         sequences, cameras = manifest.parts[:2]
         self.put_sequences_and_cameras(self._sequences(sequences), self._cameras(cameras))
+        if manifest.labels:
+            self._labels(*manifest.labels)
         for number in range(manifest.groups):
             self._group(*manifest.group(number))
         self.archive.check_end()
@@ -153,6 +162,16 @@ class Unpacking(ABC):
         for line, _ in _lines(reader, part, CameraLine):
             yield line
         reader.finish()
+
+    def _labels(self, part: ArchivePart, files: ArchivePart) -> None:
+        if part.rows > MOST_LABELS:
+            raise InvalidArchive(f"{part.name}: a map has at most {MOST_LABELS} labelled frames.")
+        reader, pictures = self.archive.part(part), self.archive.part(files)
+        for line, _ in _lines(reader, part, LabelLine):
+            self.put_label(line, self._checked(f"the labelled frame of {line.at}", line.bytes, line.sha256, pictures))
+            self.advance(0, self.archive.manifest.places)
+        reader.finish()
+        pictures.finish()
 
     def _group(self, places: ArchivePart, *more: ArchivePart) -> None:
         lines, *others = (self.archive.part(part) for part in (places, *more))
@@ -197,18 +216,22 @@ class Unpacking(ABC):
     def _picture(self, line: PlaceLine, images: PartReader) -> tuple[bytes, bytes] | None:
         if line.picture is None:
             return None
-        if line.picture.bytes > self._most_picture_bytes:
-            more = f"it has {line.picture.bytes} bytes of at most {self._most_picture_bytes}"
-            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {more}.")
-        content = images.read(line.picture.bytes)
-        digest = hashlib.sha256(content).digest()
-        if digest.hex() != line.picture.sha256:
-            raise InvalidArchive(f"The picture of place {line.id!r} does not match its SHA-256.")
+        content = self._checked(f"place {line.id!r}", line.picture.bytes, line.picture.sha256, images)
+        return content, bytes.fromhex(line.picture.sha256)
+
+    def _checked(self, of: str, size: int, sha256: str, images: PartReader) -> bytes:
+        """The next picture, if it may be stored."""
+        if size > self._most_picture_bytes:
+            more = f"it has {size} bytes of at most {self._most_picture_bytes}"
+            raise InvalidArchive(f"The picture of {of} cannot be taken: {more}.")
+        content = images.read(size)
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise InvalidArchive(f"The picture of {of} does not match its SHA-256.")
         try:
             self._check_picture(content)
         except InvalidImage as error:
-            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
-        return content, digest
+            raise InvalidArchive(f"The picture of {of} cannot be taken: {error}") from None
+        return content
 
     def _keypoints(self, line: PlaceLine, records: PartReader) -> bytes | None:
         if line.keypoints is None:

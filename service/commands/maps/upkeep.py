@@ -76,6 +76,8 @@ def health(
             f"{stop['frames']} frames of traverse {stop['sequence']} show one view, from place {stop['place']} "
             f"on: placerec maps prune {map_id} --yes deletes all but the first."
         )
+    if report["calibration_doubt"]:
+        remark(f"The map's own calibration is not to be trusted. {report['calibration_doubt']}")
     if not report["complete"]:
         remark("The time was up before the whole map was examined; --seconds gives it more.")
 

@@ -50,11 +50,17 @@ function GiveUp({ map, tag, changed, close }) {
   `;
 }
 
+/** What undoes the change of a map that was just answered: its calibration is put back whole, unless it was changed since. */
+function putBack(map, before, { revision }, changed, failed) {
+  const calibration = ofEncoder(before) ? null : { restore: before };
+  return () => patch(mapPath(map), { calibration }, `"${revision}"`).then(changed, failed);
+}
+
 /** Store what a dry run has found: at once, or by the map's name where it replaces a calibration of the map's own. */
 function Store({ map, data, tag, own, changed, close }) {
   const send = async () => {
-    await patch(mapPath(map), { calibration: { measured_at: data.measured.at } }, tag);
-    say("The calibration was stored.", own ? undefined : () => patch(mapPath(map), { calibration: null }).then(changed, complain));
+    const edited = await patch(mapPath(map), { calibration: { measured_at: data.measured.at } }, tag);
+    say("The calibration was stored.", putBack(map, data.calibration, edited, changed, complain));
     changed();
   };
   const action = "Store the calibration";
@@ -77,11 +83,12 @@ function Change({ data: { calibration, measured, now, proposed } }) {
 function State({ map, data, tag, changed, giveUp, storeIt }) {
   const { calibration, measured } = data;
   const proposes = data.proposed && JSON.stringify(measured.report.calibration) !== JSON.stringify(calibration);
+  const worse = measured?.report.change?.worse;
   return html`
     ${proposes && html`
-      <section class="notice good spread" aria-label="Dry run">
-        <p><${Change} data=${data} /> Nothing was stored.</p>
-        ${may("admin") && html`<button type="button" class="primary" onClick=${storeIt}>Store it</button>`}
+      <section class=${worse ? "notice spread" : "notice good spread"} aria-label="Dry run">
+        <p><${Change} data=${data} /> Nothing was stored${worse ? html`, and it cannot be: ${worse}` : "."}</p>
+        ${may("admin") && !worse && html`<button type="button" class="primary" onClick=${storeIt}>Store it</button>`}
       </section>
     `}
     <div class="columns">
@@ -117,11 +124,20 @@ function Measured({ measured }) {
         ["Area under ROC", decimal(found.auc_roc)],
         ["Cross-validated precision", share(found.cross_validated.precision)],
         ["Cross-validated recall", share(found.cross_validated.recall)],
+        ...changeRows(report.change),
         ["Brier score", html`${decimal(found.cross_validated.reliability.brier)} <span class="faint">base rate ${decimal(found.cross_validated.reliability.brier_of_base_rate)}</span>`],
       ]} />
       ${report.warnings.map((one) => html`<p class="notice">${one}</p>`)}
     </section>
   `;
+}
+
+/** What becomes of answers that had no part in it, of either kind. */
+function changeRows(change) {
+  return [["Known places", change?.known], ["Strangers", change?.strangers]].filter(([, one]) => one).map(([name, { answers, before, after }]) => [
+    `${name}, held out`,
+    html`probability ${decimal(before.probability)} → ${decimal(after.probability)}, error ${decimal(before.error)} → ${decimal(after.error)} <span class="faint">${integer(answers)} answers</span>`,
+  ]);
 }
 
 function share({ value, low, high }) {
@@ -152,11 +168,9 @@ function Threshold({ map, data, tag, changed }) {
   const same = threshold === calibration.threshold && margin === calibration.margin;
   const apply = async () => {
     setError(null);
-    const before = { threshold: calibration.threshold, margin: calibration.margin };
-    const fallback = ofEncoder(calibration) ? null : before;
     try {
-      await patch(mapPath(map), { calibration: { threshold, margin } }, tag);
-      say("The threshold was applied.", () => patch(mapPath(map), { calibration: fallback }).then(changed, setError));
+      const edited = await patch(mapPath(map), { calibration: { threshold, margin } }, tag);
+      say("The threshold was applied.", putBack(map, calibration, edited, changed, setError));
       changed();
     } catch (problem) {
       setError(problem);

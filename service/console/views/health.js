@@ -29,6 +29,7 @@ function Report({ map, data }) {
   const { answers, never_matched: silent, aliasing, gaps, gap_count: gapCount, gap_counts: byMeasure, retraverse, complete } = data;
   return html`
     ${!complete && html`<p class="notice">The map is large: a sample of ${integer(aliasing.examined)} of its ${integer(aliasing.of)} places was examined in the time there was.</p>`}
+    ${data.calibration_doubt && html`<p class="notice">The map's own calibration is not to be trusted. ${data.calibration_doubt} <a href=${href("maps", map, "calibration")}>Calibrate it again, or go back to the encoder's</a></p>`}
     ${data.shared_routes.map((one) => html`<${OneRoute} map=${map} route=${one} />`)}
     <${Trends} map=${map} trends=${data.trends} />
     <div class="columns">

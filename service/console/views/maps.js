@@ -122,6 +122,7 @@ function health(map) {
   if (map.calibration.source === "encoder-default") {
     return { word: "not calibrated", tone: "", why: "It uses its encoder's thresholds." };
   }
+  if (map.calibration_doubt) return { word: "badly calibrated", tone: "warn", why: map.calibration_doubt };
   const calibrated = `Calibrated by ${map.calibration.source}`;
   if (total < 20) return { word: "calibrated", tone: "", why: `${calibrated}; too few answers of the last day to say how good they are.` };
   if (day.recognized / total < 0.5) return { word: "in doubt", tone: "warn", why: `${calibrated}; less than half of the answers of the last day were recognized.` };

@@ -328,16 +328,66 @@ def test_without_strangers_the_threshold_does_not_fall(target: Target | None) ->
     assert adjust_calibration(ten, base, "labels", target).calibration.threshold < base.threshold
 
 
-def test_answers_without_their_place_keep_strangers_from_becoming_likely() -> None:
-    """Known places alone say that all is right; the same frames asked without their places say what strangers get."""
-    base, surely = BASE.model_copy(update={"curve": LAW}), Curve(slope=60, intercept=20)
-    both, held_out = drawn(150, surely), drawn(1000, surely, seed=1)
-    alone = both.take(both.known)
-    stated = {}
-    for name, some in (("alone", alone), ("both", both)):
-        found = adjust_calibration(some, base, "runs", PRECISE).calibration
-        stated[name] = held_out.probabilities(found)[~held_out.known].mean()
-    assert stated["both"] < 0.5 * stated["alone"]
+def labels(known: int, strangers: int, right: int) -> Trials:
+    """Doubtful frames: of places of the map, of which so many are answered rightly, and strangers."""
+    count = known + strangers
+    shows = np.arange(count) < known
+    return Trials(
+        np.linspace(0.04, 0.1, count), np.full(count, np.inf), shows, np.arange(count) < right, np.arange(count)
+    )
+
+
+TIMID = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-8), "geometry": TERMS})
+"""It states less than is true of places that the map has."""
+
+
+@pytest.mark.parametrize(
+    ("asked", "rises", "falls"),
+    [
+        (labels(10, 0, right=10), False, False),
+        (labels(10, 2, right=10), False, False),
+        (labels(200, 0, right=200), False, False),
+        (labels(10, 0, right=0), False, True),
+        (labels(0, 10, right=0), False, False),
+        (labels(2, 30, right=2), False, False),
+        (labels(10, 3, right=10), True, False),
+    ],
+)
+@pytest.mark.parametrize("evidence", [np.nan, 12.0])
+@pytest.mark.parametrize("target", [None, PRECISE])
+def test_labels_of_one_kind_make_no_answer_likelier(
+    asked: Trials, rises: bool, falls: bool, evidence: float, target: Target | None
+) -> None:
+    """Ten right answers to known places tell nothing of strangers, and ten strangers nothing of known places."""
+    asked = replace(asked, evidence=np.full(len(asked), evidence))
+    found = adjust_calibration(asked, TIMID, "labels", target).calibration
+    scores = np.linspace(-0.2, 0.4, 61)
+    for verified in (np.nan, 0.0, 12.0, 60.0):
+        any_answer = Trials(
+            scores, np.full(61, np.inf), scores > 9, scores > 9, np.arange(61), evidence=np.full(61, verified)
+        )
+        before, after = (any_answer.probabilities(one) for one in (TIMID, found))
+        assert bool((after > before + 1e-9).any()) == rises
+        if falls or not rises:
+            assert bool((after < before - 1e-6).any()) == falls
+    if not rises:
+        assert found.threshold >= TIMID.threshold - 1e-9
+
+
+def test_labels_of_one_kind_keep_the_calibration_in_force() -> None:
+    present = TIMID.model_copy(update={"curve": LAW, "threshold": 0.13, "source": "sequence:tuesday"})
+    kept = adjust_calibration(labels(10, 0, right=10), TIMID, "labels", present=present).calibration
+    assert (kept.curve, kept.source) == (LAW, "labels") and kept.threshold == pytest.approx(0.13)
+    both = adjust_calibration(labels(10, 10, right=10), TIMID, "labels", present=present).calibration
+    assert both == adjust_calibration(labels(10, 10, right=10), TIMID, "labels").calibration, "labels move the base"
+
+
+def test_known_places_alone_are_no_calibration() -> None:
+    """Right and wrong answers to places of the map, and no stranger: nothing is fitted to them."""
+    known = drawn(300).take(drawn(300).known)
+    assert 10 < known.right.sum() < len(known) - 10
+    with pytest.raises(CalibrationImpossible, match="here are 300 and 0"):
+        fit_map_calibration(known, BASE, PRECISE, "frames")
 
 
 @pytest.mark.thorough

@@ -349,7 +349,8 @@ class StoreContract(RuleBasedStateMachine):
         unlabelled = [frame.number for frame in kept if frame.label is None]
         assert unlabelled == sorted(unlabelled, reverse=True)
         latest = kept[0]
-        assert review.label(latest.number, {"place": "p1"}).label == {"place": "p1"}
+        said = {"label": {"place": "p1"}, "at": "2026-11-28T10:00:00.500000+00:00", "by": None}
+        assert review.label(latest.number, said).label == said
         assert latest.number in [frame.number for frame in self.map.review.labelled()]
         assert sha256(self.map.review.picture(latest.number)).digest() == latest.digest
         assert (page.count, page.size) == (len(kept), sum(frame.size for frame in kept))

@@ -131,7 +131,7 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     page.get_by_role("status").get_by_role("button", name="Undo").wait_for(state="detached")
     admin.settle()
     after = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
-    assert after["threshold"] == pytest.approx(before["threshold"])
+    assert after == before, "its source, its curve and what it rests on are back as well"
 
 
 @pytest.mark.thorough

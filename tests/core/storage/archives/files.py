@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from core import maps
+from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.manifest import seal_of
 from core.maps.archives.reading import Archive
 from core.maps.archives.tar_layout import header, padded
@@ -93,8 +94,10 @@ def _peak() -> int:
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
 
 
-def imported(atlas: Atlas, path: Path, map_id: str, rows_per_segment: int = 4) -> Map:
+def imported(
+    atlas: Atlas, path: Path, map_id: str, rows_per_segment: int = 4, most_picture_bytes: int = MOST_PICTURE_BYTES
+) -> Map:
     """The map of a file, listed."""
     with Archive(path) as archive, atlas.building(map_id) as folder:
-        build(archive, folder, map_id, rows_per_segment)
+        build(archive, folder, map_id, rows_per_segment, most_picture_bytes=most_picture_bytes)
     return atlas.get(map_id)

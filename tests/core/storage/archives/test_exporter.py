@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.ledger.maps.connection import MapConnection
-from core.maps import MapSettings
+from core.maps import MapSettings, ReviewSetting
 from core.maps.archives import writing
 from core.places import Neighborhood
 from core.storage import Atlas, Map
@@ -28,6 +29,10 @@ from tests.core.storage.test_opening import flip
 
 def listed(map_: Map) -> list[object]:
     return [map_.places(None, 100), map_.sequences(None, 100), map_.cameras.all(), map_.transfer.sequence_ends()]
+
+
+def label(map_: Map, **shown: object) -> object:
+    return map_.review.label(1, {"label": shown, "at": "2026-11-28T10:00:00+00:00", "by": "ann"})
 
 
 def same_place(map_: Map, place_id: str) -> list[str]:
@@ -193,12 +198,16 @@ def test_the_state_changes_with_every_write(full: Map) -> None:
         lambda: full.forget("z"),
         lambda: full.cameras.put("rear", None),
         lambda: full.edit({"description": "other"}),
+        lambda: full.review.keep(b"shown", {"verdict": "unknown"}, ReviewSetting()) and label(full, stranger=True),
+        lambda: label(full, place="a"),
+        lambda: full.review.label(1, None),
     ):
         write()
         seen.append(full.exporter.state())
-    assert len(set(map(id, seen))) == len(seen)
+    assert all(one != other for one, other in pairwise(seen))
     full.snapshot()
-    assert full.exporter.state() is seen[-1]
+    full.review.keep(b"another", {"verdict": "unknown"}, ReviewSetting())
+    assert full.exporter.state() == seen[-1], "a frame without a label is not exported"
 
 
 def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,7 +253,7 @@ def test_an_older_version_is_refused_with_what_to_do(content: bytes, tmp_path: P
     with pytest.raises(InvalidArchive) as error, Archive(path):
         pass
     assert str(error.value) == (
-        "The file was written before the first release of placerec (format 1, this one knows 2): enrol its frames "
+        "The file was written before the first release of placerec (format 1, this one knows 3): enrol its frames "
         "again."
     )
 
