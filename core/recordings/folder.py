@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from core.errors import InvalidRecording, InvalidTraverse
+from core.errors import InvalidImage, InvalidRecording, InvalidTraverse
+from core.frames.containers import read_header, read_structure
 from core.frames.traverses import find_images
 from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
 from core.recordings.frame import RecordedFrame, make_id
@@ -19,6 +20,8 @@ from core.recordings.pictures import sendable
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 COLUMNS = ("file", "id", *POSE, "timestamp")
+JPEG, LONGEST_HEAD = b"\xff\xd8\xff", 128 << 10
+"""The first bytes of a JPEG file, and how many are read for its EXIF data, of which there are 64 KiB at most."""
 
 
 class _Row(BaseModel):
@@ -63,10 +66,11 @@ def folder_frames(directory: Path, prefix: str = "") -> tuple[list[RecordedFrame
         if left_out:
             remarks.append(f"{left_out} images of {directory} are not listed in {FILE_NAME} and are left out.")
     else:
-        found = [
-            _Found(path, RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
+        frames = {
+            path: RecordedFrame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True)
             for path in find_images(directory)
-        ]
+        }
+        found = [_Found(path, _described(path, frame)) for path, frame in frames.items()]
     _check_ids(found)
     return [one.frame for one in found], remarks
 
@@ -102,6 +106,19 @@ def _check_ids(found: list[_Found]) -> None:
 def picture_frame(path: Path) -> RecordedFrame:
     """A single image file as a frame; its pose and time are those of its EXIF data."""
     return RecordedFrame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
+
+
+def _described(path: Path, frame: RecordedFrame) -> RecordedFrame:
+    """A frame with the pose and the time of a JPEG file whose beginning has them all; any other one as it is."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(LONGEST_HEAD)
+        if not head.startswith(JPEG):
+            return frame
+        read_structure(head, read_header(head))
+    except (OSError, InvalidImage):
+        return frame
+    return frame.described(head, with_zeros=True)
 
 
 def read_picture(path: Path) -> bytes:
