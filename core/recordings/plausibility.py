@@ -31,6 +31,8 @@ MOST_OF_NOISE = 50_000
 """Samples by which the noise is measured."""
 JITTER = 0.1
 """Seconds by which stamps may be off, for messages that have queued come at once."""
+WHOLE_SECONDS = 1.0
+"""Seconds by which stamps may be off that are all whole."""
 BASELINE = 0.5
 """Seconds over which the speed before a sample is measured, at least."""
 
@@ -83,6 +85,11 @@ class Judgement:
     part: Integers
     segment: Integers
     remarks: list[str] = field(default_factory=list)
+
+
+def jitter_of(nanoseconds: ArrayLike) -> float:
+    """Seconds by which times may be off that somebody has written down: int64 [n], maybe whole seconds."""
+    return JITTER if (np.asarray(nanoseconds, np.int64) % NANOSECONDS).any() else WHOLE_SECONDS
 
 
 def judge(

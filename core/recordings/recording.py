@@ -16,7 +16,7 @@ from core.recordings.bag import Bag, bag_files
 from core.recordings.folder import folder_frames
 from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id
 from core.recordings.messages import IMAGE_TYPES
-from core.recordings.plausibility import MOST_SPEED, Source, judge
+from core.recordings.plausibility import MOST_SPEED, Source, jitter_of, judge
 from core.recordings.trajectory import JudgedTrajectory
 from core.recordings.trajectory_files import read_trajectory
 from core.recordings.video import SUFFIXES as VIDEOS
@@ -24,8 +24,6 @@ from core.recordings.video import Video
 
 LARGEST_GAP = 1.5
 """Seconds between two known poses between which a pose is interpolated; a satellite receiver gives one a second."""
-LIST_JITTER = 1.0
-"""Seconds by which times of a list or of EXIF data may be off, which are often whole ones."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +261,7 @@ def _judge_poses(recording: Recording, most_speed: float) -> None:
             geographic=kind == "geographic",
             absolute=True,
             most_speed=most_speed,
-            jitter=LIST_JITTER,
+            jitter=jitter_of(times),
         )
         for at in np.array(numbers)[~judgement.kept].tolist():
             frames[at] = replace(frames[at], pose=None)
