@@ -36,6 +36,9 @@ SAME_VIEW = 3
 A frame is put there only if its pose is no farther from that of the first frame there.  It is more than 1 because the
 poses of one stop may be coarse."""
 
+NO_FIX = 1e-6
+"""Degrees: what a receiver without a fix writes is latitude 0 and longitude 0, to so much."""
+
 NO_TIME = -(1 << 63)
 """The timestamp of a place without one."""
 
@@ -184,6 +187,12 @@ def check_coordinates(known: Collection[PoseKind], kind: PoseKind, subject: str)
             f"{subject} has {COORDINATES[kind]}, and the places of the map have {COORDINATES[there]}: a map has one "
             "kind. Convert them, or use another map."
         )
+
+
+def is_no_fix(latitude: ArrayLike, longitude: ArrayLike) -> NDArray[np.bool_]:
+    """Whether positions in degrees are what a receiver without a fix writes."""
+    found: NDArray[np.bool_] = np.abs(np.asarray(latitude)) <= NO_FIX
+    return found & (np.abs(np.asarray(longitude)) <= NO_FIX)
 
 
 def _utc(moment: datetime) -> datetime:

@@ -19,7 +19,7 @@ from datetime import UTC, date, datetime, time, timedelta, timezone
 from pydantic import ValidationError
 
 from core.frames.containers import find_exif
-from core.places import Pose
+from core.places import Pose, is_no_fix
 
 Value = bytes | tuple[int, ...] | tuple[float, ...]
 """The value of a tag: text, whole numbers, or fractions."""
@@ -50,7 +50,7 @@ def read_orientation(block: bytes | None) -> int:
     return int(value[0]) if value and value[0] in range(1, 9) else 1
 
 
-def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
+def read_pose_and_time(data: bytes, with_zeros: bool = False) -> tuple[Pose | None, datetime | None]:
     """The pose and the time that an image file was taken at, by its metadata; None for either that is missing.
 
     The pose is in degrees (WGS 84).  Its heading is the image direction if that is relative to true north; a magnetic
@@ -59,6 +59,7 @@ def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
 
     Args:
         data: a JPEG, PNG or WebP file; other bytes have no metadata.
+        with_zeros: whether latitude 0, longitude 0 is a pose, too, and not what is written without a fix.
     """
     block = find_exif(data)
     if block is None:
@@ -66,7 +67,10 @@ def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
     root = _folder(block, _first_folder(block))
     gps = _folder(block, _offset(root.get(_GPS_FOLDER)))
     clock = _folder(block, _offset(root.get(_EXIF_FOLDER)))
-    return _pose(gps), _clock_time(clock) or _satellite_time(gps)
+    pose = _pose(gps)
+    if pose is not None and not with_zeros and is_no_fix(pose.latitude or 0.0, pose.longitude or 0.0):
+        pose = None
+    return pose, _clock_time(clock) or _satellite_time(gps)
 
 
 def _first_folder(block: bytes) -> int:

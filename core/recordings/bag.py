@@ -32,11 +32,12 @@ from core.recordings.messages import (
     pose_of,
     transforms_of,
 )
+from core.recordings.plausibility import MOST_SPEED, Source
 from core.recordings.ros1_storage import Ros1Storage
 from core.recordings.sqlite_storage import SqliteStorage
 from core.recordings.storage import Entry, Storage, Topic
-from core.recordings.trajectory import Trajectory
-from core.recordings.transforms import TransformTree
+from core.recordings.trajectory import JudgedTrajectory
+from core.recordings.transforms import TransformTree, is_absolute
 
 STORAGES: dict[str, type[SqliteStorage] | type[McapStorage] | type[Ros1Storage]] = {
     ".db3": SqliteStorage,
@@ -335,8 +336,13 @@ class Bag:
                 tree.add(transforms_of(data, topic.kind, topic.coding or "cdr", topic.schema), entry.received)
         return tree
 
-    def trajectory(self, name: str, fixed: str | None = None, moving: str | None = None) -> Trajectory:
+    def trajectory(
+        self, name: str, fixed: str | None = None, moving: str | None = None, most_speed: float = MOST_SPEED
+    ) -> JudgedTrajectory:
         """The path by the poses of a topic; of transforms, that of the frame ``moving`` in ``fixed``.
+
+        Args:
+            most_speed: metres a second; no vehicle is faster.
 
         Raises:
             UnknownTopic: the bag has no such topic of poses.
@@ -346,10 +352,10 @@ class Bag:
         if self.topics[name].kind in TRANSFORM_TYPES:
             if not moving:
                 raise InvalidTrajectory("The pictures name no frame of a camera: name one with --moving-frame.")
-            return self.transforms().trajectory(fixed, moving)
+            return self.transforms().trajectory(fixed, moving, name, most_speed)
         if fixed is not None or moving is not None:
             raise InvalidTrajectory(f"{name} has poses and no transforms: leave out --fixed-frame and --moving-frame.")
-        times, places, turns, idle = [], [], [], 0
+        times, poses, idle = [], [], list[int]()
         for file, entry in self._entries(name):
             storage = self._files[file][1]
             topic = storage.topics[name]
@@ -357,16 +363,30 @@ class Bag:
                 data = storage.read(entry.key)
             pose = pose_of(data, topic.kind, topic.coding or "cdr", topic.schema)
             if pose is None:
-                idle += 1
+                idle.append(entry.stamp or entry.received)
                 continue
             times.append(entry.stamp or entry.received)
-            places.append(pose[0])
-            turns.append(pose[1])
+            poses.append(pose)
         if idle:
-            self.remarks.append(f"{idle} messages of {name} have no position (no fix) and are left out.")
+            self.remarks.append(
+                f"{len(idle)} messages of {name} have no position (no fix; first at {min(idle) / NANOSECONDS:.3f} s) "
+                "and are left out."
+            )
         if not times:
             raise InvalidTrajectory(f"No message of {name} has a position.")
-        return Trajectory.of_samples(times, places, turns, self.topics[name].kind in FIXES)
+        publishers, publisher = np.unique([f"{pose.frame} {pose.child}" for pose in poses], return_inverse=True)
+        usual = str(publishers[np.argmax(np.bincount(publisher))]).partition(" ")[0]
+        of_satellites = self.topics[name].kind in FIXES
+        return JudgedTrajectory.of_samples(
+            times,
+            np.array([pose.position for pose in poses]),
+            np.array([pose.turn for pose in poses]),
+            Source(name),
+            of_satellites,
+            of_satellites or is_absolute(usual),
+            most_speed,
+            publisher,
+        )
 
     def all_remarks(self) -> list[str]:
         """All remarks, those about damaged files first."""

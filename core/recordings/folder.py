@@ -14,7 +14,8 @@ from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
-from core.errors import InvalidRecording, InvalidTraverse
+from core.errors import InvalidImage, InvalidRecording, InvalidTraverse
+from core.frames.containers import read_header, read_structure
 from core.frames.traverses import find_images
 from core.names import composed
 from core.numerals import check_numeral
@@ -26,6 +27,8 @@ from core.recordings.pose_names import NamedPose, named_pose
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 COLUMNS = ("file", "id", *POSE, "timestamp")
+JPEG, LONGEST_HEAD = b"\xff\xd8\xff", 128 << 10
+"""The first bytes of a JPEG file, and how many are read for its EXIF data, of which there are 64 KiB at most."""
 
 
 _Cell = Annotated[float, BeforeValidator(lambda text: check_numeral(text.removeprefix("+")))]
@@ -76,7 +79,8 @@ def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> 
     else:
         images = find_images(directory)
         poses = _named_poses(images, by_names, remarks)
-        found = [_Found(path, _frame(path, prefix, pose)) for path, pose in zip(images, poses, strict=True)]
+        frames = [_frame(path, prefix, pose) for path, pose in zip(images, poses, strict=True)]
+        found = [_Found(path, _described(path, frame)) for path, frame in zip(images, frames, strict=True)]
     _check_ids(found)
     return [one.frame for one in found], remarks
 
@@ -151,6 +155,19 @@ def _check_ids(found: list[_Found]) -> None:
 def picture_frame(path: Path) -> RecordedFrame:
     """A single image file as a frame; its pose and time are those of its EXIF data."""
     return RecordedFrame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
+
+
+def _described(path: Path, frame: RecordedFrame) -> RecordedFrame:
+    """A frame with the pose and the time of a JPEG file whose beginning has them all; any other one as it is."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(LONGEST_HEAD)
+        if not head.startswith(JPEG):
+            return frame
+        read_structure(head, read_header(head))
+    except (OSError, InvalidImage):
+        return frame
+    return frame.described(head, with_zeros=True)
 
 
 def read_picture(path: Path) -> bytes:

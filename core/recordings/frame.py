@@ -28,6 +28,7 @@ class RecordedFrame:
     timestamp: when it was taken, UTC; None if not known, as for a video.
     embedded: whether the timestamp, and the pose unless there is one, are those of the EXIF data of its bytes, which
         ``described`` reads.
+    segment: from 1: a part of its recording, which is a traverse of its own, for its coordinates are.
     """
 
     id: str
@@ -37,16 +38,18 @@ class RecordedFrame:
     timestamp: datetime | None = None
     nanoseconds: int | None = None
     embedded: bool = False
+    segment: int = 1
 
-    def described(self, data: bytes | None = None) -> RecordedFrame:
+    def described(self, data: bytes | None = None, with_zeros: bool = False) -> RecordedFrame:
         """The frame with the pose and the time in its bytes, if that is where they are.
 
         Args:
             data: its bytes, if they are at hand; otherwise they are loaded.
+            with_zeros: as of ``read_pose_and_time``.
         """
         if not self.embedded:
             return self
-        pose, timestamp = read_pose_and_time(self.load() if data is None else data)
+        pose, timestamp = read_pose_and_time(self.load() if data is None else data, with_zeros)
         taken = None if timestamp is None else 1000 * microseconds(timestamp)
         pose = pose if self.pose is None else self.pose
         return replace(self, pose=pose, timestamp=timestamp, nanoseconds=taken, embedded=False)

@@ -61,8 +61,6 @@ STAMP_BYTES = 16
 """The first bytes of a message of ROS, in which its stamp is."""
 WHOLE: tuple[Coding, ...] = ("protobuf", "json")
 """Codings whose stamps may be anywhere in a message."""
-PositionAndTurn = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Float64 [3], and the quaternion x, y, z, w, float64 [4]."""
 MOST_SCHEMAS = 64
 """Schemas of protobuf that are held ready."""
 
@@ -184,20 +182,32 @@ def _either(message: Any, name: str) -> Any:
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
 
 
-def pose_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> PositionAndTurn | None:
-    """The position and the orientation in a message of ``POSE_TYPES`` that is none of ``TRANSFORM_TYPES``.
+class PoseSaid(NamedTuple):
+    """The pose in a message.
 
-    Returns:
-        float64 [3], metres, or latitude and longitude in degrees and the height above the ellipsoid, NaN if it is not
-        known; and float64 [4], the quaternion x, y, z, w, NaN where it is not known.  None if the message has no
-        position: it has no fix, or numbers that are not finite.
+    position: float64 [3], metres, or latitude and longitude in degrees and the height above the ellipsoid, NaN if it is
+        not known; numbers are as they are written, also if they are none.
+    turn: float64 [4], the quaternion x, y, z, w, NaN where it is not known.
+    frame, child: the names of the frame in which the pose is, and of the frame whose pose it is; empty if not named.
+    """
+
+    position: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    frame: str
+    child: str
+
+
+def pose_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> PoseSaid | None:
+    """The pose in a message of ``POSE_TYPES`` that is none of ``TRANSFORM_TYPES``; None if it states to have no fix.
 
     Raises:
         InvalidRecording: the message is damaged.
     """
     message = _decoded(data, kind, coding, schema)
     try:
-        return _fix_in(message) if kind in FIXES else _pose_in(message)
+        found = _fix_in(message) if kind in FIXES else _pose_in(message)
+        frame = str(getattr(message.header if hasattr(message, "header") else message, "frame_id", ""))
+        return found and PoseSaid(*found, frame.removeprefix("/"), str(getattr(message, "child_frame_id", "")))
     except (AttributeError, TypeError, ValueError) as error:
         raise InvalidRecording(f"A message is damaged: it is no {kind}.") from error
 
@@ -205,27 +215,24 @@ def pose_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> Posi
 UNKNOWN_TURN = (math.nan,) * 4
 
 
-def _fix_in(message: Any) -> PositionAndTurn | None:
+def _fix_in(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     altitude = float(message.altitude)
     stated = math.isfinite(altitude) and altitude != 0.0  # what was left out reads as 0
     place = np.array([float(message.latitude), float(message.longitude), altitude if stated else math.nan])
     has_fix = not hasattr(message, "status") or message.status.status >= 0
-    usable = has_fix and np.isfinite(place[:2]).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180
-    return (place, np.array(UNKNOWN_TURN)) if usable else None
+    return (place, np.array(UNKNOWN_TURN)) if has_fix else None
 
 
-def _pose_in(message: Any) -> PositionAndTurn | None:
+def _pose_in(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     position = np.array([float(getattr(pose.position, axis)) for axis in "xyz"])
-    if not np.isfinite(position).all():
-        return None
     return position, unit_turn([float(getattr(pose.orientation, axis)) for axis in "xyzw"])
 
 
 def unit_turn(numbers: Sequence[float]) -> NDArray[np.float64]:
     """A quaternion x, y, z, w of length 1, float64 [4]; NaN if the numbers are none."""
     turn = np.array(numbers, np.float64)
-    length = float(np.linalg.norm(turn))
+    length = math.hypot(*turn.tolist())
     return turn / length if math.isfinite(length) and length > 1e-6 else np.array(UNKNOWN_TURN)
 
 
@@ -234,7 +241,7 @@ class Transform(NamedTuple):
 
     stamp: nanoseconds; 0 if there is none.
     moved: float64 [3], metres.
-    turned: float64 [4], the quaternion x, y, z, w.
+    turned: float64 [4], the quaternion x, y, z, w; NaN if it is none.
     """
 
     parent: str
@@ -245,7 +252,7 @@ class Transform(NamedTuple):
 
 
 def transforms_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -> list[Transform]:
-    """The transforms of a message of ``TRANSFORM_TYPES``; those whose numbers are none are left out.
+    """The transforms of a message of ``TRANSFORM_TYPES``, also those whose numbers are none.
 
     Raises:
         InvalidRecording: the message is damaged.
@@ -253,10 +260,9 @@ def transforms_of(data: bytes, kind: str, coding: Coding, schema: bytes = b"") -
     message = _decoded(data, kind, coding, schema)
     try:
         listed = [message] if kind == FOXGLOVE_TRANSFORM else list(message.transforms)
-        found = [_foxglove_transform(one) if kind in _OF_FOXGLOVE else _ros_transform(one) for one in listed]
+        return [_foxglove_transform(one) if kind in _OF_FOXGLOVE else _ros_transform(one) for one in listed]
     except (AttributeError, TypeError, ValueError) as error:
         raise InvalidRecording(f"A message is damaged: it is no {kind}.") from error
-    return [one for one in found if np.isfinite(one.moved).all() and np.isfinite(one.turned).all()]
 
 
 _OF_FOXGLOVE = (FOXGLOVE_TRANSFORM, FOXGLOVE_TRANSFORMS)

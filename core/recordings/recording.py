@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
+
 from core.clocks import is_ahead, time_text
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnsupportedFormat
 from core.frames.intrinsics import Intrinsics
@@ -15,7 +17,8 @@ from core.recordings.bag import Bag, bag_files
 from core.recordings.folder import folder_frames
 from core.recordings.frame import NANOSECONDS, RecordedFrame, make_id
 from core.recordings.messages import IMAGE_TYPES
-from core.recordings.trajectory import Trajectory, missing
+from core.recordings.plausibility import MOST_SPEED, Source, jitter_of, judge
+from core.recordings.trajectory import JudgedTrajectory
 from core.recordings.trajectory_files import read_trajectory
 from core.recordings.video import SUFFIXES as VIDEOS
 from core.recordings.video import Video
@@ -35,6 +38,7 @@ class Poses:
     times: of the trajectory in the form of KITTI; None if it has a pose for each frame.
     largest_gap: seconds between two poses between which one is interpolated.
     names: those in the names of the files of a folder, whatever else says poses.
+    most_speed: metres a second; poses that are reached faster are left out.
     """
 
     topic: str | None = None
@@ -44,6 +48,7 @@ class Poses:
     fixed: str | None = None
     moving: str | None = None
     names: bool = False
+    most_speed: float = MOST_SPEED
 
 
 @dataclass
@@ -54,6 +59,8 @@ class Recording:
     remarks: sentences about its content that a user must know.
     intrinsics: of the camera that took them, if a bag has them.
     continuous: whether its frames were taken by a clock, as those of a bag or a video, and not chosen by somebody.
+    lost: how many frames lose their pose because poses are left out that cannot be.
+    lost_by: sentences on what is left out, which are remarks, too.
     """
 
     name: str
@@ -61,6 +68,8 @@ class Recording:
     remarks: list[str] = field(default_factory=list)
     continuous: bool = False
     intrinsics: Intrinsics | None = None
+    lost: int = 0
+    lost_by: list[str] = field(default_factory=list)
     _close: Callable[[], None] = lambda: None
 
     def leave_out_dates(self, clock: float) -> None:
@@ -126,8 +135,10 @@ def open_recording(path: Path, topic: str | None = None, poses: Poses = Poses(),
         recording = _open_video(path) if _is_video(path) else _open_folder(path, prefix, poses.names)
     try:
         if poses.file is not None:
-            trajectory, by_frame = read_trajectory(poses.file, poses.times)
-            _place(recording, trajectory, by_frame, poses.largest_gap)
+            found = read_trajectory(poses.file, poses.times, poses.most_speed)
+            _place(recording, found.judged, poses.largest_gap, found.poses if found.by_frame else None)
+        elif not of_bag:
+            _judge_poses(recording, poses.most_speed)
         if prefix and (of_bag or _is_video(path)):
             recording.frames = [replace(frame, id=_prefixed(prefix, frame.id)) for frame in recording.frames]
     except BaseException:
@@ -166,7 +177,9 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
             moving = poses.moving
             if moving is None and bag.is_of_transforms(poses.topic):
                 moving = bag.camera_frame(chosen)
-            _place(recording, bag.trajectory(poses.topic, poses.fixed, moving), False, poses.largest_gap)
+            _place(
+                recording, bag.trajectory(poses.topic, poses.fixed, moving, poses.most_speed), poses.largest_gap, None
+            )
         recording.remarks = bag.all_remarks() + recording.remarks
     except BaseException:
         bag.close()
@@ -208,17 +221,21 @@ def _open_video(path: Path) -> Recording:
     return Recording(path.stem, frames, remarks, continuous=True, _close=video.close)
 
 
-def _place(recording: Recording, trajectory: Trajectory, by_frame: bool, largest_gap: float) -> None:
-    """Give the frames their poses.
+def _place(recording: Recording, judged: JudgedTrajectory, largest_gap: float, by_frame: int | None) -> None:
+    """Give the frames their poses, and each part of the recording with coordinates of its own a number.
+
+    Args:
+        by_frame: how many poses there are if each frame has one of them, without times.
 
     Raises:
-        InvalidTrajectory: the frames have no times, or another number than the trajectory; or no frame gets a pose.
+        InvalidTrajectory: the frames have no times, or another number than the poses; or no frame gets a pose, although
+            none is left out.
     """
     frames = [frame.described() for frame in recording.frames]
-    if by_frame:
-        if len(trajectory) != len(frames):
+    if by_frame is not None:
+        if by_frame != len(frames):
             raise InvalidTrajectory(
-                f"The trajectory has {len(trajectory)} poses and {recording.name} has {len(frames)} frames: without a "
+                f"The trajectory has {by_frame} poses and {recording.name} has {len(frames)} frames: without a "
                 "file of times there must be one for each frame."
             )
         times = [number * NANOSECONDS for number in range(len(frames))]
@@ -229,17 +246,66 @@ def _place(recording: Recording, trajectory: Trajectory, by_frame: bool, largest
                 f"{len(frames) - len(times)} of {len(frames)} frames of {recording.name} have no time, so a trajectory "
                 "with times gives nothing for them."
             )
+    trajectory = judged.trajectory
     found = trajectory.at(times, largest_gap)
-    without = missing(found)
-    if without == len(frames):
+    without = np.array([pose is None for pose in found])
+    segments, with_poses = (1 + np.searchsorted(judged.begins, one, "right") for one in (times, trajectory.nanoseconds))
+    elsewhere = without & ~np.isin(segments, with_poses) if len(trajectory) else np.zeros(len(frames), np.bool_)
+    lost = without & ~elsewhere & judged.covers(times, largest_gap)
+    missing = int((without & ~elsewhere & ~lost).sum())
+    if missing == len(frames):
         first, last = min(times) / NANOSECONDS, max(times) / NANOSECONDS
         raise InvalidTrajectory(
             f"No frame of {recording.name} gets a pose: its frames are of {first:.3f} s to {last:.3f} s, the poses of "
-            f"{trajectory.span()}, and only gaps of up to {largest_gap:g} s are bridged."
+            f"{judged.span()}, and only gaps of up to {largest_gap:g} s are bridged."
         )
-    if without:
+    recording.remarks += judged.remarks
+    if elsewhere.any():
+        names = sorted({f"~{one}" for one in segments[elsewhere].tolist()} - {"~1"}, key=len)
         recording.remarks.append(
-            f"{without} of {len(frames)} frames get no pose: they lie before the first or after the last known pose, "
+            f"{elsewhere.sum()} of {len(frames)} frames are of a part whose coordinates begin anew: they get no pose. "
+            f"Each part is a traverse of its own, whose name ends with {', '.join(names) or '~2'}; an alignment "
+            "finds which of its frames show places of another one."
+        )
+    if lost.any():
+        recording.lost, recording.lost_by = int(lost.sum()), judged.remarks
+        recording.remarks.append(f"{lost.sum()} of {len(frames)} frames lose their pose by what is left out.")
+    if missing:
+        recording.remarks.append(
+            f"{missing} of {len(frames)} frames get no pose: they lie before the first or after the last known pose, "
             f"or in a gap of more than {largest_gap:g} s."
         )
-    recording.frames = [replace(frame, pose=pose) for frame, pose in zip(frames, found, strict=True)]
+    recording.frames = [
+        replace(frame, pose=pose, segment=segment)
+        for frame, pose, segment in zip(frames, found, segments.tolist(), strict=True)
+    ]
+
+
+def _judge_poses(recording: Recording, most_speed: float) -> None:
+    """Take poses that cannot be from frames that have their own, by a list or by EXIF data."""
+    frames = recording.frames
+    for kind in ("metric", "geographic"):
+        numbers = [at for at, frame in enumerate(frames) if frame.pose is not None and frame.pose.kind() == kind]
+        poses = [pose for at in numbers if (pose := frames[at].pose) is not None]
+        times = [taken for at in numbers if (taken := frames[at].nanoseconds) is not None]
+        if not poses:
+            continue
+        positions = [
+            [pose.latitude, pose.longitude, 0.0] if kind == "geographic" else [pose.x, pose.y, pose.z or 0.0]
+            for pose in poses
+        ]
+        judgement = judge(
+            times if len(times) == len(poses) else None,
+            np.array(positions, np.float64),
+            None,
+            Source(recording.name, "frames", lambda one, of=numbers: f"{frames[of[one]].name}"),  # type: ignore[misc]
+            geographic=kind == "geographic",
+            absolute=True,
+            most_speed=most_speed,
+            jitter=jitter_of(times),
+        )
+        for at in np.array(numbers)[~judgement.kept].tolist():
+            frames[at] = replace(frames[at], pose=None)
+            recording.lost += 1
+        recording.lost_by += judgement.remarks
+    recording.remarks += recording.lost_by

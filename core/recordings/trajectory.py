@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.errors import InvalidTrajectory
 from core.places import Pose
 from core.recordings.frame import NANOSECONDS
-
-LARGEST_COORDINATE = 1e9
-"""Metres; no pose of a place may be further away."""
+from core.recordings.plausibility import BY_FAR, LARGEST_COORDINATE, MOST_SPEED, Source, judge
 
 LEAST_HORIZONTAL = 1e-6
 """An axis that is so near the vertical points nowhere in the plane."""
@@ -29,16 +26,27 @@ class Trajectory:
         it is not known.
     turns: float64 [n, 4], unit quaternions x, y, z, w; NaN where the orientation is not known.
     geographic: whether positions are in degrees.
+    part: int64 [n]; between samples of different parts there is no pose.
     """
 
     nanoseconds: NDArray[np.int64]
     positions: NDArray[np.float64]
     turns: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
     geographic: bool = False
+    part: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.part) < len(self.nanoseconds):
+            object.__setattr__(self, "part", np.zeros(len(self.nanoseconds), np.int64))
 
     @classmethod
     def of_samples(
-        cls, nanoseconds: ArrayLike, positions: ArrayLike, turns: ArrayLike, geographic: bool = False
+        cls,
+        nanoseconds: ArrayLike,
+        positions: ArrayLike,
+        turns: ArrayLike,
+        geographic: bool = False,
+        part: ArrayLike | None = None,
     ) -> Trajectory:
         """Samples in any order; of several at one time the first counts.
 
@@ -53,7 +61,8 @@ class Trajectory:
         if not (np.abs(needed) <= LARGEST_COORDINATE).all():
             raise InvalidTrajectory(f"The trajectory has a position beyond {LARGEST_COORDINATE:g} m, or none.")
         times, first = np.unique(times, return_index=True)
-        return cls(times, places[first], np.asarray(turns, np.float64).reshape(-1, 4)[first], geographic)
+        parts = np.zeros(len(places), np.int64) if part is None else np.asarray(part, np.int64)
+        return cls(times, places[first], np.asarray(turns, np.float64).reshape(-1, 4)[first], geographic, parts[first])
 
     def __len__(self) -> int:
         return len(self.nanoseconds)
@@ -66,15 +75,10 @@ class Trajectory:
         Args:
             largest_gap: seconds; between samples further apart, and beyond the ends, there is no pose.
         """
-        times = np.asarray(nanoseconds, np.int64)
-        after = np.searchsorted(self.nanoseconds, times, side="left")
-        inside = after < len(self)
-        exact = inside & (self.nanoseconds[np.minimum(after, len(self) - 1)] == times)
-        last = np.where(inside, after, len(self) - 1)
-        first = np.where(exact, last, np.maximum(last - 1, 0))
-        gaps = self.nanoseconds[last] - self.nanoseconds[first]
-        known = exact | (inside & (after > 0) & (gaps <= largest_gap * NANOSECONDS))
-        share = np.where(gaps > 0, (times - self.nanoseconds[first]) / np.maximum(gaps, 1), 0.0)
+        first, last, share, known = _around(self.nanoseconds, nanoseconds, largest_gap)
+        if not len(self):
+            return [None] * len(known)
+        known &= self.part[first] == self.part[last]
         places = self._positions(first, last, share)
         headings = self._headings(first, last, share)
         return [
@@ -117,11 +121,87 @@ class Trajectory:
         turn = None if math.isnan(heading) else float(heading)
         return Pose(x=float(place[0]), y=float(place[1]), z=float(place[2]), heading=turn)
 
+
+def _around(
+    samples: NDArray[np.int64], nanoseconds: ArrayLike, largest_gap: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """The samples before and after some times, by their numbers, how far between them, and whether a gap is bridged."""
+    times = np.asarray(nanoseconds, np.int64)
+    if not len(samples):
+        none = np.zeros(len(times), np.int64)
+        return none, none, none.astype(np.float64), none.astype(np.bool_)
+    after = np.searchsorted(samples, times, side="left")
+    inside = after < len(samples)
+    exact = inside & (samples[np.minimum(after, len(samples) - 1)] == times)
+    last = np.where(inside, after, len(samples) - 1)
+    first = np.where(exact, last, np.maximum(last - 1, 0))
+    gaps = samples[last] - samples[first]
+    known = exact | (inside & (after > 0) & (gaps <= largest_gap * NANOSECONDS))
+    return first, last, np.where(gaps > 0, (times - samples[first]) / np.maximum(gaps, 1), 0.0), known
+
+
+@dataclass(frozen=True)
+class JudgedTrajectory:
+    """What of a trajectory can be believed.
+
+    trajectory: the samples in one frame of coordinates; there may be none.
+    told: int64 [m], the times of all samples, also those that are left out, in order.
+    begins: int64 [k], the times at which coordinates begin anew.
+    remarks: sentences about what is left out.
+    """
+
+    trajectory: Trajectory
+    told: NDArray[np.int64]
+    begins: NDArray[np.int64]
+    remarks: list[str]
+
+    @classmethod
+    def of_samples(
+        cls,
+        nanoseconds: ArrayLike,
+        positions: ArrayLike,
+        turns: ArrayLike,
+        source: Source,
+        geographic: bool = False,
+        absolute: bool = False,
+        most_speed: float = MOST_SPEED,
+        publishers: ArrayLike | None = None,
+    ) -> JudgedTrajectory:
+        """Judge samples in any order, with arguments as of ``judge``.
+
+        The first frame of coordinates counts, unless another one has by far more samples.
+        """
+        times = np.asarray(nanoseconds, np.int64)
+        places = np.asarray(positions, np.float64).reshape(-1, 3)
+        quaternions = np.asarray(turns, np.float64).reshape(-1, 4)
+        found = judge(
+            times,
+            places,
+            None if geographic else quaternions,
+            source,
+            geographic,
+            absolute,
+            most_speed,
+            publishers=publishers,
+        )
+        order = np.argsort(times, kind="stable")
+        held = order[found.kept[order]]
+        segments = found.segment[held]
+        begins = times[held[1:]][np.diff(segments) != 0]
+        if held.size:
+            sizes = np.bincount(segments)
+            largest = int(np.argmax(sizes))
+            held = held[segments == (largest if sizes[largest] >= BY_FAR * sizes[segments[0]] else segments[0])]
+        oriented = np.where(found.turned[:, None], quaternions, math.nan)
+        taken, first = np.unique(times[held], return_index=True)
+        held = held[first]
+        trajectory = Trajectory(taken, places[held], oriented[held], geographic, found.part[held])
+        return cls(trajectory, np.unique(times), begins, found.remarks)
+
+    def covers(self, nanoseconds: ArrayLike, largest_gap: float) -> NDArray[np.bool_]:
+        """Whether there would be poses at some times, bool, were all samples believed."""
+        return _around(self.told, nanoseconds, largest_gap)[3]
+
     def span(self) -> str:
-        """From when to when it reaches, in seconds, for messages."""
-        return f"{self.nanoseconds[0] / NANOSECONDS:.3f} s to {self.nanoseconds[-1] / NANOSECONDS:.3f} s"
-
-
-def missing(poses: Sequence[Pose | None]) -> int:
-    """How many frames have no pose."""
-    return sum(pose is None for pose in poses)
+        """From when to when samples reach, in seconds, for messages."""
+        return f"{self.told[0] / NANOSECONDS:.3f} s to {self.told[-1] / NANOSECONDS:.3f} s"

@@ -29,6 +29,7 @@ from service.commands.options.recordings import (
     EverySeconds,
     FixedFrame,
     LargestGap,
+    MostSpeed,
     MovingFrame,
     PosesFrom,
     PoseTopic,
@@ -100,6 +101,16 @@ def enrol(
     trajectory_times: TrajectoryTimes = None,
     poses: PosesFrom = None,
     largest_gap: LargestGap = None,
+    most_speed: MostSpeed = None,
+    allow_lost_poses: Annotated[
+        bool,
+        typer.Option(
+            "--allow-lost-poses",
+            help="Also enrol a recording of which more than a tenth of the frames lose their pose, as no vehicle can "
+            "have driven so.",
+            rich_help_panel=PANEL,
+        ),
+    ] = False,
     every_metres: EveryMetres = None,
     every_degrees: EveryDegrees = None,
     every_seconds: EverySeconds = None,
@@ -138,21 +149,29 @@ def enrol(
         fixed_frame,
         moving_frame,
         poses,
+        most_speed,
     )
     target = CommandTarget(url, data_dir)
     began = time.monotonic()
     with options.open(recording, id_prefix) as opened:
-        name = _checked_sequence(opened.name if sequence is None else sequence)
+        from core.recordings.paths import check_lost_poses, traverse_of, way_of  # here because it takes a moment
+
+        name = opened.name if sequence is None else sequence
+        traverses = [_checked_sequence(one) for one in dict.fromkeys(traverse_of(name, one) for one in opened.frames)]
+        if not allow_lost_poses:
+            check_lost_poses(opened)
 
         def choose(used: str | None, mask: Mask | None) -> list[FrameToSend]:
             chosen = options.choose(opened, used, mask)
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
-            return [FrameToSend(taken, name, camera) for taken in chosen]
+            if (way := way_of(chosen)) is not None:
+                remark(f"{way[0].upper()}{way[1:]}.")
+            return [FrameToSend(taken, traverse_of(name, taken), camera) for taken in chosen]
 
         report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened))
-    _show(report, map_id, name, frames, time.monotonic() - began)
-    if align:
-        _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
+    _show(report, map_id, ", ".join(traverses), frames, time.monotonic() - began)
+    for one in traverses if align else ():
+        _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": one}, wait=True))
     if report.failures:
         raise typer.Exit(1)
 

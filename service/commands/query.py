@@ -29,6 +29,7 @@ from service.commands.options.recordings import (
     EverySeconds,
     FixedFrame,
     LargestGap,
+    MostSpeed,
     MovingFrame,
     PoseTopic,
     RecordingOptions,
@@ -91,6 +92,7 @@ def query(
     trajectory: TrajectoryFile = None,
     trajectory_times: TrajectoryTimes = None,
     largest_gap: LargestGap = None,
+    most_speed: MostSpeed = None,
     every_metres: EveryMetres = None,
     every_degrees: EveryDegrees = None,
     every_seconds: EverySeconds = None,
@@ -128,6 +130,7 @@ def query(
         every_change,
         fixed_frame,
         moving_frame,
+        most_speed,
     )
 
     def frames(encoder: str | None) -> Iterator[QueryFrame]:

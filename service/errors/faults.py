@@ -35,6 +35,10 @@ class InvalidRequest(Fault):
         self.errors = errors or []
 
 
+class ImplausiblePose(Fault):
+    """No vehicle can have come from the poses beside it to this one, or it is what a receiver writes without a fix."""
+
+
 class UnsupportedMediaType(Fault):
     """The resource does not support the content type, or the bytes are of another type."""
 

@@ -167,6 +167,7 @@ KINDS: dict[type[Exception], Kind] = {
     # The content of the request
     faults.MalformedBody: MALFORMED_BODY,
     faults.InvalidRequest: INVALID_REQUEST,
+    faults.ImplausiblePose: Kind(422, "implausible-pose", "No vehicle can have been at the pose"),
     faults.UnsupportedMediaType: Kind(415, "unsupported-media-type", "The content type is not supported here"),
     faults.BodyTooLarge: Kind(413, "body-too-large", "The body has too many bytes"),
     faults.FrameNeeded: Kind(409, "frame-needed", "The frame has to be sent"),

@@ -13,6 +13,7 @@ from typing import Any
 from starlette.requests import Request
 
 from core.maps import Map
+from core.recordings.plausibility import MOST_SPEED
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
@@ -32,6 +33,7 @@ from service.jobs.job import Job
 from service.jobs.jobs import Jobs
 from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
 from service.places.enrolment import Enrolled, FrameToEnrol, enrol
+from service.places.plausible import judge_entries
 from service.places.staging import StagedForm, StagedPart, Staging
 from service.worker_threads import in_thread, to_its_end
 
@@ -55,12 +57,19 @@ Align = Callable[[Engine, JobContext, Sequence[str]], list[dict[str, Any]]]
 
 
 async def receive(
-    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request, align: bool = False
+    engine: Engine,
+    jobs: Jobs,
+    staging: Staging,
+    map_: Map,
+    request: Request,
+    align: bool = False,
+    most_speed: float | None = None,
 ) -> Job:
     """Write a form to disk as it arrives, and submit a job for it; both are on disk when this returns.
 
     Args:
         align: whether the job aligns the traverses of the form with those that the map has.
+        most_speed: metres a second of the vehicle at most; None: as by default.
 
     Raises:
         JobQueueFull, StagingFull: the form was not read.
@@ -79,15 +88,17 @@ async def receive(
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
     name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align))
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align, most_speed))
 
 
-def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool) -> Job:
+def _submit(
+    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool, most_speed: float | None
+) -> Job:
     """Submit a job for a form; if that fails, the form is removed."""
     try:
         count = len(_read_form(engine, staging.open(name))[0])
         maps = {map_.record.id: creation_time(map_)}
-        arguments = {"form": name, "places": count, "align": align}
+        arguments = {"form": name, "places": count, "align": align, "most_speed": most_speed}
         return jobs.submit(KIND, map_.record.id, arguments=arguments, maps=maps)
     except BaseException:
         staging.remove(name)
@@ -128,7 +139,7 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
     form = _Form(engine, staging, context)
-    result = EnrolmentInCommits(engine, context, form.entries, form.frame).run()
+    result = {**EnrolmentInCommits(engine, context, form.entries, form.frame).run(), "remarks": form.remarks}
     if not context.arguments.get("align", False):
         return result
     return {**result, "aligned": align(engine, context, form.sequences())}
@@ -253,6 +264,7 @@ class _Form:
         """The position of the first entry of each id."""
         for position, entry in enumerate(self.entries):
             self._first.setdefault(entry_id(entry) or "", position)
+        self._implausible, self.remarks = judge_entries(self.entries, context.arguments.get("most_speed") or MOST_SPEED)
 
     def sequences(self) -> list[str]:
         """The names of the form's traverses, in the order of their first entries."""
@@ -264,6 +276,8 @@ class _Form:
         frame = read_entry(self.entries[position], self._files, self._read, self._cameras, self._settings)
         if self._first[frame.id] != position:
             raise InvalidRequest(f"id: the form has {frame.id} twice.")
+        if position in self._implausible:
+            raise self._implausible[position]
         return frame
 
     def _read(self, name: str) -> FormPart:

@@ -122,6 +122,14 @@ class BatchParameters(Parameters):
         description="With background: align the traverses of the form with those that the map has, once all frames "
         "are enrolled, as POST …/align does; the job's result has the reports in `aligned`.",
     )
+    most_speed: float | None = Field(
+        default=None,
+        ge=1,
+        le=1e6,
+        allow_inf_nan=False,
+        description="With background: metres a second of the vehicle at most; 60 if left out. A place is refused with "
+        "`implausible-pose` whose pose is reached faster, by the timestamps of its traverse.",
+    )
     batch: BatchName = Field(
         default=None,
         description="A name for this batch, for example a random one, to which another batch can refer with after.",
@@ -141,6 +149,8 @@ class BatchParameters(Parameters):
             )
         if self.align and not self.background:
             raise ValueError("align needs background: it takes longer than a request may wait")
+        if self.most_speed is not None and not self.background:
+            raise ValueError("most_speed needs background: only there a traverse is judged as a whole")
         if self.batch is not None and self.batch == self.after:
             raise ValueError("a batch cannot come after itself")
         return self

@@ -245,7 +245,7 @@ async def _enrol_later(
 ) -> Response:
     map_ = await engine.map(map_id)
     engine.assert_encoder(map_, options.encoder)
-    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request, options.align)
+    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request, options.align, options.most_speed)
     request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
     return accepted(job, engine.settings)
 

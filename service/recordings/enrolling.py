@@ -8,15 +8,17 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.belief.view import STILL, View, view_of
-from core.errors import InvalidImage, InvalidRecording
+from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
 from core.maps import Map
 from core.names import composed
-from core.places import Camera, PlaceFields
+from core.places import Camera, PlaceFields, check_sequence
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
+from core.recordings.paths import check_lost_poses, traverse_of, way_of
+from core.recordings.plausibility import MOST_SPEED
 from core.recordings.recording import LARGEST_GAP
 from core.recordings.value_ranges import range_remark, used_range
 from service.engine.engine import Engine
@@ -26,7 +28,7 @@ from service.jobs.context import JobContext, JobGivesWay, yield_to_requests
 from service.places.bulk_enrolment import Align, EnrolmentInCommits
 from service.places.enrolment import FrameToEnrol
 from service.places.map_events import tell_map
-from service.recordings.reader import Order
+from service.recordings.reader import Order, as_fields
 from service.recordings.readers import Readers, Turns
 from service.recordings.uploads import KIND, Recordings
 from service.settings import Settings
@@ -55,6 +57,19 @@ class RecordingOrder(BaseModel):
     largest_gap: float = Field(
         default=LARGEST_GAP, gt=0, le=3600, allow_inf_nan=False, description="Seconds between poses that are bridged."
     )
+    most_speed: float = Field(
+        default=MOST_SPEED,
+        ge=1,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Metres a second of the vehicle at most: poses that are reached faster are left out.",
+    )
+    allow_lost_poses: bool = Field(
+        default=False,
+        strict=True,
+        description="Also enrol a bag of which more than a tenth of the frames lose their pose, as no vehicle can have "
+        "driven so; without it, the job fails and nothing is enrolled.",
+    )
     every_metres: float | None = Metres
     every_degrees: float | None = Metres
     every_seconds: float | None = Metres
@@ -79,10 +94,12 @@ def enrol_recording(
 
     Returns:
         As of a job that enrols a form; with ``frames``, how many the bag has, ``posed``, how many of the chosen ones
-        have a pose, and ``remarks`` on the bag.
+        have a pose, ``path``, how long their path is, ``sequences``, all traverses, and ``remarks`` on the bag.
 
     Raises:
-        InvalidRecording, UnknownTopic, InvalidTrajectory, MissingExtra: the bag cannot be used so.
+        InvalidRecording, UnknownTopic, InvalidTrajectory, MissingExtra: the bag cannot be used so, or too many frames
+            lose their pose.
+        InvalidIdentifier: the name of a later part of the traverse is too long.
         UnknownMap, UnknownCamera, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was stored
             before stays.
         JobCancelled, JobInterrupted, JobGivesWay.
@@ -98,12 +115,17 @@ def enrol_recording(
         fixed=order.fixed_frame,
         moving=order.moving_frame,
         largest_gap=order.largest_gap,
+        most_speed=order.most_speed,
         prefix=order.id_prefix,
         most=engine.settings.max_image_bytes + 1,  # so that more is noticed
     )
     with readers.reading(context, wanted) as (reader, turns):
         recording = reader.recording()
         sequence = order.sequence or recording.name
+        for traverse in {traverse_of(sequence, one) for one in recording.frames}:
+            check_sequence(traverse)
+        if not order.allow_lost_poses:
+            _check_lost_poses(recording)
         if "camera" not in context.notes:
             context.remember(camera=_complete_camera(engine, map_, order.camera, recording))
         mask = map_.cameras.mask(order.camera)
@@ -119,7 +141,8 @@ def enrol_recording(
         def frame(position: int) -> FrameToEnrol:
             turns.begin_step()
             try:
-                return _to_enrol(chosen[position], sequence, order.camera, mask, engine.settings)
+                traverse = traverse_of(sequence, chosen[position])
+                return _to_enrol(chosen[position], traverse, order.camera, mask, engine.settings)
             finally:
                 turns.end_step()
 
@@ -127,8 +150,21 @@ def enrol_recording(
         result = EnrolmentInCommits(engine, context, entries, frame, gives_way=False).run()
         posed = sum(one.pose is not None for one in chosen)
         facts = {"sequence": sequence, "frames": len(recording.frames), "chosen": len(chosen), "posed": posed}
-    told = {**result, **facts, "remarks": remarks}
-    return {**told, "aligned": align(engine, context, [sequence])} if order.align else told
+        traverses = list(dict.fromkeys(traverse_of(sequence, one) for one in chosen))
+    told = {**result, **facts, "sequences": traverses, "path": way_of(chosen), "remarks": remarks}
+    return {**told, "aligned": align(engine, context, traverses)} if order.align else told
+
+
+def _check_lost_poses(recording: Recording) -> None:
+    """Refuse a bag of which too many frames lose their pose.
+
+    Raises:
+        InvalidTrajectory: they do; the text has fields of the order.
+    """
+    try:
+        check_lost_poses(recording)
+    except InvalidTrajectory as error:
+        raise InvalidTrajectory(as_fields(str(error))) from error
 
 
 def _choose(
@@ -235,9 +271,10 @@ def _check_ids(map_: Map, frames: Sequence[RecordedFrame], sequence: str) -> Non
         InvalidRecording: the text names the first one.
     """
     map_.open()
-    rows = [row for row in map_.rows_of([frame.id for frame in frames]) if row is not None]
+    traverses = {frame.id: traverse_of(sequence, frame) for frame in frames}
+    rows = [row for row in map_.rows_of(list(traverses)) if row is not None]
     found = [place for place in map_.places_at(rows) if place is not None]
-    taken = [place for place in found if composed(place.sequence) != sequence]
+    taken = [place for place in found if composed(place.sequence) != traverses[place.id]]
     if taken:
         raise InvalidRecording(
             f"{len(taken)} ids of these frames belong to places of another traverse, such as {taken[0].id!r}: give "

@@ -70,7 +70,7 @@ TELLS = {
 }
 """The errors that a child may report."""
 
-OPTION = re.compile("--(topic|pose-topic|fixed-frame|moving-frame)")
+OPTION = re.compile("--(topic|pose-topic|fixed-frame|moving-frame|most-speed|allow-lost-poses)")
 """An option of the command line, as errors of ``core.recordings`` name it; an order has a field of the same name."""
 
 ENDED = "It cannot be read: it is damaged, or reading it takes too much memory or too long."
@@ -92,6 +92,7 @@ class Order(BaseModel):
     fixed: str | None
     moving: str | None
     largest_gap: float
+    most_speed: float
     prefix: str
     most: int
 
@@ -103,6 +104,7 @@ class DescribedFrame(BaseModel):
     name: str
     pose: Pose | None
     nanoseconds: int
+    segment: int
 
 
 class DescribedBag(BaseModel):
@@ -112,6 +114,8 @@ class DescribedBag(BaseModel):
     remarks: list[str]
     intrinsics: Intrinsics | None = None
     frames: list[DescribedFrame]
+    lost: int
+    lost_by: list[str]
 
 
 class Reader:
@@ -154,10 +158,18 @@ class Reader:
         with self._lock:
             told = self._described = self._describe() if self._described is None else self._described
         frames = [
-            RecordedFrame(one.id, one.name, partial(self.load, number), one.pose, utc(one.nanoseconds), one.nanoseconds)
+            RecordedFrame(
+                one.id,
+                one.name,
+                partial(self.load, number),
+                one.pose,
+                utc(one.nanoseconds),
+                one.nanoseconds,
+                segment=one.segment,
+            )
             for number, one in enumerate(told.frames)
         ]
-        recording = Recording(told.name, frames, list(told.remarks), continuous=True, intrinsics=told.intrinsics)
+        recording = Recording(told.name, frames, list(told.remarks), True, told.intrinsics, told.lost, told.lost_by)
         recording.leave_out_dates(time.time())
         return recording
 
@@ -279,7 +291,7 @@ def _main() -> None:
     _limit(resource.RLIMIT_AS, _address_space() + memory)
     _limit(resource.RLIMIT_CORE, 0)
     _limit(resource.RLIMIT_CPU, CPU_SECONDS + int(order.path.stat().st_size / BYTES_PER_SECOND * 10))
-    poses = Poses(order.pose_topic, None, None, order.largest_gap, order.fixed, order.moving)
+    poses = Poses(order.pose_topic, None, None, order.largest_gap, order.fixed, order.moving, order.most_speed)
     try:
         recording = open_recording(order.path, order.topic, poses, order.prefix)
         if len(recording.frames) > MOST_FRAMES:
@@ -289,9 +301,17 @@ def _main() -> None:
             remarks=[_as_sent(one, order.path)[:LONGEST_TEXT] for one in recording.remarks],
             intrinsics=recording.intrinsics,
             frames=[
-                DescribedFrame(id=one.id, name=one.name[:LONGEST_TEXT], pose=one.pose, nanoseconds=one.nanoseconds or 0)
+                DescribedFrame(
+                    id=one.id,
+                    name=one.name[:LONGEST_TEXT],
+                    pose=one.pose,
+                    nanoseconds=one.nanoseconds or 0,
+                    segment=one.segment,
+                )
                 for one in recording.frames
             ],
+            lost=recording.lost,
+            lost_by=[_as_sent(one, order.path)[:LONGEST_TEXT] for one in recording.lost_by],
         ).model_dump_json()
     except (PlacerecError, MemoryError) as error:
         _say(out, REFUSED, _told(error, order.path))
@@ -315,7 +335,12 @@ def _as_sent(text: str, path: Path) -> str:
 
     Where the service has put the bag concerns nobody.
     """
-    return OPTION.sub(lambda found: found[1].replace("-", "_"), text.replace(str(path), path.name))
+    return as_fields(text.replace(str(path), path.name))
+
+
+def as_fields(text: str) -> str:
+    """Words with fields of the order for options of the command."""
+    return OPTION.sub(lambda found: found[1].replace("-", "_"), text)
 
 
 def _say(out: BinaryIO, kind: bytes, data: bytes) -> None:

@@ -39,6 +39,10 @@ CAMERA_WAIT = 2.0
 FRESH = 1.0
 """Seconds that an image may be old to be enrolled."""
 OF_THE_FRAME = frozenset({400, 413, 415, 422})
+ALTERNATES = (
+    "Odometry leaps and returns again and again, as if two publishers alternate on its topic: nobody can know which is "
+    "right."
+)
 
 
 @dataclass(frozen=True)
@@ -79,11 +83,13 @@ class Done:
 class Drive:
     """A drive on which the robot enrols images.
 
-    origin: of its odometry; with another one it is over.
+    origin: of its odometry.
+    segment: from 1; with another origin the next one begins, whose coordinates are others.
     last: the pose by odometry of the last image of each camera that was enrolled.
     """
 
     origin: str
+    segment: int = 1
     last: dict[str, Planar] = field(default_factory=dict)
 
     def goes_on(self, camera: str, odom: Planar, metres: float, degrees: float) -> bool:
@@ -128,7 +134,7 @@ class Localizer:
         self._fusion = Fusion()
         self.fix: Fix | None = None
         """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
-        self._mapping = False
+        self._mapping = ""  # the origin of the odometry whose frame is that of the map that is made; empty if none is
         self._driving: Drive | None = None
         self._paused_until = 0.0
         self._heard = self._pictured = -math.inf  # a robot that has just started counts few seconds
@@ -406,7 +412,7 @@ class Localizer:
         if sent is None or not frame.stamp or not sent.stamp or frame.stamp >= sent.stamp:
             return True
         if frame.stamp < sent.stamp - CLOCK_JUMP * NANOSECONDS:
-            self._mapping = False
+            self._mapping = ""
             self._forget()
             self._end_runs()
             return True
@@ -560,7 +566,7 @@ class Localizer:
     def _relocalize(self) -> Done:
         if not self._active:
             return Done(False, "The node is not active.")
-        self._mapping = False
+        self._mapping = ""
         self._forget()
         self._end_runs()
         self._paused_until = 0.0
@@ -588,16 +594,24 @@ class Localizer:
         return Done(all(one.success for one in done), " ".join(one.message for one in done))
 
     def _enrol_present(self, frame: Frame) -> Done:
-        in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
-        if in_odom is None:
+        located = self.odometer.located(frame.stamp) if frame.stamp else None
+        if located is None:
             return Done(False, "There is no odometry for the moment of the image, so its pose is not known.")
+        if self.odometer.alternates:
+            return Done(False, ALTERNATES)
+        if not located.settled:
+            return Done(False, "Odometry has leapt a moment ago, so no pose is known yet; ask again.")
         run = self._running(frame.camera)
         if self.odometer.frame == self._settings.map_frame:
-            robot = in_odom
-        elif self._mapping or run.places() == 0:
-            self._mapping, robot = True, in_odom  # the frame of the odometry is that of the new map
-        elif self.fix is not None and self.fix.origin == self.odometer.origin:
-            robot = self.fix.correction.then(in_odom)
+            robot = located.pose
+        elif self._mapping == located.origin or run.places() == 0:
+            self._mapping, robot = located.origin, located.pose  # the frame of the odometry is that of the new map
+        elif self.fix is not None and self.fix.origin == located.origin:
+            robot = self.fix.correction.then(located.pose)
+        elif self._mapping:
+            return Done(
+                False, "Odometry has begun anew since the map was begun: its poses are no longer those of the map."
+            )
         else:
             return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
         return self._enrol(frame, robot)
@@ -610,8 +624,9 @@ class Localizer:
             return Done(False, "The map has places. Drive into an empty one, or with odometry in the frame of the map.")
         if not self.odometer.frame:
             return Done(False, "There is no odometry, so no pose is known.")
-        self._mapping = self.odometer.frame != self._settings.map_frame
-        self._driving = Drive(self.odometer.origin)
+        origin = self.odometer.origin
+        self._mapping = "" if self.odometer.frame == self._settings.map_frame else origin
+        self._driving = Drive(origin)
         return Done(True, "Images are enrolled as the robot drives; meanwhile it is not localized.")
 
     def _end_drive(self) -> Done:
@@ -622,35 +637,57 @@ class Localizer:
 
     def _enrol_keyframe(self, frame: Frame) -> None:
         """Enrol a frame if the robot has gone on far enough since the last one."""
-        odom, drive = self.odometer.at(frame.stamp) if frame.stamp else None, self._driving
-        if odom is None or drive is None:
+        located, drive = self.odometer.located(frame.stamp) if frame.stamp else None, self._driving
+        if located is None or drive is None:
             self._health.counts["frames without odometry"] += 1
             return
-        if self.odometer.origin != drive.origin:
-            self._driving = None
-            self._mapping = False
-            self._health.begins("keyframes", "Odometry has begun anew, so images are no longer enrolled.")
+        if self.odometer.alternates:
+            self._health.counts["frames without odometry"] += 1
+            self._health.begins("keyframes", f"No images are enrolled: {ALTERNATES}", ERROR)
             return
-        self._health.over("keyframes")
+        if located.origin != drive.origin:
+            if not located.settled:  # it may be a wrong message, after which odometry goes on where it was
+                self._health.counts["frames without odometry"] += 1
+                return
+            drive = self._driving = self._driving_on(drive, located.origin)
+        elif drive.segment == 1:
+            self._health.over("keyframes")
         if not self._is_placed(frame.camera):
             return
+        odom = located.pose
         if not drive.goes_on(frame.camera, odom, self._settings.keyframe_metres, self._settings.keyframe_degrees):
             return
-        self._enrol(frame, odom)
+        self._enrol(frame, odom if drive.segment == 1 else None, drive.segment)
         drive.last[frame.camera] = odom
         self._heard_from_service()
         self._health.counts["keyframes enrolled"] += 1
 
-    def _enrol(self, frame: Frame, robot: Planar) -> Done:
-        """Enrol a frame at which the robot was at a pose of the map."""
+    def _driving_on(self, drive: Drive, origin: str) -> Drive:
+        """The drive after odometry has begun anew: it goes on in the frame of the map, else as another traverse."""
+        if self.odometer.frame == self._settings.map_frame:
+            return Drive(origin, drive.segment, drive.last)
+        segment = drive.segment + 1
+        self._health.over("keyframes")
+        self._health.begins(
+            "keyframes",
+            "Odometry has begun anew, so images are enrolled without poses, as the traverse "
+            f"{self._sequence}~{segment}.",
+        )
+        return Drive(origin, segment)
+
+    def _enrol(self, frame: Frame, robot: Planar | None, segment: int = 1) -> Done:
+        """Enrol a frame at which the robot was at a pose of the map; None: its odometry is not that of the map."""
         self._camera = frame.camera
         run = self._running(frame.camera)
-        camera = robot.then(self._mount(frame.camera))
-        heading = math.degrees(camera.yaw)
         moment = moment_of(frame.stamp)
         assert moment is not None
         place = f"here-{moment:%Y%m%dT%H%M%S}-{moment.microsecond // 1000:03d}-{secrets.token_hex(2)}"
-        fields: dict[str, Any] = {"sequence": self._sequence}
+        fields: dict[str, Any] = {"sequence": self._sequence if segment == 1 else f"{self._sequence}~{segment}"}
+        if robot is None:
+            run.enrol(place, picture_of(frame.message), frame.stamp, **fields)
+            return Done(True, f"{place} was enrolled without a pose.")
+        camera = robot.then(self._mount(frame.camera))
+        heading = math.degrees(camera.yaw)
         if (origin := self._settings.origin) is not None:
             fields["latitude"], fields["longitude"], fields["heading"] = origin.geographic(camera)
             if origin.altitude is not None:

@@ -38,7 +38,7 @@ from placerec_ros.frames import StaticFrames, UnfitMount, mount_of
 from placerec_ros.fusion import Fix
 from placerec_ros.health import ERROR, OK, WARN, Health
 from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
-from placerec_ros.localizer import Answered, Done, Localizer
+from placerec_ros.localizer import ALTERNATES, Answered, Done, Localizer
 from placerec_ros.odometry import stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
 from placerec_ros.repetition import Repetition
@@ -369,7 +369,11 @@ class PlacerecNode(LifecycleNode):
         except ValueError as error:
             self._health.begins("odometry", f"A message of odometry cannot be used: {error}.")
         else:
-            self._health.over("odometry")
+            self._health.counts["messages of odometry left out"] = self._localizer.odometer.left_out
+            if self._localizer.odometer.alternates:
+                self._health.begins("odometry", ALTERNATES)
+            else:
+                self._health.over("odometry")
             self._send_transform(stamp_of(message))
 
     def _ask_for(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import threading
 from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from placerec_client import Odometry
 from placerec_ros.planar import Planar, wrapped, yaw_of
@@ -26,6 +27,13 @@ GAINED = 2.0
 """Metres a second by which a robot becomes faster in a second."""
 AWAY = 1.0
 """Metres that a pose may be farther away than the robot can have gone; farther, and odometry has begun anew."""
+RETURN = 2.0
+"""Seconds in which odometry that has leapt may go on where it was: the messages between were none of it."""
+SETTLED = 5
+"""Messages in a row after which odometry that has begun anew is no wrong message."""
+MOST_RUNS, RUNS_WITHIN, BY_FAR = 6, 10.0, 4
+"""If odometry leaps and returns so often in so many seconds, and one side has not by far more messages, two publishers
+alternate on its topic."""
 OVER_LIMIT = 2.0
 """How many times the limit of its speed a robot may seem to go, as the service has it."""
 FLAT = (0, 1, 5, 6, 7, 11, 30, 31, 35)
@@ -37,6 +45,26 @@ NANOSECONDS = 1_000_000_000
 
 
 Covariance = tuple[float, ...]
+
+
+class Located(NamedTuple):
+    """Where the robot was at a moment by odometry.
+
+    origin: a name for where this odometry began.
+    settled: whether odometry has gone on for some messages since it began, and nothing else comes between.
+    """
+
+    pose: Planar
+    origin: str
+    settled: bool
+
+
+class Left(NamedTuple):
+    """Odometry before it leapt: its readings, its frame, and the number of its beginning."""
+
+    readings: list[Reading]
+    frame: str
+    number: int
 
 
 @dataclass(frozen=True)
@@ -70,7 +98,13 @@ class Odometer:
         self._fastest = min(FASTEST, OVER_LIMIT * speed_limit) if speed_limit else FASTEST
         self._poses: list[Reading] = []
         self._lock = threading.Lock()
-        self._beginnings = 0  # of the odometry, since this object was made
+        self._beginnings = self._number = 0  # how often odometry has begun, and the number of the present beginning
+        self._left: Left | None = None
+        self.left_out = 0
+        """How many messages came between two of odometry that went on, and were none of it."""
+        self._run = 0  # messages since odometry has begun or returned
+        self._runs: deque[tuple[int, int]] = deque(maxlen=MOST_RUNS)  # those before: their ends, and their messages
+        self._trusted = 1  # the number of the last beginning that was followed by enough messages
         self.frame = ""
         """The frame of the odometry's poses, such as ``odom``; empty before the first message."""
         self.child = ""
@@ -93,9 +127,11 @@ class Odometer:
         reading = Reading(stamp, planar, speed, _covariance(message.pose.covariance))
         with self._lock:
             frame = message.header.frame_id
-            if frame != self.frame or self._begins_anew(reading):
-                self._poses.clear()
-                self._beginnings += 1
+            if frame != self.frame or self._begins_anew(self._poses, reading):
+                self._leave(frame, reading)
+            self._run += 1
+            if self._run >= SETTLED:
+                self._trusted = self._number
             self.frame, self.child = frame, message.child_frame_id
             if not self._poses or stamp > self._poses[-1].stamp:
                 self._poses.append(reading)
@@ -106,15 +142,54 @@ class Odometer:
                 first = max(bisect_left(self._poses, oldest, key=_stamp), len(self._poses) - MOST_POSES)
                 del self._poses[:first]
 
+    def _leave(self, frame: str, reading: Reading) -> None:
+        """Begin anew with a message, or go on with the odometry before if the message goes on there."""
+        left, present = self._left, Left(self._poses, self.frame, self._number)
+        self._left = present
+        if left is not None and left.frame == frame and left.readings:
+            last = left.readings[-1]
+            gone_on = 0 < reading.stamp - last.stamp <= RETURN * NANOSECONDS
+            if gone_on and not self._begins_anew(left.readings, reading):
+                if self._number != self._trusted:
+                    self.left_out += self._run
+                self._runs.append((reading.stamp, self._run))
+                self._poses, self._number, self._run = left.readings, left.number, 0
+                return
+        if self._run:
+            self._runs.append((reading.stamp, self._run))
+        self._beginnings += 1
+        self._poses, self._number, self._run = [], self._beginnings, 0
+
     @property
     def origin(self) -> str:
         """A name for where the odometry began, of 128 characters at most."""
-        return f"{self._beginnings} {self.frame}"[:128]
+        return f"{self._number} {self.frame}"[:128]
+
+    @property
+    def alternates(self) -> bool:
+        """Whether messages of two publishers alternate: odometry leaps and returns again and again."""
+        with self._lock:
+            return self._alternates()
+
+    def _alternates(self) -> bool:
+        if len(self._runs) < MOST_RUNS or not self._poses:
+            return False
+        sides = [sum(count for _, count in list(self._runs)[side::2]) for side in (0, 1)]
+        lately = abs(self._poses[-1].stamp - self._runs[0][0]) <= RUNS_WITHIN * NANOSECONDS
+        return lately and min(sides) * BY_FAR > max(sides)
+
+    def located(self, stamp: int) -> Located | None:
+        """Where the robot was at a moment, in nanoseconds, and by which odometry; None if none is near it."""
+        with self._lock:
+            reading = self._read(stamp)
+            settled = self._number == self._trusted and not self._alternates()
+            return None if reading is None else Located(reading.pose, self.origin, settled)
 
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
-            self._poses.clear()
+            self._poses, self._left = [], None
+            self._runs.clear()
             self.frame = self.child = ""
 
     def at(self, stamp: int) -> Planar | None:
@@ -170,20 +245,20 @@ class Odometer:
         )
         return Reading(stamp, pose, max(before.speed, after.speed), covariance)
 
-    def _begins_anew(self, reading: Reading) -> bool:
+    def _begins_anew(self, poses: Sequence[Reading], reading: Reading) -> bool:
         """Whether odometry begins anew with a message: its clock was set back, as by a bag, or its pose has jumped.
 
         A pose has jumped if it is farther away than the robot can have gone since the message before.
         """
-        if not self._poses:
+        if not poses:
             return False
-        last = self._poses[-1]
+        last = poses[-1]
         seconds = (reading.stamp - last.stamp) / NANOSECONDS
         if seconds <= 0:
             return seconds < -CLOCK_JUMP
         gone = self._fastest * seconds
         speeds = [speed for speed in (last.speed, reading.speed) if speed]
-        if len(self._poses) > 1 and (before := self._poses[-2]).stamp < last.stamp:
+        if len(poses) > 1 and (before := poses[-2]).stamp < last.stamp:
             speeds.append(_metres(before, last) * NANOSECONDS / (last.stamp - before.stamp))
         if speeds:
             gone = min(gone, max(speeds) * seconds + GAINED * seconds**2)

@@ -23,6 +23,7 @@ from service.commands.options.recordings import (
     EverySeconds,
     FixedFrame,
     LargestGap,
+    MostSpeed,
     MovingFrame,
     PoseTopic,
     RecordingOptions,
@@ -56,6 +57,7 @@ class RecordingsOptions:
     trajectory_times: TrajectoryTimes = None
     query_trajectory_times: Annotated[Path | None, _of_query(metavar="FILE")] = None
     largest_gap: LargestGap = None
+    most_speed: MostSpeed = None
     every_metres: EveryMetres = None
     every_degrees: EveryDegrees = None
     every_seconds: EverySeconds = None
@@ -72,6 +74,7 @@ class RecordingsOptions:
             *self._of_both,
             self.fixed_frame,
             self.moving_frame,
+            self.most_speed,
         )
 
     @property
@@ -85,6 +88,7 @@ class RecordingsOptions:
             *self._of_both,
             self.query_fixed_frame,
             self.query_moving_frame,
+            self.most_speed,
         )
 
     @property

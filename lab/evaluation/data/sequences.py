@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,7 @@ from core.errors import InvalidGroundTruth, InvalidTrajectory
 from core.frames.traverses import Truth, find_images, natural_key, tolerance_truth
 from core.places import Pose
 from core.recordings.frame import NANOSECONDS
-from core.recordings.trajectory import Trajectory
-from core.recordings.trajectory_files import read_trajectory
+from core.recordings.trajectory_files import TrajectoryFile, read_trajectory
 from lab.evaluation.data.layouts import DatasetLayout, LayoutTraverses, Names, present
 from lab.evaluation.data.poses import near, within_truth
 
@@ -36,11 +36,15 @@ def kitti(sequence: str, metres: float, degrees: float, frames: int) -> DatasetL
         folder = present(base, cameras)
         assert folder is not None, "found"
         images = find_images(folder)
-        trajectory, by_frame = _trajectory(base / poses)
-        if not by_frame or len(trajectory) != len(images):
-            raise InvalidGroundTruth(f"{base / poses} has {len(trajectory)} poses, and {folder} {len(images)} images.")
-        found = trajectory.at(np.arange(len(images), dtype=np.int64) * NANOSECONDS, 0.0)
-        return _revisits(images, found, metres, degrees, frames)
+        told = _trajectory(base / poses)
+        if not told.by_frame or told.poses != len(images):
+            raise InvalidGroundTruth(f"{base / poses} has {told.poses} poses, and {folder} {len(images)} images.")
+        found = told.judged.trajectory.at(np.arange(len(images), dtype=np.int64) * NANOSECONDS, 0.0)
+        known = [index for index, pose in enumerate(found) if pose is not None]
+        revisits = _revisits(
+            [images[index] for index in known], [found[index] for index in known], metres, degrees, frames
+        )
+        return replace(revisits, notes=(*revisits.notes, *told.judged.remarks))
 
     return DatasetLayout("KITTI", "dataset", (cameras, (poses,)), read, poses, f"sequences/{sequence}")
 
@@ -60,18 +64,20 @@ def tum(metres: float, degrees: float, frames: int) -> DatasetLayout:
                 raise InvalidGroundTruth(f"{image} is not named by its time in seconds, as TUM's images are.")
             seconds, fraction = image.stem.split(".")
             times.append(int(seconds) * NANOSECONDS + int(fraction.ljust(9, "0")))
-        trajectory, by_frame = _trajectory(base / "groundtruth.txt")
-        if by_frame:
+        found_there = _trajectory(base / "groundtruth.txt")
+        if found_there.by_frame:
             raise InvalidGroundTruth(f"{base / 'groundtruth.txt'} has no times: it is not in the form of TUM.")
-        poses = trajectory.at(times, TUM_GAP)
+        judged = found_there.judged
+        poses = judged.trajectory.at(times, TUM_GAP)
         known = [index for index, pose in enumerate(poses) if pose is not None]
         if not known:
             raise InvalidGroundTruth(f"{base / 'groundtruth.txt'} has no pose at the time of an image.")
         left_out = len(images) - len(known)
-        notes = (f"{left_out} of {len(images)} images have no pose within {TUM_GAP:g} s and are left out.",)
+        gaps = f"{left_out} of {len(images)} images have no pose within {TUM_GAP:g} s and are left out."
+        notes = (*judged.remarks, *((gaps,) if left_out else ()))
         chosen = [images[index] for index in known]
         found = _revisits(chosen, [poses[index] for index in known], metres, degrees, frames)
-        return LayoutTraverses(found.references, found.queries, found.truth, found.excluded, notes if left_out else ())
+        return LayoutTraverses(found.references, found.queries, found.truth, found.excluded, notes)
 
     return DatasetLayout("TUM RGB-D", "", (("rgb",), ("groundtruth.txt",)), read, "groundtruth.txt")
 
@@ -112,7 +118,7 @@ def _revisits(
     return LayoutTraverses(images, images, truth, excluded)
 
 
-def _trajectory(path: Path) -> tuple[Trajectory, bool]:
+def _trajectory(path: Path) -> TrajectoryFile:
     try:
         return read_trajectory(path)
     except InvalidTrajectory as error:

@@ -74,6 +74,15 @@ LargestGap = Annotated[
         min=0, help="Seconds between two poses that are bridged; default: 1.5.", rich_help_panel=PANEL, metavar="S"
     ),
 ]
+MostSpeed = Annotated[
+    float | None,
+    typer.Option(
+        min=1,
+        help="Metres a second of the vehicle at most: poses that are reached faster are left out; default: 60.",
+        rich_help_panel=PANEL,
+        metavar="V",
+    ),
+]
 EveryMetres = Annotated[
     float | None,
     typer.Option(min=0, help="Keyframes: take a frame after N metres.", rich_help_panel=PANEL, metavar="N"),
@@ -114,6 +123,7 @@ class RecordingOptions:
     fixed_frame: FixedFrame = None
     moving_frame: MovingFrame = None
     poses: PosesFrom = None
+    most_speed: MostSpeed = None
 
     @contextmanager
     def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
@@ -131,18 +141,14 @@ class RecordingOptions:
             raise typer.BadParameter("--trajectory-times goes with --trajectory")
         # Imported here because it takes a moment.
         from core.recordings import Poses, open_recording
+        from core.recordings.plausibility import MOST_SPEED
         from core.recordings.recording import LARGEST_GAP
 
         gap = LARGEST_GAP if self.largest_gap is None else self.largest_gap
-        poses = Poses(
-            self.pose_topic,
-            self.trajectory,
-            self.trajectory_times,
-            gap,
-            self.fixed_frame,
-            self.moving_frame,
-            self.poses == "names",
-        )
+        speed = MOST_SPEED if self.most_speed is None else self.most_speed
+        files = (self.trajectory, self.trajectory_times)
+        frames = (self.fixed_frame, self.moving_frame)
+        poses = Poses(self.pose_topic, *files, gap, *frames, names=self.poses == "names", most_speed=speed)
         with messages.status(f"Reading {path} …"):
             recording = open_recording(path, self.topic, poses, prefix)
             recording.leave_out_dates(time.time())

@@ -469,6 +469,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     assert not refused["success"] and "no odometry" in refused["message"]
 
     def show(picture: bytes, x: float, y: float, heading: float) -> None:
+        robot.frame += 10  # it drives there
         robot.odometry(x, y, heading)
         robot.answers_to([picture])
 

@@ -23,7 +23,8 @@ MOST = 1 << 20
 
 def order(path: Path, most: int = MOST) -> Order:
     return Order(
-        path=path, topic=None, pose_topic=None, fixed=None, moving=None, largest_gap=1.5, prefix="", most=most
+        path=path, topic=None, pose_topic=None, fixed=None, moving=None, largest_gap=1.5, most_speed=60.0, prefix="",
+        most=most,
     )  # fmt: skip
 
 

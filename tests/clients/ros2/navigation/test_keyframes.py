@@ -43,8 +43,13 @@ def test_keyframes_are_enrolled_as_the_robot_drives(moving: Robot) -> None:
     until(partial(has, 5))
     assert robot.peer.take("answer") == [], "meanwhile it is not localized"
     robot.frame += 1
-    robot.odometry(100.0, 1.0, 0.0)
+    for number in range(6):
+        robot.odometry(100.0 + 0.1 * number, 1.0, 0.0)
+        robot.frame += 1
+    robot.odometry(100.6, 1.0, 0.0)
     robot.look(encoded(robot.site.frames[7]))
-    assert robot.says("Odometry has begun anew, so images are no longer enrolled")["level"] == 1
-    assert not robot.peer.do("switch", service="enrol_keyframes", on=False)["success"]
-    assert len(enrolled()) == 5
+    assert robot.says("images are enrolled without poses, as the traverse drive~2")["level"] == 1
+    until(lambda: len(server.places("driven")) == 6)
+    last = list(server.places("driven").values())[-1]
+    assert last["sequence"] == "drive~2" and last["pose"] is None
+    assert robot.peer.do("switch", service="enrol_keyframes", on=False)["success"]
