@@ -55,7 +55,7 @@ class RecordingOrder(BaseModel):
         default=LARGEST_GAP, gt=0, le=3600, allow_inf_nan=False, description="Seconds between poses that are bridged."
     )
     every_metres: float | None = Metres
-    every_degrees: float | None = Metres
+    every_degrees: float | None = Field(default=None, gt=0, le=180, allow_inf_nan=False)
     every_seconds: float | None = Metres
     keep_standing: bool = Field(
         default=False, strict=True, description="Also enrol frames in which nothing changes, as where the robot stood."

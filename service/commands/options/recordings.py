@@ -79,7 +79,7 @@ EveryMetres = Annotated[
 ]
 EveryDegrees = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, max=180, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
 ]
 EverySeconds = Annotated[
     float | None,
