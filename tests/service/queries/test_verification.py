@@ -219,8 +219,8 @@ def test_a_camera_of_another_angle_is_told(server: Server, posed: str) -> None:
         lens = None if focal is None else INTRINSICS | {"fx": focal, "fy": focal}
         server.client.put(f"/v1/maps/{posed}/cameras/{name}", json={"intrinsics": lens}).raise_for_status()
     notes = {name: server.query(posed, jpeg(2), camera=name).get("note") for name in (*lenses, "front")}
-    assert "'wide' sees 1.7 times the angle that the camera 'front'" in notes["wide"]
-    assert "'narrow' sees 0.53 times" in notes["narrow"]
+    assert "'wide' sees 1.7 times the angle that the camera 'front'" in str(notes["wide"])
+    assert "'narrow' sees 0.53 times" in str(notes["narrow"])
     assert (notes["similar"], notes["unknown"], notes["front"]) == (None, None, None)
     assert "note" not in server.query(posed, jpeg(2))
 
