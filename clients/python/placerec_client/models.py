@@ -362,6 +362,7 @@ class QueryAnswer(Model):
     decision: float | None = None
     threshold: float
     reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
@@ -680,6 +681,7 @@ class ClosureAnswer(Model):
     decision: float | None = None
     threshold: float
     reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
