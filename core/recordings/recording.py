@@ -37,8 +37,8 @@ class Poses:
     file: a trajectory in the form of TUM or KITTI.
     times: of the trajectory in the form of KITTI; None if it has a pose for each frame.
     largest_gap: seconds between two poses between which one is interpolated.
-    names: those in the names of the files of a folder, whatever else says poses.
     most_speed: metres a second; poses that are reached faster are left out.
+    names: those in the names of the files of a folder, whatever else says poses.
     """
 
     topic: str | None = None
@@ -47,8 +47,8 @@ class Poses:
     largest_gap: float = LARGEST_GAP
     fixed: str | None = None
     moving: str | None = None
-    names: bool = False
     most_speed: float = MOST_SPEED
+    names: bool = False
 
 
 @dataclass

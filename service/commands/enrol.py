@@ -148,8 +148,8 @@ def enrol(
         every_change,
         fixed_frame,
         moving_frame,
-        poses,
         most_speed,
+        poses,
     )
     target = CommandTarget(url, data_dir)
     began = time.monotonic()

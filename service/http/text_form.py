@@ -27,13 +27,10 @@ class TextForm:
 
 
 def _composed_query(query: bytes) -> bytes:
-    """A query string whose names and values are in the one form; one that is not UTF-8 stays as it is."""
-    if query.isascii() and b"%" not in query:
+    """A query string whose names and values are in the one form; it has no letters but of ASCII, or it was refused."""
+    if b"%" not in query:
         return query  # nearly always
-    try:
-        text = query.decode()
-    except UnicodeDecodeError:
-        return query
-    if query.isascii() and (plain := unquote_plus(text)) == composed(plain):
+    text = query.decode("latin-1")
+    if (plain := unquote_plus(text)) == composed(plain):
         return query
     return urlencode([(composed(name), composed(value)) for name, value in parse_qsl(text, True)]).encode()

@@ -71,7 +71,7 @@ class RecordingOrder(BaseModel):
         "driven so; without it, the job fails and nothing is enrolled.",
     )
     every_metres: float | None = Metres
-    every_degrees: float | None = Metres
+    every_degrees: float | None = Field(default=None, gt=0, le=180, allow_inf_nan=False)
     every_seconds: float | None = Metres
     keep_standing: bool = Field(
         default=False, strict=True, description="Also enrol frames in which nothing changes, as where the robot stood."

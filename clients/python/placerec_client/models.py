@@ -361,7 +361,8 @@ class QueryAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
@@ -646,7 +647,6 @@ class CameraView(Model):
     name: str
     mask: Mask | None = None
     intrinsics: Intrinsics | None = None
-    value_range: tuple[int, int] | None = None
     updated_at: datetime
 
 
@@ -680,7 +680,8 @@ class ClosureAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
     verification: VerificationView | None = None
@@ -1259,7 +1260,7 @@ class MapAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float | None = None
-    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
     verification: VerificationView | None = None
     rivals: list[RivalGroup] = Field(default_factory=list)
     revision: int | None = None
@@ -1741,7 +1742,6 @@ class SessionAnswer(Model):
     change: ChangeView | None = None
     earlier: EarlierBelief | None = None
     motion: Known[Literal["first", "sequence", "speed-limit", "odometry"]]
-    note: str | None = None
     view: Known[Literal["covered", "constant"]] | None = None
     repeated: bool = False
     restored: bool

@@ -611,7 +611,7 @@ class SendFrame(TypedDict, total=False):
     """Metres in odometry's frame; with odometry_x."""
 
     odometry_heading: float | None
-    """Degrees counter-clockwise from +x of odometry's frame to where the camera looks; with odometry_x."""
+    """Degrees counter-clockwise from +x of odometry's frame to where the camera looks, -360 to 360; with odometry_x."""
 
     odometry_covariance: str | Sequence[float] | None
     """The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated by commas,

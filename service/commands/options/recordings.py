@@ -89,7 +89,7 @@ EveryMetres = Annotated[
 ]
 EveryDegrees = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(min=0, max=180, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
 ]
 EverySeconds = Annotated[
     float | None,
@@ -122,8 +122,8 @@ class RecordingOptions:
     every_change: EveryChange = None
     fixed_frame: FixedFrame = None
     moving_frame: MovingFrame = None
-    poses: PosesFrom = None
     most_speed: MostSpeed = None
+    poses: PosesFrom = None
 
     @contextmanager
     def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
@@ -148,7 +148,7 @@ class RecordingOptions:
         speed = MOST_SPEED if self.most_speed is None else self.most_speed
         files = (self.trajectory, self.trajectory_times)
         frames = (self.fixed_frame, self.moving_frame)
-        poses = Poses(self.pose_topic, *files, gap, *frames, names=self.poses == "names", most_speed=speed)
+        poses = Poses(self.pose_topic, *files, gap, *frames, speed, self.poses == "names")
         with messages.status(f"Reading {path} …"):
             recording = open_recording(path, self.topic, poses, prefix)
             recording.leave_out_dates(time.time())

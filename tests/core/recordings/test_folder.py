@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 from unicodedata import normalize
 
 import cv2
@@ -96,8 +97,11 @@ def test_a_list_gives_order_ids_poses_and_times(tmp_path: Path) -> None:
         assert "1 images of" in recording.remarks[0]
 
 
+Form = Literal["NFC", "NFD"]
+
+
 @pytest.mark.parametrize(("listed", "on_disk"), [("NFC", "NFD"), ("NFD", "NFC"), ("NFD", "NFD")])
-def test_names_of_files_have_one_form(tmp_path: Path, listed: str, on_disk: str) -> None:
+def test_names_of_files_have_one_form(tmp_path: Path, listed: Form, on_disk: Form) -> None:
     (tmp_path / normalize(on_disk, "Café 1.jpg")).write_bytes(jpeg(1, 64, 48))
     with open_recording(tmp_path) as recording:
         assert recording.frames[0].id == "Caf-1"

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from unicodedata import normalize
 
 import httpx
 import pytest
@@ -47,7 +48,7 @@ def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, se
     (monday / "places.csv").write_text(
         HEADER
         + "9.jpg,door,1.5,-2,0.25,370,,,2026-11-20T10:00:00+01:00\n"
-        + "1.jpg,,,,,,48.5,2.25,\n"
+        + "1.jpg,,48.5,2.25,,,,,\n"
         + "2.jpg,,,,,,,,\n".replace("370", ""),
         encoding="utf-8",
     )
@@ -67,8 +68,34 @@ def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, se
     assert door["pose"] == {"x": 1.5, "y": -2.0, "z": 0.25, "heading": 270.0}
     assert door["timestamp"] == "2026-11-20T09:00:00Z"
     assert door["sequence"] == "walk"
-    assert server.client.get(f"/v1/maps/{map_id}/places/1").json()["pose"] == {"latitude": 48.5, "longitude": 2.25}
+    assert server.client.get(f"/v1/maps/{map_id}/places/1").json()["pose"] == {"x": 48.5, "y": 2.25}
     assert server.client.get(f"/v1/maps/{map_id}/places/2").json()["pose"] is None
+
+
+def test_places_of_the_other_kind_fail_alone_and_say_why(
+    placerec: Placerec, monday: Path, server: Server, map_id: str
+) -> None:
+    (monday / "places.csv").write_text(HEADER + "9.jpg,door,1.5,-2,,,,,\n1.jpg,,,,,,48.5,2.25,\n")
+    done = placerec("enrol", monday, "--map", map_id, "--url", server.client.base_url, status=1)
+    assert "1 of 2 frames are places" in done.stdout
+    assert "1.jpg: " in done.stderr and "a map has one kind" in " ".join(done.stderr.split())
+
+
+def test_poses_come_from_the_names_of_files(placerec: Placerec, tmp_path: Path, server: Server, map_id: str) -> None:
+    folder = tmp_path / normalize("NFD", "Straße é")
+    folder.mkdir()
+    for number in range(3):
+        name = f"@0548164.3{number}@4180910.43@10@S@37.7@-122.4@pano{number}@@{90 * number}@@@@20180312@@.jpg"
+        (folder / name).write_bytes(jpeg(number))
+    url = ("--url", server.client.base_url)
+    done = placerec("enrol", folder, "--map", map_id, *url)
+    assert "sequence Straße é: 3 created; 3 with a pose" in done.stdout  # in the one form of texts
+    assert "UTM zone 10N" in done.stderr and "3 with a heading" in " ".join(done.stderr.split())
+    found = [place["pose"] for place in server.places(map_id).values()]
+    assert found == [{"x": float(f"548164.3{n}"), "y": 4180910.43, "heading": (90 - 90 * n) % 360} for n in range(3)]
+    assert "3 unchanged" in placerec("enrol", folder, "--map", map_id, "--poses", "names", *url).stdout
+    refused = placerec("enrol", folder, "--map", map_id, "--poses", "names", "--trajectory", "a.txt", *url, status=2)
+    assert "not both" in " ".join(refused.stderr.split())
 
 
 @pytest.mark.thorough
@@ -182,7 +209,7 @@ def test_file_names_become_ids(placerec: Placerec, tmp_path: Path) -> None:
         ("file\nmissing.jpg\n", "line 2: there is no file 'missing.jpg'"),
         ("file,x,y\n1.jpg,1\n", "line 2: the row has more or fewer cells"),
         ("file,x,y\n1.jpg,1,2,3\n", "line 2: the row has more or fewer cells"),
-        ("file,x,y\n1.jpg,one,2\n", "line 2: x: Input should be a valid number"),
+        ("file,x,y\n1.jpg,one,2\n", "line 2: x: 'one' is not a number"),
         ("file,heading\n1.jpg,90\n", "line 2: a pose is either x, y[, z] or latitude, longitude"),
         ("file,x,y,latitude,longitude\n1.jpg,1,2,3,4\n", "line 2: a pose is either"),
         ("file,timestamp\n1.jpg,yesterday\n", "line 2: timestamp: "),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.service.scenes import encoded, jpeg, scene, seen_again
-from tests.service.server import Server, assert_problem, typed
+from tests.service.server import Server, assert_problem, text, typed
 
 PLACES = 8
 
@@ -25,6 +25,29 @@ def yard(server: Server) -> str:
         )  # fmt: skip
         assert response.status_code == 201, response.text
     return "yard"
+
+
+def test_areas_of_the_other_kind_are_refused(server: Server, yard: str, islands: str) -> None:
+    degrees: dict[str, object] = {"latitude": -17, "longitude": 180, "radius": 50}
+    metres: dict[str, object] = {"x": 1, "y": 1, "radius": 50}
+    for map_id, area, kind in (
+        (yard, degrees, "geographic"), (yard, {"bbox": "1,1,2,2"}, "geographic"), (islands, metres, "metric"),
+        (yard, degrees | {"soft": "position"}, "geographic"),
+    ):  # fmt: skip
+        sent = server.client.post(
+            f"/v1/maps/{map_id}/query", params=text(area), content=jpeg(1), headers=typed(jpeg(1))
+        )
+        assert f"has {kind} coordinates" in assert_problem(sent, 409, "mixed-coordinates")["detail"]
+    params = text(metres | {"id": "new"})
+    close = server.client.post(
+        f"/v1/maps/{islands}/query:enrol", params=params, content=jpeg(99), headers=typed(jpeg(1))
+    )
+    assert_problem(close, 409, "mixed-coordinates")
+    both = server.client.post(
+        "/v1/query", params=text(metres | {"maps": "yard,islands"}), content=jpeg(1), headers=typed(jpeg(1))
+    )
+    reports = {one["map"]: one for one in both.json()["maps"]}
+    assert reports["yard"]["problem"] is None and reports["islands"]["problem"]["type"].endswith("mixed-coordinates")
 
 
 @pytest.fixture(scope="module")
@@ -151,13 +174,13 @@ def test_a_soft_prior_adds_no_certainty_and_a_carried_robot_is_found(server: Ser
     assert agrees["probability"] is None or agrees["probability"] >= carried["probability"]
 
 
-def test_every_kind_may_be_soft(server: Server, yard: str) -> None:
+def test_every_kind_may_be_soft(server: Server, islands: str) -> None:
     answer = server.query(
-        yard, jpeg(3), k=100, x=30, y=0, radius=5, heading=135, heading_tolerance=10, bbox="0,0,1,1",
+        islands, jpeg(3), k=100, latitude=-17, longitude=180, radius=5, heading=0, heading_tolerance=9, bbox="0,0,1,1",
         sequences="monday", after="2026-11-20T10:03:00Z", where={"floor": 1}, prior_trust=0.5,
         soft="position,heading,bbox,sequences,time,where",
     )  # fmt: skip
-    assert len(answer["matches"]) == PLACES
+    assert len(answer["matches"]) == 4
     assert {match["weight"] for match in answer["matches"]} == {0.5}, "no place is in the box"
 
 

@@ -213,6 +213,18 @@ def test_geometry_tells_the_pose_where_the_intrinsics_are_known(server: Server, 
     assert np.allclose(covariance, covariance.T) and (np.linalg.eigvalsh(covariance) > 0).all()
 
 
+def test_a_camera_of_another_angle_is_told(server: Server, posed: str) -> None:
+    lenses = {"wide": 150.0, "similar": 250.0, "narrow": 600.0, "unknown": None}
+    for name, focal in lenses.items():
+        lens = None if focal is None else INTRINSICS | {"fx": focal, "fy": focal}
+        server.client.put(f"/v1/maps/{posed}/cameras/{name}", json={"intrinsics": lens}).raise_for_status()
+    notes = {name: server.query(posed, jpeg(2), camera=name).get("note") for name in (*lenses, "front")}
+    assert "'wide' sees 1.7 times the angle that the camera 'front'" in str(notes["wide"])
+    assert "'narrow' sees 0.53 times" in str(notes["narrow"])
+    assert (notes["similar"], notes["unknown"], notes["front"]) == (None, None, None)
+    assert "note" not in server.query(posed, jpeg(2))
+
+
 def test_auto_verifies_for_the_pose(server: Server, posed: str) -> None:
     answer = server.query(posed, jpeg(2), camera="front")
     assert answer["verification"]["state"] == "verified" and answer["pose"]["source"] == "intrinsics"

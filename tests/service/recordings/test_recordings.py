@@ -268,7 +268,13 @@ def test_what_is_refused(taking: Server) -> None:
     order = taking.client.post("/v1/maps/refusing/recordings/walk.mcap", json={})
     assert (order.status_code, slug(order)) == (404, "unknown-recording")
     put(taking, "refusing", "walk.mcap", 0, b"x")
-    for body in ({"every_metres": 0}, {"fixed_frame": "map"}, {"sequence": "a/b"}, {"file": "/etc/passwd"}):
+    for body in (
+        {"every_metres": 0},
+        {"every_degrees": 181},
+        {"fixed_frame": "map"},
+        {"sequence": "a/b"},
+        {"file": "/etc/passwd"},
+    ):
         assert taking.client.post("/v1/maps/refusing/recordings/walk.mcap", json=body).status_code == 422, body
     strange = taking.client.post("/v1/maps/refusing/recordings/walk.mcap", json={"camera": "none"})
     assert slug(strange) == "unknown-camera"

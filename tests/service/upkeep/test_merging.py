@@ -34,6 +34,18 @@ from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
 
 
+def test_maps_of_both_kinds_of_coordinates_are_not_merged(server: Server) -> None:
+    for name, pose in (("metres", {"x": 1, "y": 2}), ("degrees", {"latitude": 48.1, "longitude": 11.5})):
+        server.create_map(name)
+        assert server.enrol(name, name, jpeg(len(name)), **pose).status_code == 201
+    order: dict[str, Any] = {"from": "degrees", "sample": 0}
+    (conflict,) = finished(server, asked(server, "metres", "merge", **order))["result"]["conflicts"]
+    assert "geographic coordinates" in conflict and "metric coordinates" in conflict
+    refused = finished(server, asked(server, "metres", "merge", dry_run=False, **order))
+    assert refused["state"] == "failed" and refused["problem"]["type"] == "urn:placerec:problem:mixed-coordinates"
+    assert places(server, "metres").keys() == {"metres"}
+
+
 @pytest.mark.thorough
 def test_merging_first_reports_and_then_copies(server: Server) -> None:
     server.create_map("east", encoder=TWO_STAGES, keep="thumbnail")

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -348,6 +349,30 @@ def test_lines_are_what_a_person_can_read(content: bytes) -> None:
     assert (lines["q0"]["track"], lines["q0"]["station"], lines["q0"]["pose_of"]) == ("monday", 2, "p2")
     assert shown["pose"] == {"latitude": 48.8, "longitude": 2.3, "heading": 10.0}
     assert shown["sequence"] == "Ünter den Linden"
+
+
+def test_a_file_of_old_gives_its_texts_their_one_form(
+    content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two traverses whose names look the same stay two, and metadata with such names stays as it is."""
+    apart, path = normalize("NFD", "Ü"), tmp_path / "old.tar"
+    walk, letter = json.dumps(f"{apart}nter den Linden").encode(), json.dumps(normalize("NFD", "ä")).encode()
+
+    def edit(_manifest: dict[str, Any], parts: Parts) -> None:
+        parts[SEQUENCES] = parts[SEQUENCES].replace(b'"monday"', walk)
+        changed = parts[PLACES].replace(b'"monday"', walk).replace('"ä"'.encode(), letter, 1)
+        parts[PLACES] = changed.replace('"ä"'.encode(), b"%b: 1, %b" % ('"ä"'.encode(), letter), 1)
+
+    path.write_bytes(changed(content, edit))
+    atlas = Atlas(tmp_path / "data")
+    made = imported(atlas, path, "old")
+    assert made.verify().ok
+    names = {one.name: one.places for one in made.sequences(None, 9)[0]}
+    assert names == {"Ünter den Linden": 6, "Ünter den Linden~2": 1}
+    assert "sequence renamed" in caplog.text
+    first, second = (set(made.place(f"p{number}").metadata) for number in range(2))
+    atlas.close()
+    assert first == {"i", "ä"} and second == {"i", "ä", normalize("NFD", "ä")}
 
 
 def test_a_flipped_bit_anywhere_makes_no_map(content: bytes, library: Atlas, tmp_path: Path) -> None:
