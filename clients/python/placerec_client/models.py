@@ -361,7 +361,7 @@ class QueryAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
@@ -508,6 +508,29 @@ class Calibration(Model):
     geometry: GeometryTerms | None = None
 
 
+class Stated(Model):
+    """The probabilities that a calibration states for some answers."""
+
+    probability: float
+    error: float
+
+
+class KindChange(Model):
+    """The probabilities of one kind of answers, before and after."""
+
+    answers: int
+    before: Stated
+    after: Stated
+
+
+class HeldOutChange(Model):
+    """What a calibration changes for answers that had no part in it."""
+
+    known: KindChange | None = None
+    strangers: KindChange | None = None
+    worse: str | None = None
+
+
 class Reliability(Model):
     """The reliability of stated probabilities over n answers whose truth is known."""
 
@@ -564,7 +587,7 @@ class Target(Model):
 
 
 class CalibrationReport(Model):
-    """A calibration, and the measurement that it rests on."""
+    """A calibration, the measurement that it rests on, and what it would change."""
 
     map: str
     encoder: str
@@ -574,6 +597,7 @@ class CalibrationReport(Model):
     calibration: Calibration
     previous: Calibration
     measurement: Measurement
+    change: HeldOutChange | None = None
     warnings: list[str]
 
 
@@ -647,6 +671,7 @@ class CameraView(Model):
     name: str
     mask: Mask | None = None
     intrinsics: Intrinsics | None = None
+    value_range: tuple[int, int] | None = None
     updated_at: datetime
 
 
@@ -680,7 +705,7 @@ class ClosureAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     note: str | None = None
     matches: list[Match]
     rivals: list[RivalGroup] = Field(default_factory=list)
@@ -893,6 +918,20 @@ class FleetAlarm(Model):
     sentence: str
 
 
+class FleetLost(Model):
+    """A robot that was told no place for half a minute, until it was told one three times in a row."""
+
+    map: str
+    name: str | None = None
+    session: str | None = None
+    camera: str | None = None
+    place: str | None = None
+    raised: bool
+    since: datetime
+    cleared_at: datetime | None = None
+    last_at: datetime | None = None
+
+
 class HourCount(Model):
     """How many answers had each verdict within an hour."""
 
@@ -934,6 +973,7 @@ class FleetState(Model):
     maps: list[FleetMap]
     robots: list[FleetRobot]
     alarms: list[FleetAlarm]
+    lost: list[FleetLost]
 
 
 class FrameReport(Model):
@@ -1260,7 +1300,7 @@ class MapAnswer(Model):
     margin: float | None = None
     decision: float | None = None
     threshold: float | None = None
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    reason: Known[Literal["no-regions", "few-values", "empty-map", "no-place-allowed"]] | None = None
     verification: VerificationView | None = None
     rivals: list[RivalGroup] = Field(default_factory=list)
     revision: int | None = None
@@ -1355,6 +1395,7 @@ class MapHealth(Model):
     map: str
     places: int
     complete: bool
+    calibration_doubt: str | None = None
     answers: AnswersView
     never_matched: SilentPlaces | None = None
     aliasing: AliasingView
@@ -1422,6 +1463,7 @@ class MapView(Model):
     learning: LearningSetting
     alarms: AlarmSetting
     calibration: Calibration | None = None
+    calibration_doubt: str | None = None
     index: IndexStatus
     storage: StorageStatus
     places: int
@@ -1501,6 +1543,7 @@ class PlaceMatchView(Model):
 
     at: datetime
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    run: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
     probability: float | None = None
     place: str | None = None
     change: ChangeView | None = None
@@ -1583,6 +1626,7 @@ class Readiness(Model):
     """The service is ready for requests."""
 
     status: str = "ready"
+    degraded: str | None = None
     checks: dict[str, str]
     encoder: str
     quarantined: list[QuarantinedMap]
@@ -1593,6 +1637,7 @@ class RecentAnswerView(Model):
 
     at: datetime
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    run: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
     probability: float | None = None
     place: str | None = None
     change: ChangeView | None = None
@@ -1713,6 +1758,7 @@ class ServiceState(Model):
     started_at: datetime
     uptime_seconds: float
     ready: bool
+    degraded: str | None = None
     checks: dict[str, str]
     queue: QueueState
     storage: ThreadsState
@@ -1742,6 +1788,7 @@ class SessionAnswer(Model):
     change: ChangeView | None = None
     earlier: EarlierBelief | None = None
     motion: Known[Literal["first", "sequence", "speed-limit", "odometry"]]
+    note: str | None = None
     view: Known[Literal["covered", "constant"]] | None = None
     repeated: bool = False
     restored: bool
