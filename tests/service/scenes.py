@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
 
@@ -51,7 +53,7 @@ def blank(width: int = 64, height: int = 64) -> Pixels:
     return np.zeros((height, width, 3), np.uint8)
 
 
-def encoded(pixels: Pixels, extension: str = ".jpg", quality: int = 90) -> bytes:
+def encoded(pixels: NDArray[Any], extension: str = ".jpg", quality: int = 90) -> bytes:
     """The pixels as the bytes of a file."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if extension == ".jpg" else []
     done, data = cv2.imencode(extension, pixels, options)
