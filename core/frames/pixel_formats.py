@@ -173,9 +173,13 @@ def mosaic_in(form: str, data: bytes) -> Pixels | None:
         UnfitPixels: OpenCV is needed and missing.
     """
     named = _MOSAIC.match(form)
-    if named is None:
+    if named is None or not is_file(data):
         return None
-    found: Any = _opencv(named[1]).imdecode(np.frombuffer(data, np.uint8), -1)
+    opencv = _opencv(named[1])
+    try:
+        found = opencv.imdecode(np.frombuffer(data, np.uint8), -1)
+    except opencv.error:
+        return None
     if found is None or found.ndim != 2:  # damaged, which is said where it is decoded; or colours were made of it
         return None
     return pixels_of_array(f"{named[1]}{8 * found.dtype.itemsize}", found)

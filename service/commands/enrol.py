@@ -287,7 +287,7 @@ async def _mask(service: Service, map_id: str, camera: str | None, opened: Recor
         Failure: the map has no such camera.
     """
     from core.frames.masks import Mask, with_range  # here because it takes a moment
-    from core.recordings.value_ranges import range_remark, used_range
+    from core.recordings.pictures import range_remark, used_range
 
     if camera is None:
         if (used := await asyncio.to_thread(used_range, opened.frames)) is not None:

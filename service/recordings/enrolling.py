@@ -19,8 +19,8 @@ from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
 from core.recordings.paths import check_lost_poses, traverse_of, way_of
 from core.recordings.plausibility import MOST_SPEED
+from core.recordings.pictures import range_remark, used_range
 from core.recordings.recording import LARGEST_GAP
-from core.recordings.value_ranges import range_remark, used_range
 from service.engine.engine import Engine
 from service.http.multipart import FormPart
 from service.http.uploads import check_part

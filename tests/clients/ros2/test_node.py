@@ -348,7 +348,7 @@ def test_raw_pictures_of_a_wrong_encoding_are_said_once(robot: Robot) -> None:
         fields: dict[str, object] = {"width": 320, "height": 240, "stamp": robot.BASE + number}
         robot.peer.do("publish", topic="/image", kind="Image", encoding="32FC1", file=depth, **fields)
         robot.peer.do("publish", topic="/image", kind="Image", encoding="bgr8", file=grey, **fields)
-    robot.says("bytes in rows of")
+    robot.says("in rows of 960 bytes")
     assert robot.log().count("The encoding '32FC1' is not read") == 1
 
 
