@@ -177,6 +177,10 @@ class MergeConflict(Problem):
     """409 ``merge-conflict``: The maps cannot be merged as they are."""
 
 
+class MixedCoordinates(Problem):
+    """409 ``mixed-coordinates``: The map has coordinates of the other kind."""
+
+
 class PlaceTaken(Problem):
     """409 ``place-taken``: The place has another frame."""
 
@@ -552,6 +556,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "look-name-taken": LookNameTaken,
     "map-exists": MapExists,
     "merge-conflict": MergeConflict,
+    "mixed-coordinates": MixedCoordinates,
     "place-taken": PlaceTaken,
     "recording-in-use": RecordingInUse,
     "recording-offset": RecordingOffset,
