@@ -891,6 +891,20 @@ class FleetAlarm(Model):
     sentence: str
 
 
+class FleetLost(Model):
+    """A robot that was told no place for half a minute, until it was told one three times in a row."""
+
+    map: str
+    name: str | None = None
+    session: str | None = None
+    camera: str | None = None
+    place: str | None = None
+    raised: bool
+    since: datetime
+    cleared_at: datetime | None = None
+    last_at: datetime | None = None
+
+
 class HourCount(Model):
     """How many answers had each verdict within an hour."""
 
@@ -932,6 +946,7 @@ class FleetState(Model):
     maps: list[FleetMap]
     robots: list[FleetRobot]
     alarms: list[FleetAlarm]
+    lost: list[FleetLost]
 
 
 class FrameReport(Model):
@@ -1499,6 +1514,7 @@ class PlaceMatchView(Model):
 
     at: datetime
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    run: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
     probability: float | None = None
     place: str | None = None
     change: ChangeView | None = None
@@ -1581,6 +1597,7 @@ class Readiness(Model):
     """The service is ready for requests."""
 
     status: str = "ready"
+    degraded: str | None = None
     checks: dict[str, str]
     encoder: str
     quarantined: list[QuarantinedMap]
@@ -1591,6 +1608,7 @@ class RecentAnswerView(Model):
 
     at: datetime
     verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    run: Known[Literal["recognized", "ambiguous", "unknown"]] | None = None
     probability: float | None = None
     place: str | None = None
     change: ChangeView | None = None
@@ -1711,6 +1729,7 @@ class ServiceState(Model):
     started_at: datetime
     uptime_seconds: float
     ready: bool
+    degraded: str | None = None
     checks: dict[str, str]
     queue: QueueState
     storage: ThreadsState
