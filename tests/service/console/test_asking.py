@@ -222,6 +222,28 @@ def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, key
     page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
 
 
+def test_live_answers_name_the_frame_alone_and_the_run_and_say_what_was_tried_in_a_console(
+    admin: Operator, keyed: Server
+) -> None:
+    page = admin.go(f"maps/{LAB}/live")
+    page.get_by_text("listening").wait_for()
+    session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]
+    path, kind = f"/v1/maps/{LAB}/sessions/{session}/frames", {"Content-Type": "image/jpeg"}
+    told = keyed.client.post(path, content=foreign_frame(2100), headers=kind).json()
+    line = page.get_by_role("list", name="Answers").get_by_role("listitem").first
+    expect(line).to_contain_text(
+        re.compile(rf"{told['single']['verdict']}\s*this frame alone\s*.*{told['verdict']}\s*the run")
+    )
+    line.get_by_role("button", name="Why").click()
+    expect(page.get_by_role("dialog")).to_contain_text(re.compile("this frame alone.*the run"))
+    page.keyboard.press("Escape")
+    tried = {**kind, "X-Placerec-Console": "1"}
+    keyed.client.post(f"/v1/maps/{LAB}/query", content=frame_again(4), headers=tried).raise_for_status()
+    expect(line).to_contain_text("tried in a console, not counted")
+    expect(line).not_to_contain_text("the run")
+    keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")
+
+
 @pytest.mark.thorough
 def test_a_question_is_asked_again_with_its_filters(admin: Operator, keyed: Server) -> None:
     page = admin.go(f"maps/{LAB}/live")
