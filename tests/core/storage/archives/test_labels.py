@@ -148,9 +148,7 @@ def line(**values: Any) -> Callable[[bytes], bytes]:
         (uneven, "differ in the number of frames"),
     ],
 )
-def test_what_is_no_label_is_refused(
-    reviewed: Map, tmp_path: Path, change: Callable[[bytes], bytes], why: str
-) -> None:
+def test_what_is_no_label_is_refused(reviewed: Map, tmp_path: Path, change: Callable[[bytes], bytes], why: str) -> None:
     content = exported(reviewed, tmp_path / "kept")
     (tmp_path / "other").mkdir()
     path = tmp_path / "other/sent.tar"
