@@ -507,6 +507,29 @@ class Calibration(Model):
     geometry: GeometryTerms | None = None
 
 
+class Stated(Model):
+    """The probabilities that a calibration states for some answers."""
+
+    probability: float
+    error: float
+
+
+class KindChange(Model):
+    """The probabilities of one kind of answers, before and after."""
+
+    answers: int
+    before: Stated
+    after: Stated
+
+
+class HeldOutChange(Model):
+    """What a calibration changes for answers that had no part in it."""
+
+    known: KindChange | None = None
+    strangers: KindChange | None = None
+    worse: str | None = None
+
+
 class Reliability(Model):
     """The reliability of stated probabilities over n answers whose truth is known."""
 
@@ -563,7 +586,7 @@ class Target(Model):
 
 
 class CalibrationReport(Model):
-    """A calibration, and the measurement that it rests on."""
+    """A calibration, the measurement that it rests on, and what it would change."""
 
     map: str
     encoder: str
@@ -573,6 +596,7 @@ class CalibrationReport(Model):
     calibration: Calibration
     previous: Calibration
     measurement: Measurement
+    change: HeldOutChange | None = None
     warnings: list[str]
 
 
@@ -1353,6 +1377,7 @@ class MapHealth(Model):
     map: str
     places: int
     complete: bool
+    calibration_doubt: str | None = None
     answers: AnswersView
     never_matched: SilentPlaces | None = None
     aliasing: AliasingView
@@ -1420,6 +1445,7 @@ class MapView(Model):
     learning: LearningSetting
     alarms: AlarmSetting
     calibration: Calibration | None = None
+    calibration_doubt: str | None = None
     index: IndexStatus
     storage: StorageStatus
     places: int

@@ -1268,6 +1268,88 @@ class AlarmChanges(TypedDict):
     quiet_stretches: NotRequired[int | None]
 
 
+class Curve(TypedDict):
+    """P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), d a decision value."""
+
+    slope: float
+    """Log odds gained by a decision value greater by one."""
+
+    intercept: float
+    """Log odds at the decision value 0."""
+
+    imagined_slope: NotRequired[float]
+    """Added to the slope where the whole background is imagined; left out if 0."""
+
+    imagined_intercept: NotRequired[float]
+    """Added to the intercept where the whole background is imagined; left out if 0."""
+
+
+class Environment(TypedDict):
+    """The prior of the scores of other places of one environment, in units of the score (see the module). ``mean``
+    and ``deviation`` are μ₀ and σ₀; ``mean_weight`` and ``deviation_weight`` are κ₀ and ν₀, the number of scores
+    that the prior counts as.
+    """
+
+    mean: float
+
+    deviation: float
+
+    mean_weight: float
+
+    deviation_weight: float
+
+
+class GeometryTerms(TypedDict):
+    """How evidence joins the log odds of the first two stages (see the module)."""
+
+    support: float
+    """Weight of the log odds of the first two stages."""
+
+    slope: float
+    """Log odds gained by an evidence e times greater."""
+
+    lead: NotRequired[float]
+    """Log odds gained where the map has other places and none of them fits nearly as well."""
+
+    intercept: float
+    """Log odds where nothing says anything."""
+
+
+class Calibration(TypedDict):
+    """When to believe a match; measured on frames held out of training. ``threshold`` is on the decision value,
+    ``margin`` on the difference of two scores. ``background_mean`` and ``background_deviation`` describe the score
+    of unrelated frames, in units of the score. ``curve`` gives the probability that a decision value is right; a
+    calibration on frames that are all alike has none. ``decision`` names the kind of decision value. ``environment``
+    describes the scores of other places of one environment, which stand for those that a small map does not have
+    yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
+    ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes
+    the order of the candidates only.
+    """
+
+    source: str
+
+    threshold: float
+
+    margin: float
+
+    background_mean: float
+
+    background_deviation: float
+
+    curve: NotRequired[Curve | None]
+
+    decision: NotRequired[str]
+
+    frames: NotRequired[int | None]
+    """Held-out or labelled frames it rests on, if known."""
+
+    environment: NotRequired[Environment | None]
+    """Scores of other places within one environment; null: not measured."""
+
+    geometry: NotRequired[GeometryTerms | None]
+    """How geometric evidence joins the probability; null: it does not."""
+
+
 class CalibrationChanges(TypedDict):
     """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
@@ -1280,6 +1362,9 @@ class CalibrationChanges(TypedDict):
     """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
     was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
     """
+
+    restore: NotRequired[Calibration | None]
+    """Put back, instead, a calibration that the map had, whole, as it was read: to undo a change."""
 
 
 class Pose(TypedDict):
