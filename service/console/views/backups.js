@@ -2,6 +2,7 @@
 import { get, post, send } from "../shared/api.js";
 import { ExactMoment, Facts, Field, FormDialog, Head, Nothing, NumberInput, Pill, say, Trouble } from "../shared/elements.js";
 import { bytes, counted, integer } from "../shared/formats.js";
+import { NOT_SAVED, SAVED } from "../shared/saved.js";
 import { JobProgress } from "../shared/jobs.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href } from "../shared/router.js";
@@ -56,7 +57,7 @@ export default function Backups() {
             ? html`<${Nothing} title="No backup yet" />`
             : html`
               <${Table} items=${items} />
-              <p class="faint small">Each is a folder beside the service, which <code>placerec backup verify</code> and <code>placerec backup restore</code> read. A map that has not changed takes no room again.</p>
+              <p class="faint small">Each is a folder beside the service, which <code>placerec backup verify</code> and <code>placerec backup restore</code> read. A map that has not changed takes no room again. Of each map ${SAVED}. ${NOT_SAVED}</p>
             `}
         `}
     <//>

@@ -217,7 +217,7 @@ function Delete({ map, places, close, changed }) {
   };
   return html`
     <${ByName} title=${`Delete ${map}`} name=${map} action="Delete the map" close=${close} send=${destroy}>
-      <p>The map is deleted with ${places === undefined ? "everything in it" : `its ${counted(places, "place")}`}, its pictures and its calibration. This cannot be undone; export it first if it may be wanted again.</p>
+      <p>The map is deleted with ${places === undefined ? "everything in it" : `its ${counted(places, "place")}`}, its pictures, its calibration and its review. This cannot be undone; export it first if it may be wanted again. In an export ${SAVED}. ${NOT_SAVED}</p>
     <//>
   `;
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -39,13 +38,20 @@ PERSON = {
 """A calibration by which every answer of :func:`answers` is right with a probability of ½."""
 
 
-@pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    """A service without a server, whose map ``hall`` has no places, and a calibration that a person gave it."""
-    with TestClient(create_app(Settings(data_dir=tmp_path), as_owner=True)) as made:
-        assert made.post("/v1/maps", json={"id": "hall"}).status_code == 201
-        assert patch(made, {"restore": PERSON}).json()["calibration"] == PERSON
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service without a server."""
+    with TestClient(create_app(Settings(data_dir=tmp_path_factory.mktemp("calibrated")), as_owner=True)) as made:
         yield made
+
+
+@pytest.fixture
+def client(service: TestClient) -> TestClient:
+    """The service, with a new map ``hall`` of no places, and with a calibration that a person gave it."""
+    service.delete(HALL)
+    assert service.post("/v1/maps", json={"id": "hall"}).status_code == 201
+    assert patch(service, {"restore": PERSON}).json()["calibration"] == PERSON
+    return service
 
 
 def patch(client: TestClient, calibration: object, tag: str | None = None) -> httpx.Response:
