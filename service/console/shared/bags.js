@@ -36,7 +36,7 @@ async function upload(map, file, name, tell, signal) {
   }
 }
 
-const NO_OPTIONS = { topic: "", pose_topic: "", fixed_frame: "", moving_frame: "", every_metres: NaN, every_seconds: NaN, keep_standing: false, align: false };
+const NO_OPTIONS = { topic: "", pose_topic: "", fixed_frame: "", moving_frame: "", every_metres: NaN, every_seconds: NaN, keep_standing: false, allow_lost_poses: false, align: false };
 
 const MOST_APART = 1e6;
 
@@ -73,6 +73,7 @@ export function Bags({ map, files, sequence, camera, enrolled }) {
         <${Field} label="A frame every, seconds"><${NumberInput} min="0" step="any" value=${options.every_seconds} change=${(seconds) => change({ every_seconds: seconds })} /><//>
       </div>
       <label class="field check"><input type="checkbox" checked=${options.keep_standing} onChange=${() => change({ keep_standing: !options.keep_standing })} /><span>Also frames in which nothing has moved</span></label>
+      <label class="field check"><input type="checkbox" checked=${options.allow_lost_poses} onChange=${() => change({ allow_lost_poses: !options.allow_lost_poses })} /><span>Also a bag of which more than a tenth of the frames lose their pose</span></label>
       <label class="field check"><input type="checkbox" checked=${options.align} onChange=${() => change({ align: !options.align })} /><span>Then align the traverse with those that the map has</span></label>
       ${wrong && html`<p class="notice" role="alert">${wrong}</p>`}
       ${files.map((file) => html`<${Bag} key=${nameOf(file)} map=${map} file=${file} order=${order} wrong=${wrong} enrolled=${enrolled} />`)}

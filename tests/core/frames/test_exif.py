@@ -53,6 +53,15 @@ def test_position_and_satellite_time(name: str) -> None:
     assert moment == datetime(2026, 11, 20, 9, 30, 15, tzinfo=UTC)
 
 
+@pytest.mark.parametrize("zeros", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.001)])
+def test_zeros_are_no_position(zeros: tuple[float, float, float]) -> None:
+    data = photograph(gps=GPS | {2: zeros, 4: (0.0, 0.0, 0.0)})
+    pose, moment = read_pose_and_time(data)
+    assert pose is None and moment is not None
+    assert read_pose_and_time(data, with_zeros=True)[0] == Pose(latitude=zeros[2] / 3600, longitude=0.0)
+    assert read_pose_and_time(photograph(gps=GPS | {2: zeros}))[0] is not None, "the equator is a place"
+
+
 def test_south_and_west_are_negative() -> None:
     pose, _ = read_pose_and_time(photograph(gps=GPS | {1: "S", 3: "W"}))
     assert pose is not None

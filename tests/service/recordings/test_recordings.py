@@ -24,6 +24,7 @@ from tests.core.recordings.bags import (
     camera_info,
     compressed,
     image,
+    moved,
     walk,
     write_mcap,
     write_ros1,
@@ -127,6 +128,34 @@ def test_other_kinds_of_bags_are_taken_too(taking: Server, kind: str, tmp_path: 
         assert seen[-1] == path.stat().st_size == lab.recordings.size(name)
         result = lab.recordings.enrol(name, pose_topic=ODOMETRY, every_metres=2.0, keep_standing=True).wait().result
         assert result and (result["sequence"], result["chosen"], lab.recordings.size(name)) == ("walk", 3, 0)
+
+
+def test_a_bag_that_loses_its_poses_is_refused_unless_allowed(taking: Server, tmp_path: Path) -> None:
+    seen = [compressed(START + n * SECOND, jpeg(n)) for n in range(4)]
+    alternating = [moved(START + n * SECOND // 10, n / 10 + 500 * (n % 2), 0.0) for n in range(40)]
+    data = write_mcap(tmp_path / "two.mcap", [*seen, *alternating]).read_bytes()
+    taking.create_map("losing")
+    assert put(taking, "losing", "two.mcap", 0, data).status_code == 200
+    problem = enrolled(taking, "losing", "two.mcap", **ORDER)["problem"]
+    assert problem["status"] == 422 and problem["type"].endswith(":invalid-trajectory")
+    assert "4 of 4 frames lose their pose" in problem["detail"] and "allow_lost_poses" in problem["detail"]
+    assert "--" not in problem["detail"] and places(taking, "losing") == {}
+    result = enrolled(taking, "losing", "two.mcap", allow_lost_poses=True, **ORDER)["result"]
+    assert (result["posed"], result["path"]) == (0, None) and "two publishers" in result["remarks"][0]
+
+
+def test_a_bag_whose_odometry_begins_anew_gives_two_traverses(taking: Server, tmp_path: Path) -> None:
+    seen = [compressed(START + n * SECOND, jpeg(n)) for n in range(4)]
+    told = [moved(START + n * SECOND // 10, n - 20.0 * (n >= 20), 0.0) for n in range(40)]
+    data = write_mcap(tmp_path / "anew.mcap", [*seen, *told]).read_bytes()
+    taking.create_map("anew")
+    assert put(taking, "anew", "anew.mcap", 0, data).status_code == 200
+    result = enrolled(taking, "anew", "anew.mcap", **ORDER)["result"]
+    assert result["sequences"] == ["monday", "monday~2"] and result["posed"] == 2
+    assert result["path"] == "path 10 m, extent 10 × 0.0 m, 2 of 4 frames with a pose"
+    assert "begins anew" in result["remarks"][0] and "~2" in result["remarks"][1]
+    found = [(one["sequence"], one["pose"] is None) for one in places(taking, "anew").values()]
+    assert sorted(found) == [("monday", False)] * 2 + [("monday~2", True)] * 2
 
 
 def test_a_camera_without_intrinsics_gets_those_of_the_bag(taking: Server, placerec: Placerec, tmp_path: Path) -> None:

@@ -230,6 +230,36 @@ def test_poses_come_from_satellites_and_files(placerec: Placerec, tmp_path: Path
     assert "path.tum, line 1: 3 values are neither" in bad.stderr
 
 
+def test_a_recording_that_loses_its_poses_is_refused_unless_allowed(placerec: Placerec, tmp_path: Path) -> None:
+    told = [moved(START + n * SECOND // 10, n / 10 + 500 * (n % 2), 0.0) for n in range(40)]
+    bag = write_mcap(tmp_path / "walk.mcap", [*small_walk(4), *told])
+    words = ("enrol", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)
+    refused = placerec(*words, status=1)
+    assert "4 of 4 frames lose their pose, more than a tenth: /odom alternates between two publishers" in refused.stderr
+    assert "--allow-lost-poses" in refused.stderr
+    assert json.loads(placerec("maps", "list", "--json").stdout)["items"] == [], "nothing was created"
+    done = placerec(*words, "--allow-lost-poses")
+    assert "4 of 4 frames are places" in done.stdout and "0 with a pose" in done.stdout
+
+
+def test_odometry_that_begins_anew_gives_two_traverses(placerec: Placerec, tmp_path: Path) -> None:
+    told = [moved(START + n * SECOND // 10, n - 20.0 * (n >= 20), 0.0) for n in range(40)]
+    bag = write_mcap(tmp_path / "walk.mcap", [*small_walk(4), *told])
+    done = placerec("enrol", bag, "--map", "lab", "--create", "--pose-topic", ODOMETRY)
+    assert "Path 10 m, extent 10 × 0.0 m, 2 of 4 frames with a pose." in done.stderr
+    assert "leaps once, by 19.0 m within 0.1 s (at 1700000002.000 s) and goes on from there" in done.stderr
+    assert "sequence walk, walk~2: 4 created; 2 with a pose" in done.stdout
+    places, _ = stored(tmp_path / "data", "lab")
+    assert [(one["sequence"], one["pose"] is not None) for one in places] == [
+        ("walk", True),
+        ("walk", True),
+        ("walk~2", False),
+        ("walk~2", False),
+    ]
+    again = placerec("enrol", bag, "--map", "lab", "--pose-topic", ODOMETRY)
+    assert "4 unchanged" in again.stdout and "0 sent" in again.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
