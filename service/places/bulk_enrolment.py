@@ -55,12 +55,13 @@ Align = Callable[[Engine, JobContext, Sequence[str]], list[dict[str, Any]]]
 
 
 async def receive(
-    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request, align: bool = False
+    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request, align: bool = False, replace: bool = True
 ) -> Job:
     """Write a form to disk as it arrives, and submit a job for it; both are on disk when this returns.
 
     Args:
         align: whether the job aligns the traverses of the form with those that the map has.
+        replace: whether its frames replace places of other frames.
 
     Raises:
         JobQueueFull, StagingFull: the form was not read.
@@ -79,15 +80,15 @@ async def receive(
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
     name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align))
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align, replace))
 
 
-def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool) -> Job:
+def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool, replace: bool) -> Job:
     """Submit a job for a form; if that fails, the form is removed."""
     try:
         count = len(_read_form(engine, staging.open(name))[0])
         maps = {map_.record.id: creation_time(map_)}
-        arguments = {"form": name, "places": count, "align": align}
+        arguments = {"form": name, "places": count, "align": align, "replace": replace}
         return jobs.submit(KIND, map_.record.id, arguments=arguments, maps=maps)
     except BaseException:
         staging.remove(name)
@@ -128,7 +129,8 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
     form = _Form(engine, staging, context)
-    result = EnrolmentInCommits(engine, context, form.entries, form.frame).run()
+    replace = bool(context.arguments.get("replace", True))
+    result = EnrolmentInCommits(engine, context, form.entries, form.frame, replace=replace).run()
     if not context.arguments.get("align", False):
         return result
     return {**result, "aligned": align(engine, context, form.sequences())}
@@ -164,6 +166,7 @@ class EnrolmentInCommits:
         frame: reads the frame of an entry by its position; an error that concerns this frame alone is reported.  It may
             give way, after which it is asked for the same frame again.
         gives_way: whether other jobs may come between two commits, after which the entries are read again.
+        replace: whether a frame replaces the place of another frame.
     """
 
     def __init__(
@@ -173,9 +176,10 @@ class EnrolmentInCommits:
         entries: Sequence[Any],
         frame: Callable[[int], FrameToEnrol],
         gives_way: bool = True,
+        replace: bool = True,
     ) -> None:
         self.engine, self.context, self.entries, self._frame = engine, context, entries, frame
-        self._gives_way = gives_way
+        self._gives_way, self._replace = gives_way, replace
         self.map = context.map(engine.maps)
         nothing = {"done": 0, "changes": {}, "failed": 0, "named": []}
         self.outcome = _Outcome(**context.notes.get("told", nothing))
@@ -232,7 +236,9 @@ class EnrolmentInCommits:
             failures[positions[index]] = error
 
         async def work(deadline: RequestDeadline) -> dict[int, Enrolled]:
-            return await enrol(self.engine, self.map, frames, deadline, reject, queued=False)
+            return await enrol(
+                self.engine, self.map, frames, deadline, reject, queued=False, replace_places=self._replace
+            )
 
         stored = run_after_requests(self.engine, self.context, work) if frames else {}
         for one in stored.values():

@@ -107,6 +107,11 @@ class BatchParameters(Parameters):
         description="With background: align the traverses of the form with those that the map has, once all frames "
         "are enrolled, as POST …/align does; the job's result has the reports in `aligned`.",
     )
+    replace: bool = Field(
+        default=True,
+        description="Whether a frame replaces the place of another frame that has its id; else it fails alone with 409 "
+        "places-taken. The same frame is never one of these.",
+    )
     batch: BatchName = Field(
         default=None,
         description="A name for this batch, for example a random one, to which another batch can refer with after.",
