@@ -148,8 +148,8 @@ class Keyring:
         """The holder of the key in an ``Authorization`` header.
 
         Raises:
-            KeyNeeded: there is no header, or it does not have the form ``Bearer placerec_…``.
-            KeyRefused: the key is unknown, expired or revoked.
+            KeyNeeded: there is no header, or it has no key behind ``Bearer``.
+            KeyRefused: the key is unknown, cut, expired or revoked.
             KeysUnreadable: the keys are not known, because their file cannot be read.
         """
         known = self._known
@@ -162,13 +162,15 @@ class Keyring:
         scheme, _, token = authorization.strip().partition(b" ")
         token = token.strip()
         found = TOKEN.fullmatch(token.decode("latin-1"))
-        if scheme.lower() != b"bearer" or found is None:
+        if scheme.lower() != b"bearer" or not token:
             raise KeyNeeded("Send the whole key in the header 'Authorization: Bearer placerec_…'.")
+        if found is None:
+            raise KeyRefused("This key is not known: it is no whole key of the form placerec_….")
         held = known.held.get(found[1].encode())
         # The comparison takes the same time for an unknown id.
         is_right = hmac.compare_digest(digest_of(token), NO_DIGEST if held is None else held.key.digest)
         if held is None or not is_right:
-            raise KeyRefused("The service does not know this key.")
+            raise KeyRefused("This key is not known.")
         if held.key.revoked_at is not None:
             raise KeyRefused(f"The key {held.key.name!r} was revoked.")
         now = self._wall()

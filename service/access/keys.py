@@ -73,7 +73,7 @@ class Key:
 
     Args:
         id: 12 hexadecimal digits, which are part of the key.
-        name: of the key's holder; unique among the keys in force.
+        name: of the key's holder; unique among the keys in force, but for those that one of them replaces.
         role: of its holder.
         maps: ids of the maps that it is limited to; None for all maps.
         learn: whether maps may learn from the runs of its holder; only with the role ``enrol``, and ``admin`` has it.
@@ -165,14 +165,17 @@ class Keys:
         expires_at: datetime | None = None,
         keep_admin: bool = False,
         learn: bool = False,
+        replaces: str | None = None,
     ) -> tuple[Key, str]:
         """Create a key; return it and its text, which is not stored.  It is on disk when this returns.
 
         Args:
             learn: whether maps may learn from the runs of its holder.
             keep_admin: refuse a key after which none in force can manage the service.
+            replaces: the id of a key in force, whose name this one may have, for that one is about to end.
 
         Raises:
+            UnknownKey: there is no key that it ``replaces``.
             InvalidRequest: the name, the role or the expiry cannot be used.
             KeyExists: another key in force has the name.
             InvalidIdentifier: the id of a map is not valid.
@@ -200,7 +203,9 @@ class Keys:
             self.place.prepare()
         with self.place.changing() as connection:
             keys = _read(connection)
-            if any(other.name == name and in_force(other, now) for other in keys):
+            before = None if replaces is None else _of_id(keys, replaces)
+            goes_on = before is not None and before.name == name and in_force(before, now)
+            if not goes_on and any(other.name == name and in_force(other, now) for other in keys):
                 raise KeyExists(f"There is already a key {name!r}. Delete it first, or choose another name.")
             if len(keys) >= MOST_KEYS:
                 raise TooManyKeys(f"{MOST_KEYS} keys were created, which is the most that one data directory holds.")

@@ -143,6 +143,7 @@ OPERATIONS: dict[str, Rule] = {
     # Places, traverses, cameras: the objects that an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
+    "compare_places": Rule("enrol", "path"),
     "read_recording": Rule("enrol", "path"),
     "upload_recording": Rule("enrol", "path", changes=True),
     "enrol_recording": Rule("enrol", "path", changes=True),

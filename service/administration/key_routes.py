@@ -95,7 +95,7 @@ def _position(key: Key) -> str:
     "",
     status_code=201,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*BODY_PROBLEMS, FirstKeyLocal, KeyExists, TooManyKeys, LastAdminKey),
+    responses=problem_documentation(*BODY_PROBLEMS, FirstKeyLocal, KeyExists, UnknownKey, TooManyKeys, LastAdminKey),
 )
 def create_key(
     new: NewKey,
@@ -119,7 +119,7 @@ def create_key(
             "machine, with 'placerec keys create'."
         )
     request.state.noted = _noted(new.model_dump(include={"name", "role", "maps", "learn"}))
-    key, token = store.create(new.name, new.role, new.maps, new.expires_at, not lock_out, new.learn)
+    key, token = store.create(new.name, new.role, new.maps, new.expires_at, not lock_out, new.learn, new.replaces)
     _take_effect(gate)
     request.state.noted["changed_key"] = key.id
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{key.id}"

@@ -114,6 +114,12 @@ class NewKey(BaseModel):
         "includes it.",
     )
     expires_at: Timestamp | None = Field(default=None, description="When it expires; null or left out: never.")
+    replaces: str | None = Field(
+        default=None,
+        max_length=64,
+        description="The id of a key in force whose name this one has, to take its place. Then end that one, by its "
+        "`expires_at` or by deleting it.",
+    )
 
 
 class KeyChanges(BaseModel):

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import re
+import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from core.errors import InvalidIdentifier
-from core.names import composed
+from core.names import LONGEST
 from core.places import check_sequence
-from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames
+from placerec_client.errors import InvalidFrame
+from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames, load
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, progress, remark, say
 from service.commands.jobs import offered_calibration, show_outcome, submit
@@ -64,6 +67,15 @@ class Report:
             self.posed += outcome.posed
 
 
+@dataclass(frozen=True)
+class _Wanted:
+    """How the traverse is called, whether somebody chose this name, and whether places of other frames are replaced."""
+
+    sequence: str
+    named: bool
+    replace: bool
+
+
 def enrol(
     recording: Annotated[
         Path,
@@ -84,9 +96,20 @@ def enrol(
         typer.Option(help="Pictures that a map that is created stores of each frame."),
     ] = None,
     sequence: Annotated[
-        str | None, typer.Option(help="Name of the traverse; default: the name of RECORDING.", show_default=False)
+        str | None,
+        typer.Option(
+            help="Name of the traverse; default: the name of RECORDING, with ~2 and so on where the map has another "
+            "traverse of this name.",
+            show_default=False,
+        ),
     ] = None,
     id_prefix: Annotated[str, typer.Option(help="Prefix of the ids that are made from names of files or topics.")] = "",
+    replace_places: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Replace places of other frames that have these ids; without it nothing is sent then."
+        ),
+    ] = False,
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
@@ -134,7 +157,8 @@ def enrol(
     their extension. The frames of a bag are taken in the order of their header
     stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
     shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
-    The command can be interrupted and run again: a frame that is already enrolled is not sent again.
+    The command can be interrupted and run again: a frame that is already enrolled is not sent again. Where the map has
+    places of other frames under these ids, nothing is sent, unless they are to be replaced.
     """
     options = RecordingOptions(
         topic,
@@ -156,8 +180,10 @@ def enrol(
     with options.open(recording, id_prefix) as opened:
         from core.recordings.paths import check_lost_poses, traverse_of, way_of  # here because it takes a moment
 
-        name = opened.name if sequence is None else sequence
-        traverses = [_checked_sequence(one) for one in dict.fromkeys(traverse_of(name, one) for one in opened.frames)]
+        chosen_name = _checked_sequence(opened.name if sequence is None else sequence)
+        wanted = _Wanted(chosen_name, sequence is not None, replace_places)
+        for one in {traverse_of(chosen_name, frame) for frame in opened.frames}:
+            _checked_sequence(one)
         if not allow_lost_poses:
             check_lost_poses(opened)
 
@@ -166,9 +192,11 @@ def enrol(
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             if (way := way_of(chosen)) is not None:
                 remark(f"{way[0].upper()}{way[1:]}.")
-            return [FrameToSend(taken, traverse_of(name, taken), camera) for taken in chosen]
+            return [FrameToSend(taken, wanted.sequence, camera) for taken in chosen]
 
-        report, frames = run(_enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened))
+        report, frames, traverses = run(
+            _enrol(target, map_id, choose, wanted, camera, create, {"encoder": encoder, "keep": keep}, opened)
+        )
     _show(report, map_id, ", ".join(traverses), frames, time.monotonic() - began)
     for one in traverses if align else ():
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": one}, wait=True))
@@ -212,23 +240,29 @@ async def _enrol(
     target: CommandTarget,
     map_id: str,
     choose: Callable[[str | None, Mask | None], list[FrameToSend]],
+    wanted: _Wanted,
     camera: str | None,
     create: bool,
-    wanted: dict[str, str | None],
+    settings: dict[str, str | None],
     opened: Recording,
-) -> tuple[Report, int]:
+) -> tuple[Report, int, list[str]]:
     """Enrol the frames that ``choose`` gives for the map's encoder and the camera's mask.
 
     Returns:
-        The outcome, and the number of frames.
+        The outcome, the number of frames, and the names of their traverses.
     """
+    from core.recordings.paths import traverse_of  # here because it takes a moment
+
     report = Report()
     async with open_service(target) as service:
-        given = {key: value for key, value in wanted.items() if value is not None}
+        given = {key: value for key, value in settings.items() if value is not None}
         used = await _ready_map(service, map_id, camera, create, given)
         mask = await _mask(service, map_id, camera, opened)
         frames = await asyncio.to_thread(choose, used, mask)
-        known = await _check_ids(service, map_id, frames)
+        known, name = await _compare(service, map_id, frames, wanted, camera)
+        if name != wanted.sequence:
+            remark(f"The map has a traverse {wanted.sequence!r} already; these frames are in {name!r}.")
+        frames = [replace(frame, sequence=traverse_of(name, frame.taken)) for frame in frames]
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {map_id}", total=len(frames))
 
@@ -237,13 +271,13 @@ async def _enrol(
                 bar.advance(task)
 
             try:
-                await enrol_frames(service, map_id, frames, known, wanted["encoder"], report_frame)
+                await enrol_frames(service, map_id, frames, known, settings["encoder"], report_frame, wanted.replace)
             except Failure as failure:
                 done = sum(report.changes.values())
                 raise Failure(
                     f"{failure} {done} of {len(frames)} frames are enrolled; run the command again to continue."
                 ) from failure
-    return report, len(frames)
+    return report, len(frames), list(dict.fromkeys(frame.sequence for frame in frames))
 
 
 async def _ready_map(
@@ -316,21 +350,59 @@ async def _mask(service: Service, map_id: str, camera: str | None, opened: Recor
     return with_range(areas, found["value_range"])
 
 
-async def _check_ids(service: Service, map_id: str, frames: Sequence[FrameToSend]) -> frozenset[str]:
-    """The frames' ids that the map already has; those of another traverse are refused, not overwritten."""
-    wanted = {frame.id for frame in frames}
-    known: dict[str, Any] = {}
-    async for page in service.pages(path_of("maps", map_id, "places")):
-        known.update({place["id"]: composed(place["sequence"]) for place in page["items"] if place["id"] in wanted})
-    taken = [frame for frame in frames if frame.id in known and known[frame.id] != frame.sequence]
-    if taken:
-        other = known[taken[0].id]
-        raise Failure(
-            f"{len(taken)} ids of this traverse belong to places of another one ({taken[0].id!r} is in "
-            f"{'no sequence' if other is None else repr(other)}). Give --id-prefix, for instance "
-            f"--id-prefix {taken[0].sequence}-, or the right --sequence."
-        )
-    return frozenset(known)
+async def _compare(
+    service: Service, map_id: str, frames: Sequence[FrameToSend], wanted: _Wanted, camera: str | None
+) -> tuple[frozenset[str], str]:
+    """The frames' ids that the map already has, and the name under which to enrol them.
+
+    Raises:
+        Failure: places of other frames or other traverses have these ids, and are not to be replaced.
+    """
+    # Here because it takes a moment.
+    from service.places.comparison import MOST_COMPARED, TakenPlace, TraverseComparison, taken_text
+
+    # A name that nobody chose is settled by the first frames that the map has, or else is one that is free.
+    name, named, free = wanted.sequence, wanted.named or wanted.replace, wanted.sequence
+
+    async def taken_of(items: Sequence[dict[str, str]], settle: bool) -> list[TakenPlace]:
+        nonlocal name, named, free
+        taken: list[TakenPlace] = []
+        for start in range(0, len(items), MOST_COMPARED):
+            order = {"places": items[start : start + MOST_COMPARED], "sequence": name, "named": named, "camera": camera}
+            answer = await service.request("POST", path_of("maps", map_id, "places") + ":compare", json=order)
+            told = TraverseComparison.model_validate_json(answer.content)
+            taken += told.taken
+            free = str(told.free)
+            if settle:
+                name, named = str(told.sequence), True
+        return taken
+
+    by_id = {frame.id: frame for frame in frames if 0 < len(frame.id) <= LONGEST}
+    there = [one.id for one in await taken_of([{"id": place_id} for place_id in by_id], settle=False)]
+    if wanted.replace:
+        return frozenset(there), name
+    digests = {place_id: await asyncio.to_thread(_digest, by_id[place_id]) for place_id in there}
+    read = [{"id": place_id, "sha256": digest} for place_id, digest in digests.items() if digest is not None]
+    taken = await taken_of(read, settle=True)
+    if not taken:
+        return frozenset(there), name if named else free
+    told = taken_text(taken, len(frames))
+    of = {one.sequence for one in taken}
+    ways = [
+        f"--sequence {shlex.quote(free)} --id-prefix {shlex.quote(free + '-')} to enrol them beside",
+        "--replace to replace them",
+    ]
+    if all(one.same for one in taken) and len(of) == 1 and (theirs := of.pop()) is not None:
+        ways.insert(0, f"--sequence {shlex.quote(theirs)} to go on with it")
+    raise Failure(f"{told} Give {', '.join(ways[:-1])}, or {ways[-1]}.")
+
+
+def _digest(frame: FrameToSend) -> str | None:
+    """The SHA-256 of a frame; None if it cannot be read, which is told where it is sent."""
+    try:
+        return hashlib.sha256(load(frame)).hexdigest()
+    except InvalidFrame:
+        return None
 
 
 def _show(report: Report, map_id: str, sequence: str, frames: int, seconds: float) -> None:

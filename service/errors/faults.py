@@ -90,6 +90,10 @@ class FrameNeeded(Fault):
     """The frame was named by its digest, but the place has another frame or does not exist."""
 
 
+class PlacesTaken(Fault):
+    """Places of other frames have the ids of these, and nobody said that they are to be replaced."""
+
+
 class BatchOutOfOrder(Fault):
     """The batch was to be stored after another one, which is not stored; nothing of it was stored."""
 

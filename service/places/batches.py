@@ -11,7 +11,14 @@ from starlette.requests import Request
 from core import errors
 from core.maps.cameras import KnownCameras
 from core.places import check_place_id
-from service.errors.faults import Fault, FrameNeeded, ImplausiblePose, InvalidRequest, UnsupportedMediaType
+from service.errors.faults import (
+    Fault,
+    FrameNeeded,
+    ImplausiblePose,
+    InvalidRequest,
+    PlacesTaken,
+    UnsupportedMediaType,
+)
 from service.errors.problems import Problem, request_problem
 from service.http.multipart import FormPart
 from service.http.schemas import validated
@@ -28,6 +35,7 @@ FRAME_ERRORS = (
     errors.MixedCoordinates,
     errors.UnknownCamera,
     FrameNeeded,
+    PlacesTaken,
     InvalidRequest,
     ImplausiblePose,
     UnsupportedMediaType,

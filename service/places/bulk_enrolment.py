@@ -64,12 +64,14 @@ async def receive(
     request: Request,
     align: bool = False,
     most_speed: float | None = None,
+    replace: bool = True,
 ) -> Job:
     """Write a form to disk as it arrives, and submit a job for it; both are on disk when this returns.
 
     Args:
         align: whether the job aligns the traverses of the form with those that the map has.
         most_speed: metres a second of the vehicle at most; None: as by default.
+        replace: whether its frames replace places of other frames.
 
     Raises:
         JobQueueFull, StagingFull: the form was not read.
@@ -88,17 +90,16 @@ async def receive(
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
     name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align, most_speed))
+    arguments = {"align": align, "most_speed": most_speed, "replace": replace}
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, arguments))
 
 
-def _submit(
-    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool, most_speed: float | None
-) -> Job:
+def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, arguments: Mapping[str, Any]) -> Job:
     """Submit a job for a form; if that fails, the form is removed."""
     try:
         count = len(_read_form(engine, staging.open(name))[0])
         maps = {map_.record.id: creation_time(map_)}
-        arguments = {"form": name, "places": count, "align": align, "most_speed": most_speed}
+        arguments = {"form": name, "places": count, **arguments}
         return jobs.submit(KIND, map_.record.id, arguments=arguments, maps=maps)
     except BaseException:
         staging.remove(name)
@@ -139,7 +140,9 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
     form = _Form(engine, staging, context)
-    result = {**EnrolmentInCommits(engine, context, form.entries, form.frame).run(), "remarks": form.remarks}
+    replace = bool(context.arguments.get("replace", True))
+    made = EnrolmentInCommits(engine, context, form.entries, form.frame, replace=replace).run()
+    result = {**made, "remarks": form.remarks}
     if not context.arguments.get("align", False):
         return result
     return {**result, "aligned": align(engine, context, form.sequences())}
@@ -175,6 +178,7 @@ class EnrolmentInCommits:
         frame: reads the frame of an entry by its position; an error that concerns this frame alone is reported.  It may
             give way, after which it is asked for the same frame again.
         gives_way: whether other jobs may come between two commits, after which the entries are read again.
+        replace: whether a frame replaces the place of another frame.
     """
 
     def __init__(
@@ -184,9 +188,10 @@ class EnrolmentInCommits:
         entries: Sequence[Any],
         frame: Callable[[int], FrameToEnrol],
         gives_way: bool = True,
+        replace: bool = True,
     ) -> None:
         self.engine, self.context, self.entries, self._frame = engine, context, entries, frame
-        self._gives_way = gives_way
+        self._gives_way, self._replace = gives_way, replace
         self.map = context.map(engine.maps)
         nothing = {"done": 0, "changes": {}, "failed": 0, "named": []}
         self.outcome = _Outcome(**context.notes.get("told", nothing))
@@ -243,7 +248,9 @@ class EnrolmentInCommits:
             failures[positions[index]] = error
 
         async def work(deadline: RequestDeadline) -> dict[int, Enrolled]:
-            return await enrol(self.engine, self.map, frames, deadline, reject, queued=False)
+            return await enrol(
+                self.engine, self.map, frames, deadline, reject, queued=False, replace_places=self._replace
+            )
 
         stored = run_after_requests(self.engine, self.context, work) if frames else {}
         for one in stored.values():

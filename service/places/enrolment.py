@@ -15,7 +15,7 @@ from core.recognition.recognition import describe, frame_digest
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
-from service.errors.faults import FrameNeeded, TooManyPlaces
+from service.errors.faults import FrameNeeded, PlacesTaken, TooManyPlaces
 from service.places.batch_order import BatchTurn, Stage
 from service.places.place_events import tell_enrolment
 from service.worker_threads import in_thread
@@ -114,6 +114,7 @@ async def enrol(
     reject: Reject = refuse_all,
     queued: bool = True,
     batch_turn: BatchTurn | None = None,
+    replace_places: bool = True,
 ) -> dict[int, Enrolled]:
     """Encode frames and store them as places; a frame that its place already holds is not encoded again.
 
@@ -125,6 +126,7 @@ async def enrol(
             abort all.
         queued: whether the frames take a place in the queue, as those of a request do, but not those of a job.
         batch_turn: the turn of this batch, if it has to be encoded and stored after another one.
+        replace_places: whether a place of another frame is replaced; else ``PlacesTaken`` rejects the frame.
 
     Returns:
         The stored places by index; they are on disk, and every later query finds them.
@@ -143,7 +145,12 @@ async def enrol(
         refused.add(index)
         reject(index, error)
 
-    known = await in_thread(lambda: {i for i in open_ if map_.digest(frames[i].id) == digests[i]})
+    there = await in_thread(lambda: {i: map_.digest(frames[i].id) for i in open_})
+    known = {i for i in open_ if there[i] == digests[i]}
+    for i in sorted(open_ - known) if not replace_places else ():
+        if there[i] is not None:
+            refuse(i, PlacesTaken(f"The place {frames[i].id!r} has another frame; choose another id, or send replace."))
+            open_.discard(i)
     if batch_turn is not None:
         await batch_turn.wait_for(Stage.ENCODED)
     while open_:

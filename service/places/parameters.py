@@ -130,6 +130,11 @@ class BatchParameters(Parameters):
         description="With background: metres a second of the vehicle at most; 60 if left out. A place is refused with "
         "`implausible-pose` whose pose is reached faster, by the timestamps of its traverse.",
     )
+    replace: bool = Field(
+        default=True,
+        description="Whether a frame replaces the place of another frame that has its id; else it fails alone with 409 "
+        "places-taken. The same frame is never one of these.",
+    )
     batch: BatchName = Field(
         default=None,
         description="A name for this batch, for example a random one, to which another batch can refer with after.",

@@ -51,6 +51,7 @@ from service.jobs.schemas import JobView
 from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
+from service.places.comparison import TraverseComparison, TraverseToCompare, compare
 from service.places.enrolment import FrameToEnrol, enrol
 from service.places.filters import MOST_DELETED, DeletedPlaces, Deletion, PlacePageQuery
 from service.places.parameters import BatchParameters, EnrolParameters, check_metadata, check_taken
@@ -228,6 +229,7 @@ async def _enrol_now(
         deadline,
         lambda index, error: reject(positions[index], error),
         batch_turn=batch_turn,
+        replace_places=options.replace,
     )
     for index, one in stored.items():
         results[positions[index]] = BatchResult(
@@ -245,7 +247,9 @@ async def _enrol_later(
 ) -> Response:
     map_ = await engine.map(map_id)
     engine.assert_encoder(map_, options.encoder)
-    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request, options.align, options.most_speed)
+    job = await bulk_enrolment.receive(
+        engine, jobs, staging, map_, request, options.align, options.most_speed, options.replace
+    )
     request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
     return accepted(job, engine.settings)
 
@@ -279,6 +283,23 @@ def delete_places(map_id: MapId, order: Deletion, request: Request, engine: Engi
     there = set(found)
     missing = [place_id for place_id in wanted.ids or () if place_id not in there]
     return DeletedPlaces(dry_run=order.dry_run, places=len(found), ids=found, missing=missing)
+
+
+@router.post(
+    ":compare",
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.UnknownCamera),
+)
+def compare_places(map_id: MapId, order: TraverseToCompare, engine: EngineDep) -> TraverseComparison:
+    """Compare a traverse with the places of a map before its frames are sent; nothing is stored.
+
+    First send the ids alone; then, of the places that are `taken`, the ids with the SHA-256 of the frames' bytes: a
+    traverse whose enrolment broke off is `known`, and only frames that differ stay `taken`.
+    """
+    map_ = engine.maps.get(map_id)
+    mask = map_.cameras.mask(order.camera)
+    frames = {one.id: None if one.sha256 is None else bytes.fromhex(one.sha256) for one in order.places}
+    return compare(map_, frames, order.sequence, order.named, mask)
 
 
 @router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))

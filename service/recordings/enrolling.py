@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,20 +13,21 @@ from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
 from core.maps import Map
-from core.names import composed
 from core.places import Camera, PlaceFields, check_sequence
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
 from core.recordings.paths import check_lost_poses, traverse_of, way_of
-from core.recordings.plausibility import MOST_SPEED
 from core.recordings.pictures import range_remark, used_range
+from core.recordings.plausibility import MOST_SPEED
 from core.recordings.recording import LARGEST_GAP
 from service.engine.engine import Engine
+from service.errors.faults import PlacesTaken
 from service.http.multipart import FormPart
 from service.http.uploads import check_part
 from service.jobs.context import JobContext, JobGivesWay, yield_to_requests
 from service.places.bulk_enrolment import Align, EnrolmentInCommits
+from service.places.comparison import compare, taken_text
 from service.places.enrolment import FrameToEnrol
 from service.places.map_events import tell_map
 from service.recordings.reader import Order, as_fields
@@ -48,6 +50,11 @@ class RecordingOrder(BaseModel):
     )
 
     sequence: TraverseName | None = Field(default=None, description="The traverse; null: as the file is called.")
+    named: bool = Field(
+        default=True,
+        strict=True,
+        description="Whether somebody chose the traverse's name; another one is made unique, as `places:compare` does.",
+    )
     id_prefix: str = Field(default="", max_length=64, description="Before the ids, which are made of topic and stamp.")
     camera: Camera | None = Field(default=None, description="Of the map; its mask is applied.")
     topic: str | None = Topic
@@ -75,6 +82,11 @@ class RecordingOrder(BaseModel):
     every_seconds: float | None = Metres
     keep_standing: bool = Field(
         default=False, strict=True, description="Also enrol frames in which nothing changes, as where the robot stood."
+    )
+    replace: bool = Field(
+        default=False,
+        strict=True,
+        description="Replace places of other frames that have these ids; else it is refused.",
     )
     align: bool = Field(
         default=False, strict=True, description="Then find which frames show places that the map had already."
@@ -104,12 +116,12 @@ def enrol_recording(
             before stays.
         JobCancelled, JobInterrupted, JobGivesWay.
     """
-    map_, name = context.map(engine.maps), str(context.arguments["recording"])
+    map_, file = context.map(engine.maps), str(context.arguments["recording"])
     order = RecordingOrder.model_validate(context.arguments["order"])
     context.progress(0, None, "reading the recording")
     map_.cameras.mask(order.camera)  # an unknown one is refused before the bag is read
     wanted = Order(
-        path=recordings.find(str(context.map_id), name),
+        path=recordings.find(str(context.map_id), file),
         topic=order.topic,
         pose_topic=order.pose_topic,
         fixed=order.fixed_frame,
@@ -121,8 +133,8 @@ def enrol_recording(
     )
     with readers.reading(context, wanted) as (reader, turns):
         recording = reader.recording()
-        sequence = order.sequence or recording.name
-        for traverse in {traverse_of(sequence, one) for one in recording.frames}:
+        name = order.sequence or recording.name
+        for traverse in {traverse_of(name, one) for one in recording.frames}:
             check_sequence(traverse)
         if not order.allow_lost_poses:
             _check_lost_poses(recording)
@@ -131,12 +143,19 @@ def enrol_recording(
         mask = map_.cameras.mask(order.camera)
         if "chosen" in context.notes:  # by an attempt before this one
             chosen, remarks = [recording.frames[number] for number in context.notes["chosen"]], context.notes["remarks"]
+            sequence = str(context.notes.get("sequence", name))
         else:
             chosen, remarks = _choose(engine, context, turns, recording, order, mask)
-            _check_ids(map_, chosen, sequence)
+            sequence = name
+            if not order.replace:
+                named = order.named and order.sequence is not None
+                sequence = _compare(engine, context, map_, chosen, name, named, mask)
+            if sequence != name:
+                remarks.append(f"The map has a traverse {name} already; these frames are in {sequence}.")
             remarks += context.notes["camera"]
             numbers = {frame.id: number for number, frame in enumerate(recording.frames)}
-            context.remember(chosen=[numbers[frame.id] for frame in chosen], remarks=remarks, looks=None)
+            chosen_numbers = [numbers[frame.id] for frame in chosen]
+            context.remember(chosen=chosen_numbers, sequence=sequence, remarks=remarks, looks=None)
 
         def frame(position: int) -> FrameToEnrol:
             turns.begin_step()
@@ -147,7 +166,7 @@ def enrol_recording(
                 turns.end_step()
 
         entries = [{"id": one.id} for one in chosen]
-        result = EnrolmentInCommits(engine, context, entries, frame, gives_way=False).run()
+        result = EnrolmentInCommits(engine, context, entries, frame, gives_way=False, replace=order.replace).run()
         posed = sum(one.pose is not None for one in chosen)
         facts = {"sequence": sequence, "frames": len(recording.frames), "chosen": len(chosen), "posed": posed}
         traverses = list(dict.fromkeys(traverse_of(sequence, one) for one in chosen))
@@ -264,22 +283,36 @@ def _complete_camera(engine: Engine, map_: Map, camera: str | None, recording: R
     return remarks
 
 
-def _check_ids(map_: Map, frames: Sequence[RecordedFrame], sequence: str) -> None:
-    """Refuse ids that belong to places of another traverse, which would be overwritten.
+def _compare(
+    engine: Engine,
+    context: JobContext,
+    map_: Map,
+    frames: Sequence[RecordedFrame],
+    sequence: str,
+    named: bool,
+    mask: Mask | None,
+) -> str:
+    """The name under which to enrol frames, of which the map may have some already.
 
     Raises:
-        InvalidRecording: the text names the first one.
+        PlacesTaken: places of other frames or of other traverses have their ids.
+        JobCancelled, JobInterrupted.
     """
-    map_.open()
-    traverses = {frame.id: traverse_of(sequence, frame) for frame in frames}
-    rows = [row for row in map_.rows_of(list(traverses)) if row is not None]
-    found = [place for place in map_.places_at(rows) if place is not None]
-    taken = [place for place in found if composed(place.sequence) != traverses[place.id]]
-    if taken:
-        raise InvalidRecording(
-            f"{len(taken)} ids of these frames belong to places of another traverse, such as {taken[0].id!r}: give "
-            "id_prefix, or the right sequence."
-        )
+    found = compare(map_, {frame.id: None for frame in frames}, sequence, named, mask)
+    if found.taken:
+        taken = {one.id for one in found.taken}
+        digests: dict[str, bytes | None] = {}
+        for frame in (one for one in frames if one.id in taken):
+            yield_to_requests(engine, context)
+            try:
+                digests[frame.id] = hashlib.sha256(frame.load()).digest()
+            except (InvalidRecording, OSError):
+                continue  # what is wrong with it is said where it is enrolled
+        found = compare(map_, digests, sequence, named, mask)
+    if found.taken:
+        told = taken_text(found.taken, len(frames))
+        raise PlacesTaken(f"{told} Give another sequence and an id_prefix, or replace.")
+    return str(found.sequence)
 
 
 def _to_enrol(

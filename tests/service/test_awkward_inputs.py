@@ -43,7 +43,6 @@ from tests.core.recordings.test_plausibility import (
     two_publishers,
     walked,
     without_headings,
-    written,
 )
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server, text, typed
@@ -142,9 +141,7 @@ def png16(pixels: object) -> bytes:
 
 def gps(latitude: float, longitude: float) -> bytes:
     exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.GPSInfo).update(
-        {1: "N", 2: (latitude, 0.0, 0.0), 3: "E", 4: (longitude, 0.0, 0.0)}
-    )
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: (latitude, 0.0, 0.0), 3: "E", 4: (longitude, 0.0, 0.0)})
     file = io.BytesIO()
     Image.fromarray(scene(0)).save(file, "JPEG", exif=exif.tobytes())
     return file.getvalue()
@@ -301,7 +298,6 @@ def ways(tmp_path: Path, server: Server, map_id: str) -> Iterator[Ways]:
 
 @pytest.mark.parametrize(("act", "wanted"), [pytest.param(act, wanted, id=name) for name, act, wanted in ROWS])
 def test_nothing_awkward_passes_in_silence(ways: Ways, act: Callable[[Ways], str], wanted: str) -> None:
-    import re
 
     said = act(ways)
     print(said)

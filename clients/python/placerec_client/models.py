@@ -1899,6 +1899,23 @@ class SimilarityView(Model):
     milliseconds: dict[str, float]
 
 
+class TakenPlace(Model):
+    """A place that would be replaced, or would get into another traverse."""
+
+    id: str
+    sequence: str | None = None
+    same: bool | None = None
+
+
+class TraverseComparison(Model):
+    """What a map has already of a traverse."""
+
+    sequence: str | None = None
+    free: str | None = None
+    known: int
+    taken: list[TakenPlace]
+
+
 class VerifyReport(Model):
     """The result of a full reading of a map."""
 

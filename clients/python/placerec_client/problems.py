@@ -185,6 +185,10 @@ class PlaceTaken(Problem):
     """409 ``place-taken``: The place has another frame."""
 
 
+class PlacesTaken(Problem):
+    """409 ``places-taken``: Places of other frames have these ids."""
+
+
 class RecordingInUse(Problem):
     """409 ``recording-in-use``: A job reads the recording."""
 
@@ -558,6 +562,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "merge-conflict": MergeConflict,
     "mixed-coordinates": MixedCoordinates,
     "place-taken": PlaceTaken,
+    "places-taken": PlacesTaken,
     "recording-in-use": RecordingInUse,
     "recording-offset": RecordingOffset,
     "repeated-look": RepeatedLook,

@@ -73,6 +73,7 @@ async def enrol_frames(
     known: frozenset[str],
     encoder: str | None,
     report: Callable[[SendingOutcome], None],
+    replace: bool = False,
 ) -> None:
     """Enrol frames in their order.
 
@@ -80,6 +81,7 @@ async def enrol_frames(
         known: ids that the map already has; for these frames a first request finds out whether it has their bytes.
         encoder: the encoder that the map must have; None for any.
         report: called with the outcome of each frame as soon as it is known.
+        replace: whether places of other frames are replaced.
 
     Raises:
         Refused: the service refuses a request for a reason that concerns no single frame.
@@ -87,14 +89,14 @@ async def enrol_frames(
     """
     by_id = {frame.id: frame for frame in frames}
     lab = service.patient(PATIENCE).maps[map_id]
-    places = (NewPlace(frame.id, partial(_load, frame), frame.parameters) for frame in frames)
+    places = (NewPlace(frame.id, partial(load, frame), frame.parameters) for frame in frames)
     with failures():
-        async with aclosing(lab.enrol_each(places, known=known, encoder=encoder)) as outcomes:
+        async with aclosing(lab.enrol_each(places, known=known, encoder=encoder, replace=replace)) as outcomes:
             async for outcome in outcomes:
                 report(_outcome(by_id[outcome.place.id], outcome))
 
 
-def _load(frame: FrameToSend) -> bytes:
+def load(frame: FrameToSend) -> bytes:
     """The bytes of a frame, when its turn has come; one that cannot be used is refused alone."""
     try:
         return frame.taken.load()

@@ -84,7 +84,7 @@ export const everyMap = computed(() => caller.value !== null && caller.value.map
 export async function useKey(text, { known = false } = {}) {
   const given = text.trim();
   if (!/^[!-~]*$/.test(given)) {
-    throw Object.assign(new Error("A key consists of letters, digits, - and _."), { title: "This is no key" });
+    throw Object.assign(new Error("A key consists of letters, digits, - and _."), { title: "This key is not known" });
   }
   const told = given && !known ? await get("/key", {}, { headers: bearer(given) }) : null;
   hold(given);

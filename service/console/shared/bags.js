@@ -1,18 +1,16 @@
 // Bags of ROS: uploaded in pieces, so that a broken upload goes on where it was, and enrolled by a job of the service.
 import { get, post, send } from "./api.js";
+import { freeName } from "./comparison.js";
 import { Field, NumberInput, Progress, say, Trouble, Typed } from "./elements.js";
 import { bytes, counted, integer } from "./formats.js";
 import { JobProgress } from "./jobs.js";
 import { mapPath } from "./map_path.js";
+import { BAG, idOf } from "./recordings.js";
+import { useStateOf } from "./resource.js";
 import { href } from "./router.js";
 import { html, useEffect, useRef, useState } from "./view.js";
 
-const BAG = /\.(mcap|bag|db3)$/i;
 const PIECE = 8 * 2 ** 20;
-
-export function isBag(file) {
-  return BAG.test(file.name);
-}
 
 /** The name of a bag at the service: the same whenever the same file is chosen. */
 function nameOf(file) {
@@ -49,8 +47,11 @@ function problemOf({ every_metres: metres, every_seconds: seconds }, sequence) {
   return null;
 }
 
-/** Bags among the chosen files: which topics and frames are taken, and each on its way into the map. */
-export function Bags({ map, files, sequence, camera, enrolled }) {
+/** Bags among the chosen files: which topics and frames are taken, and each on its way into the map.
+ *
+ * busy: whether some are on their way, so that what is chosen stays; tell gets {running} as it grows, and {stored}.
+ */
+export function Bags({ map, files, sequence, camera, busy, tell }) {
   const [options, setOptions] = useState(NO_OPTIONS);
   const change = (changes) => setOptions((old) => ({ ...old, ...changes }));
   const order = {
@@ -62,6 +63,8 @@ export function Bags({ map, files, sequence, camera, enrolled }) {
   return html`
     <section class="panel" aria-label="Bags">
       <h2>${counted(files.length, "bag")}</h2>
+      <fieldset class="stack" disabled=${busy}>
+      <legend class="hidden">What is taken of bags</legend>
       <div class="fields">
         <${Field} label="Topic of the pictures" hint="The only one, if left out."><${Typed} maxlength="256" value=${options.topic} change=${({ value }) => change({ topic: value.trim() })} /><//>
         <${Field} label="Topic of the poses" hint="Such as /odom or /tf; without one, places have no poses."><${Typed} maxlength="256" value=${options.pose_topic} change=${({ value }) => change({ pose_topic: value.trim() })} /><//>
@@ -75,42 +78,46 @@ export function Bags({ map, files, sequence, camera, enrolled }) {
       <label class="field check"><input type="checkbox" checked=${options.keep_standing} onChange=${() => change({ keep_standing: !options.keep_standing })} /><span>Also frames in which nothing has moved</span></label>
       <label class="field check"><input type="checkbox" checked=${options.allow_lost_poses} onChange=${() => change({ allow_lost_poses: !options.allow_lost_poses })} /><span>Also a bag of which more than a tenth of the frames lose their pose</span></label>
       <label class="field check"><input type="checkbox" checked=${options.align} onChange=${() => change({ align: !options.align })} /><span>Then align the traverse with those that the map has</span></label>
+      </fieldset>
       ${wrong && html`<p class="notice" role="alert">${wrong}</p>`}
-      ${files.map((file) => html`<${Bag} key=${nameOf(file)} map=${map} file=${file} order=${order} wrong=${wrong} enrolled=${enrolled} />`)}
+      ${files.map((file) => html`<${Bag} key=${nameOf(file)} map=${map} file=${file} order=${order} wrong=${wrong} tell=${tell} />`)}
     </section>
   `;
 }
 
-/** One bag: its upload, its job, and what became of it. */
-function Bag({ map, file, order, wrong, enrolled }) {
+const IDLE = { state: "waiting", job: null, result: null, error: null, taken: null };
+
+/** One bag: its upload, its job, and what became of it, as long as the same is ordered. */
+function Bag({ map, file, order, wrong, tell }) {
   const [sent, setSent] = useState(null); // bytes that are there; null: nothing was begun
-  const [state, setState] = useState("waiting");
-  const [job, setJob] = useState(null);
-  const [result, setResult] = useState(null);
-  const [error, setError] = useState(null);
+  const [{ state, job, result, error, taken }, setState] = useStateOf(JSON.stringify(order), IDLE);
+  const called = file.name.replace(BAG, ""); // unless somebody names the traverse
   const run = useRef(null);
   useEffect(() => () => run.current?.abort(), []);
-  const start = async () => {
+  const start = async (more = {}) => {
     const controller = new AbortController();
     run.current = controller;
-    setError(null);
-    setResult(null);
-    setJob(null);
-    setState("running");
+    setState({ ...IDLE, state: "running" });
+    tell({ running: 1 });
     const name = nameOf(file);
     try {
       await upload(map, file, name, setSent, controller.signal);
-      setJob(await post(mapPath(map, "recordings", name), { sequence: file.name.replace(BAG, ""), ...order }));
+      const ordered = await post(mapPath(map, "recordings", name), { sequence: called, named: order.sequence !== undefined, ...order, ...more });
+      setState((old) => ({ ...old, job: ordered }));
     } catch (problem) {
-      setState("stopped");
-      if (problem.name !== "AbortError") setError(problem);
+      setState({ ...IDLE, state: "stopped", error: problem.name === "AbortError" ? null : problem });
+      tell({ running: -1 });
     }
   };
-  const onEnd = (ended) => {
-    setState(ended.state === "succeeded" ? "done" : "stopped");
-    if (ended.state !== "succeeded") return;
-    setResult(ended.result);
-    enrolled(ended.result.chosen);
+  const onEnd = async (ended) => {
+    tell({ running: -1 });
+    const done = ended.state === "succeeded";
+    setState((old) => ({ ...old, state: done ? "done" : "stopped", result: done ? ended.result : null }));
+    if (!done) {
+      if (ended.problem?.type.endsWith(":places-taken")) setState({ ...IDLE, state: "stopped", taken: { text: ended.problem.detail, free: await freeName(map, order.sequence || called) } });
+      return;
+    }
+    tell({ stored: ended.result.chosen });
     say(`${counted(ended.result.chosen, "frame")} of ${file.name} ${ended.result.chosen === 1 ? "is" : "are"} enrolled.`);
   };
   const action = sent === null ? "Upload and enrol" : sent < file.size ? "Go on" : "Enrol again";
@@ -119,11 +126,21 @@ function Bag({ map, file, order, wrong, enrolled }) {
       <div class="spread">
         <span><strong>${file.name}</strong> <span class="faint">${bytes(file.size)}</span></span>
         ${state === "running" && !job && html`<button type="button" onClick=${() => run.current.abort()}>Stop</button>`}
-        ${["waiting", "stopped"].includes(state) && html`<button type="button" class="primary" disabled=${wrong !== null} onClick=${start}>${action}</button>`}
+        ${["waiting", "stopped"].includes(state) && !taken && html`<button type="button" class="primary" disabled=${wrong !== null} onClick=${() => start()}>${action}</button>`}
       </div>
-      ${sent !== null && !job && state !== "done" && html`<${Progress} done=${sent} total=${file.size} label=${`${file.name}: bytes uploaded`} /><p class="faint small" role="status">${bytes(sent)} of ${bytes(file.size)} uploaded</p>`}
+      ${sent !== null && !job && !taken && state !== "done" && html`<${Progress} done=${sent} total=${file.size} label=${`${file.name}: bytes uploaded`} /><p class="faint small" role="status">${bytes(sent)} of ${bytes(file.size)} uploaded</p>`}
       ${error && html`<${Trouble} error=${error} />`}
       ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${onEnd} what=${`Enrolling ${file.name}`} />`}
+      ${taken && html`
+        <div class="notice stack" role="alert">
+          <p>${taken.text}</p>
+          <div class="row">
+            <button type="button" class="primary" onClick=${() => start({ sequence: taken.free, named: true, id_prefix: `${idOf(taken.free).slice(0, 60)}-` })}>Rename to ${taken.free}</button>
+            <button type="button" class="danger" onClick=${() => start({ replace: true })}>Replace these places</button>
+            <button type="button" onClick=${() => setState(IDLE)}>Cancel</button>
+          </div>
+        </div>
+      `}
       ${result && html`<${Enrolled} map=${map} result=${result} />`}
     </section>
   `;

@@ -358,10 +358,19 @@ export function Pager({ cursors, next, show, back = "Newer", on = "Older" }) {
 export const messages = signal([]);
 let number = 0;
 
-/** Say something at the edge of the page; undo, if given, is offered with it. */
-export function say(text, undo) {
+/** Say something at the edge of the page; undo, if given, is offered with it.
+ *
+ * as: what several of a kind are together, such as "labelled": they are one message, whose undo takes all of them back.
+ */
+export function say(text, undo, as) {
   const id = (number += 1);
-  messages.value = [...messages.value.slice(-3), { id, text, undo }];
+  const before = as && messages.value.find((one) => one.as === as);
+  const undos = [undo, ...(before?.undos || [])];
+  const all = async () => {
+    for (const one of undos) await one();
+  };
+  const message = { id, text: before ? `${undos.length} ${as}` : text, undo: undo && all, as, undos };
+  messages.value = [...messages.value.filter((one) => one !== before).slice(-3), message];
   setTimeout(() => unsay(id), undo ? 12_000 : 5000);
 }
 

@@ -2,6 +2,7 @@
 import { get, may, patch, remove } from "./api.js";
 import { ByName, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, say, Verdict } from "./elements.js";
 import { decimal, integer, metres, milliseconds, percent, poseText } from "./formats.js";
+import { HeadingArrow } from "./heading.js";
 import { PlaceLooks } from "./looks.js";
 import { mapPath } from "./map_path.js";
 import { Thumbnail } from "./pictures.js";
@@ -194,6 +195,7 @@ function Edit({ map, place, close, changed }) {
             <//>
           `)}
         </div>
+        <${HeadingArrow} heading=${numbers.heading} geographic=${kind === "geographic"} />
       `}
       <div class="fields">
         <${Field} label="Traverse"><input maxlength="128" value=${sequence} onInput=${(event) => setSequence(event.target.value)} /><//>

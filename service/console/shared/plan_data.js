@@ -15,6 +15,14 @@ export async function readPlan(map, signal) {
   return plan;
 }
 
+/** A plan of frames that no map has yet, with the poses that they are to get; null if none has one. */
+export function planOfFrames(frames) {
+  const column = (name) => frames.map(({ fields }) => fields[name] ?? null);
+  const poses = Object.fromEntries(["x", "y", "latitude", "longitude", "heading"].map((name) => [name, column(name)]));
+  const plan = prepared({ ...poses, ids: frames.map(({ id }) => id), sequence: frames.map(() => 0), sequences: ["new"], gaps: [] });
+  return plan.posed === 0 ? null : plan;
+}
+
 /** Add to the columns: positions in metres, headings in radians from +x, traverses, gaps, and numbers by id. */
 function prepared(columns) {
   const { ids } = columns;

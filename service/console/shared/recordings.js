@@ -1,9 +1,9 @@
 // Frames to enrol: out of chosen files, dropped folders and videos, with the poses of a places.csv.
-import { isBag } from "./bags.js";
 import { cellsOf } from "./csv.js";
 import { counted } from "./formats.js";
 import { readable } from "./frames.js";
 
+export const BAG = /\.(mcap|bag|db3)$/i;
 const LIST = "places.csv";
 const NUMBERS = ["x", "y", "z", "heading", "latitude", "longitude"];
 const COLUMNS = ["file", "id", ...NUMBERS, "timestamp"];
@@ -11,13 +11,31 @@ const UNCHANGED_MILLISECONDS = 1000;
 const STILL = 0.012;
 const SMALL = [32, 24];
 
-/** All files of a drop, those in folders too, with their paths. */
+export function isBag(file) {
+  return BAG.test(file.name);
+}
+
+const folders = new WeakMap(); // of files that were dropped
+
+/** All files of a drop, those in folders too. */
 export async function droppedFiles(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
   if (entries.length === 0) return [...transfer.files];
   const files = [];
-  for (const entry of entries) await walk(entry, files);
+  for (const entry of entries) {
+    const before = files.length;
+    await walk(entry, files);
+    if (entry.isDirectory) for (const file of files.slice(before)) folders.set(file, entry.name);
+  }
   return files;
+}
+
+/** What a traverse of these files is called unless somebody names it: as their folder or their video, else as the day. */
+export function traverseOf(files) {
+  const frames = files.filter((file) => !isBag(file));
+  const names = new Set(frames.map((file) => folders.get(file) || file.webkitRelativePath.split("/")[0] || (file.type.startsWith("video/") ? stem(file.name) : "")));
+  const [name] = names;
+  return names.size === 1 && name && !/[/\\]|^\.{1,2}$/.test(name.trim()) && name.trim() !== "" ? name.trim() : new Date().toLocaleDateString("en-CA");
 }
 
 async function walk(entry, files) {
@@ -43,20 +61,26 @@ export function idOf(text) {
   return /[^-]/.test(made) ? made : "";
 }
 
-/** The frames that files hold: {name, file or video and second, id, fields}, and remarks on what was left out.
+/** The frames that files hold: {name, file or video and second, given or stem, fields}, and remarks on what was left out.
  *
- * options: {prefix, seconds}: of ids, and between two frames of a video.
+ * given: the id that places.csv gives it; stem: of what an id is made otherwise, by `named`.
+ * seconds: between two frames of a video.
  */
-export async function framesOf(files, { prefix, seconds }) {
+export async function framesOf(files, seconds) {
   const lists = files.filter((file) => file.name.toLowerCase() === LIST);
   const pictures = files.filter((file) => file.type.startsWith("image/")).sort((one, other) => byName(one.webkitRelativePath || one.name, other.webkitRelativePath || other.name));
   const videos = files.filter((file) => file.type.startsWith("video/"));
   const others = files.filter((file) => !isBag(file)).length - lists.length - pictures.length - videos.length;
   const remarks = others > 0 ? [`Left out: ${counted(others, "file")}, neither pictures nor videos.`] : [];
   if (lists.length > 1) throw failed(`There are ${lists.length} files ${LIST}; choose one folder at a time.`);
-  const frames = lists.length === 1 ? await listed(lists[0], pictures, prefix, remarks) : pictures.map((file) => ({ name: file.name, file, id: idOf(prefix + stem(file.name)), fields: {} }));
-  for (const video of videos) frames.push(...(await framesOfVideo(video, prefix, seconds)));
+  const frames = lists.length === 1 ? await listed(lists[0], pictures, remarks) : pictures.map((file) => ({ name: file.name, file, stem: stem(file.name), fields: {} }));
+  for (const video of videos) frames.push(...(await framesOfVideo(video, seconds)));
   return { frames, remarks };
+}
+
+/** The same frames with their ids: those that were given, and others made of the traverse's name and of their own. */
+export function named(frames, sequence) {
+  return frames.map((one) => ({ ...one, id: one.given || idOf(`${sequence && `${sequence}-`}${one.stem}`) }));
 }
 
 function stem(name) {
@@ -68,7 +92,7 @@ function failed(text) {
 }
 
 /** The frames that a places.csv lists, in its order. */
-async function listed(list, pictures, prefix, remarks) {
+async function listed(list, pictures, remarks) {
   const [columns, ...rows] = cellsOf(await list.text());
   const unknown = columns.find((name) => !COLUMNS.includes(name));
   if (unknown !== undefined || !columns.includes("file")) throw failed(`The first line of ${LIST} must name "file" and may name ${COLUMNS.slice(1).join(", ")}.`);
@@ -86,7 +110,7 @@ async function listed(list, pictures, prefix, remarks) {
       fields[name] = Number(cells[name]);
     }
     if (cells.timestamp) fields.timestamp = cells.timestamp;
-    return { name: file.name, file, id: cells.id || idOf(prefix + stem(file.name)), fields };
+    return { name: file.name, file, given: cells.id, stem: stem(file.name), fields };
   });
   if (used.size < pictures.length) remarks.push(`Left out: ${counted(pictures.length - used.size, "picture")} that ${LIST} does not list.`);
   return frames;
@@ -104,7 +128,7 @@ async function opened(file) {
   return video;
 }
 
-async function framesOfVideo(file, prefix, seconds) {
+async function framesOfVideo(file, seconds) {
   const video = await opened(file);
   if (!Number.isFinite(video.duration)) await sought(video, 1e7); // its end is found by looking for it
   const { duration } = video;
@@ -114,7 +138,7 @@ async function framesOfVideo(file, prefix, seconds) {
     name: `${file.name}, ${(number * seconds).toFixed(1)} s`,
     video: file,
     second: number * seconds,
-    id: idOf(`${prefix}${stem(file.name)}-${String(number).padStart(5, "0")}`),
+    stem: `${stem(file.name)}-${String(number).padStart(5, "0")}`,
     fields: {},
   }));
 }

@@ -4,9 +4,9 @@ import { saveCsv } from "../shared/csv.js";
 import { complain, Dialog, Field, Head, Moment, Nothing, Pager, say, Typed } from "../shared/elements.js";
 import { integer } from "../shared/formats.js";
 import { Result } from "../shared/result.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
-import { html, useEffect, useState } from "../shared/view.js";
+import { html, useState } from "../shared/view.js";
 
 const FILTERS = { map: "Map", key: "Key", operation: "Operation", after: "From (UTC)", before: "To (UTC)" };
 const ENOUGH = 50;
@@ -16,9 +16,8 @@ const MOST_SAVED_PAGES = 50;
 export default function Audit({ query }) {
   const filter = Object.fromEntries(Object.keys(FILTERS).filter((name) => query[name]).map((name) => [name, query[name]]));
   const present = JSON.stringify(filter);
-  const [cursors, setCursors] = useState([""]);
+  const [cursors, setCursors] = useStateOf(present, [""]);
   const [open, setOpen] = useState(null);
-  useEffect(() => setCursors([""]), [present]);
   const cursor = cursors.at(-1);
   const lines = useResource((signal) => read(filter, cursor, signal), [filter, cursor]);
   const [saving, setSaving] = useState(false);

@@ -5,7 +5,7 @@ import { ByName, complain, Facts, Field, FormDialog, Head, Moment, Nothing, Numb
 import { decimal, integer, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { html, useEffect, useMemo, useState } from "../shared/view.js";
 
 export default function Calibration({ map }) {
@@ -25,7 +25,7 @@ export default function Calibration({ map }) {
   };
   return html`
     <${Head} title="Calibration" note=${`When an answer of ${map} is believed.`}>
-      ${may("admin") && html`<button type="button" class="primary" onClick=${calibrate}>Calibrate</button>`}
+      ${may("admin") && html`<button type="button" class="primary" disabled=${state.data === undefined} onClick=${calibrate}>Calibrate</button>`}
     <//>
     ${job && html`<section class="panel"><${JobProgress} key=${job.id} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Dry run" : "Calibration"} /></section>`}
     <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} giveUp=${giveUp} storeIt=${storeIt} />`}<//>
@@ -150,22 +150,20 @@ function Threshold({ map, data, tag, changed }) {
   const { calibration, measured } = data;
   const points = measured.report.measurement.points;
   const [least, most] = useMemo(() => rangeOf(points, calibration.threshold), [points]);
-  const [threshold, setThreshold] = useState(calibration.threshold);
-  const [margin, setMargin] = useState(calibration.margin);
+  const inForce = { threshold: calibration.threshold, margin: calibration.margin };
+  const [{ threshold, margin }, choose] = useStateOf(JSON.stringify(inForce), inForce);
+  const change = (changes) => choose((old) => ({ ...old, ...changes }));
   const [settled, setSettled] = useState({ threshold, margin });
   const [error, setError] = useState(null);
   useEffect(() => {
     const timer = setTimeout(() => setSettled({ threshold, margin }), 150);
     return () => clearTimeout(timer);
   }, [threshold, margin]);
-  useEffect(() => {
-    setThreshold(calibration.threshold);
-    setMargin(calibration.margin);
-  }, [calibration.threshold, calibration.margin]);
   // A dry run measures anew and leaves the map's tag as it is.
   const effect = useResource((signal) => get(mapPath(map, "calibration"), settled, { signal }), [map, settled, tag, measured.at]);
-  const present = effect.data?.measured?.at === measured.at ? effect.data : null;
-  const same = threshold === calibration.threshold && margin === calibration.margin;
+  const chosen = settled.threshold === threshold && settled.margin === margin;
+  const present = chosen && effect.data?.measured?.at === measured.at ? effect.data : null;
+  const same = threshold === inForce.threshold && margin === inForce.margin;
   const apply = async () => {
     setError(null);
     try {
@@ -186,13 +184,13 @@ function Threshold({ map, data, tag, changed }) {
       <div class="columns">
         <div class="stack">
           <${Field} label=${html`Threshold <strong>${decimal(threshold, 4)}</strong>`}>
-            <input type="range" min=${least} max=${most} step=${(most - least) / 500} value=${threshold} onInput=${(event) => setThreshold(event.target.valueAsNumber)} />
+            <input type="range" min=${least} max=${most} step=${(most - least) / 500} value=${threshold} onInput=${(event) => change({ threshold: event.target.valueAsNumber })} />
           <//>
           <${Field} label=${html`Margin <strong>${decimal(margin, 4)}</strong>`}>
-            <input type="range" min="0" max=${Math.max(0.05, 4 * calibration.margin)} step="0.0005" value=${margin} onInput=${(event) => setMargin(event.target.valueAsNumber)} />
+            <input type="range" min="0" max=${Math.max(0.05, 4 * calibration.margin)} step="0.0005" value=${margin} onInput=${(event) => change({ margin: event.target.valueAsNumber })} />
           <//>
           <div class="row">
-            <button type="button" disabled=${same} onClick=${() => { setThreshold(calibration.threshold); setMargin(calibration.margin); }}>As it is in force</button>
+            <button type="button" disabled=${same} onClick=${() => choose(inForce)}>As it is in force</button>
             ${may("admin") && html`<button type="button" class="primary" disabled=${same} onClick=${apply}>Apply</button>`}
           </div>
           ${error && html`<${Trouble} error=${error} again=${error.slug === "revision-mismatch" ? readAgain : undefined} />`}

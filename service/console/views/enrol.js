@@ -1,12 +1,14 @@
 // Enrol a traverse: files, a folder, a video or bags become places, in pieces that can be gone on with, on the plan as it grows.
 import { get, send } from "../shared/api.js";
-import { Bags, isBag } from "../shared/bags.js";
-import { Field, Head, NumberInput, Progress, say, Trouble, Typed } from "../shared/elements.js";
+import { Bags } from "../shared/bags.js";
+import { digestOf, toEnrol } from "../shared/comparison.js";
+import { Field, Head, Loading, NumberInput, Progress, say, Trouble, Typed } from "../shared/elements.js";
 import { counted, integer } from "../shared/formats.js";
+import { HEADING } from "../shared/heading.js";
 import { mapPath } from "../shared/map_path.js";
-import { readPlan } from "../shared/plan_data.js";
-import { droppedFiles, FrameReader, framesOf, thinned } from "../shared/recordings.js";
-import { useResource } from "../shared/resource.js";
+import { planOfFrames, readPlan } from "../shared/plan_data.js";
+import { droppedFiles, FrameReader, framesOf, isBag, thinned, traverseOf } from "../shared/recordings.js";
+import { useResource, useStateOf } from "../shared/resource.js";
 import { href } from "../shared/router.js";
 import { SmallPlan } from "../shared/small_plan.js";
 import { html, useEffect, useMemo, useRef, useState } from "../shared/view.js";
@@ -17,60 +19,81 @@ const MOST_TOLD = 20;
 
 export default function Enrol({ map }) {
   const cameras = useResource((signal) => get(mapPath(map, "cameras"), {}, { signal }), [map]);
-  const [files, setFiles] = useState([]);
-  const [options, setOptions] = useState({ sequence: new Date().toLocaleDateString("en-CA"), camera: "", every: 1, metres: 0, seconds: 1, leaveStill: true });
-  const [read, setRead] = useState({ frames: [], remarks: [] });
-  const [error, setError] = useState(null);
-  const sending = useSending(map);
+  const [{ batch, files }, setFiles] = useState({ batch: 0, files: [] });
+  const [options, setOptions] = useState({ sequence: null, camera: "", every: 1, metres: 0, seconds: 1, leaveStill: true });
   const change = (changes) => setOptions((old) => ({ ...old, ...changes }));
-  const { sequence, seconds } = options;
-  useEffect(() => {
-    let gone = false;
-    setError(null);
-    framesOf(files, { prefix: sequence ? `${sequence}-` : "", seconds }).then((found) => gone || setRead(found), (problem) => gone || (setRead({ frames: [], remarks: [] }), setError(problem)));
-    return () => {
-      gone = true;
-    };
-  }, [files, sequence, seconds]);
-  const chosen = useMemo(() => thinned(read.frames, Math.max(1, Math.floor(options.every) || 1), options.metres || 0), [read, options.every, options.metres]);
-  const wrong = problemOf(chosen);
-  const busy = sending.state === "running";
+  const { sequence, camera, every, metres, seconds } = options;
+  const name = useMemo(() => (files.length > 0 && files.every(isBag) ? "" : traverseOf(files)), [files]); // unless somebody chose another
+  const read = useResource(() => framesOf(files, seconds), [batch, seconds]);
+  const frames = useMemo(() => thinned(read.data?.frames || [], Math.max(1, Math.floor(every) || 1), metres || 0), [read.data, every, metres]);
+  const ready = read.data !== undefined;
+  const inputs = [map, batch, seconds, every, metres, camera, sequence];
+  const plan = useResource(async (signal) => (frames.length > 0 ? toEnrol(map, frames, { sequence: sequence ?? name, chosen: sequence !== null, camera }, signal) : null), [...inputs, ready]);
+  const sending = useSending(map, JSON.stringify([...inputs, options.leaveStill]));
+  const [ofBags, setOfBags] = useState({ running: 0, stored: 0 });
+  const busy = sending.state === "running" || ofBags.running > 0;
   const bags = files.filter(isBag);
-  const [ofBags, setOfBags] = useState(0);
+  const take = (chosen) => {
+    setFiles({ batch: batch + 1, files: chosen });
+    if (sending.state === "done") change({ sequence: null }); // that name is of the frames before
+  };
+  const error = read.error || (ready && plan.error);
   return html`
     <${Head} title="Enrol" note=${`Frames of a traverse become places of ${map}.`} />
     <div class="columns">
-      <section class="panel" aria-label="Frames"><${Source} take=${setFiles} busy=${busy} /></section>
+      <section class="panel" aria-label="Frames"><${Source} take=${take} busy=${busy} /></section>
       <section class="panel" aria-label="Options">
-        <${Options} options=${options} change=${change} cameras=${cameras.data?.items || []} frames=${read.frames} files=${files} busy=${busy} />
+        <${Options} options=${options} name=${plan.data?.sequence ?? name} change=${change} cameras=${cameras.data?.items || []} frames=${read.data?.frames || []} files=${files} busy=${busy} />
       </section>
     </div>
-    ${error && html`<${Trouble} error=${error} />`}
-    ${bags.length > 0 && html`<${Bags} map=${map} files=${bags} sequence=${sequence} camera=${options.camera} enrolled=${(count) => setOfBags((old) => old + count)} />`}
-    ${files.length > bags.length && html`
+    ${error && html`<${Trouble} error=${error} again=${read.error ? undefined : plan.reload} />`}
+    ${bags.length > 0 && html`<${Bags} map=${map} files=${bags} sequence=${sequence ?? ""} camera=${camera} busy=${busy} tell=${(changes) => setOfBags((old) => ({ running: old.running + (changes.running || 0), stored: old.stored + (changes.stored || 0) }))} />`}
+    ${files.length > bags.length && !error && html`
       <section class="panel" aria-label="To enrol">
-        <${Preview} read=${read} chosen=${chosen} wrong=${wrong} />
-        <div class="row">
-          ${!busy && html`<button type="button" class="primary" disabled=${chosen.length === 0 || wrong !== null} onClick=${() => sending.start(chosen, options)}>${sending.state === "stopped" ? "Go on" : `Enrol ${counted(chosen.length, "frame")}`}</button>`}
-          ${busy && html`<button type="button" onClick=${sending.stop}>Stop</button>`}
-        </div>
-        ${sending.state && html`<${Sent} map=${map} sending=${sending} sequence=${sequence} />`}
+        <${Preview} read=${read.data} plan=${ready ? plan.data : undefined} name=${sequence ?? name} />
+        <${Press} key=${batch} inputs=${JSON.stringify(inputs)} plan=${ready ? plan.data : undefined} sending=${sending} options=${options} rename=${(free) => change({ sequence: free })} drop=${() => take([])} />
+        ${sending.state && html`<${Sent} map=${map} sending=${sending} />`}
+        ${ready && plan.data && html`<${Poses} plan=${plan.data} />`}
       </section>
     `}
-    <${Growing} map=${map} count=${sending.stored + ofBags} />
+    <${Growing} map=${map} count=${sending.stored + ofBags.stored} />
   `;
 }
 
-/** Why these frames cannot be enrolled together; null if they can. */
-function problemOf(frames) {
-  const nameless = frames.find((one) => one.id === "");
-  if (nameless) return `No id can be made from the name ${nameless.name}; give one in places.csv.`;
-  const known = new Map();
-  for (const one of frames) {
-    if (known.has(one.id)) return `${known.get(one.id)} and ${one.name} would both have the id ${one.id}; give their ids in places.csv.`;
-    known.set(one.id, one.name);
-  }
-  return null;
+/** What can be done with the frames as they are shown; what is pressed before they are is done then, if nothing changes. */
+function Press({ inputs, plan, sending, options, rename, drop }) {
+  const [pressed, setPressed] = useStateOf(inputs, false);
+  const usable = plan && plan.wrong === null && plan.taken.length === 0;
+  const start = (replace) => sending.start(plan, { ...options, sequence: plan.sequence, replace });
+  useEffect(() => {
+    if (!pressed || plan === undefined) return;
+    setPressed(false);
+    if (usable) start(false);
+  }, [pressed, plan]);
+  if (sending.state === "running") return html`<div class="row"><button type="button" onClick=${sending.stop}>Stop</button></div>`;
+  if (plan?.taken.length > 0 && !sending.replaces) return html`<${Clash} plan=${plan} rename=${rename} replace=${() => start(true)} drop=${drop} />`;
+  const action = sending.state === "stopped" ? "Go on" : plan ? `Enrol ${counted(plan.frames.length, "frame")}` : "Enrol";
+  const enrol = () => (plan === undefined ? setPressed(true) : start(sending.replaces));
+  return html`<div class="row"><button type="button" class="primary" disabled=${pressed || plan === null || (plan !== undefined && !usable && !sending.replaces)} onClick=${enrol}>${action}</button></div>`;
+}
+
+/** Places that have these ids already, which is no matter of course: nothing is sent before somebody has chosen. */
+function Clash({ plan: { taken, frames, sequence, free }, rename, replace, drop }) {
+  const names = [...new Set(taken.map((one) => one.sequence))];
+  const where = names.length > 1 ? `in ${names.length} traverses` : names[0] === null ? "in no traverse" : html`in the traverse <strong>${names[0]}</strong>`;
+  const [others, unread] = [taken.filter((one) => one.same === false).length, taken.some((one) => one.same === null)];
+  const how = unread ? "; over plain HTTP the browser cannot tell whether with these pictures" : others === 0 ? ", with these pictures" : others < taken.length ? `, ${integer(others)} of them with other pictures` : ", with other pictures";
+  const made = frames.some((one) => !one.given); // of the traverse's name
+  return html`
+    <div class="notice stack" role="alert">
+      <p><strong>${integer(taken.length)} of these ${counted(frames.length, "frame")}</strong> exist already ${where}${how}.${!made && " Their ids are from places.csv, where they can be changed."}${unread && " A picture that is the same stays as it is."}</p>
+      <div class="row">
+        ${made && free && free !== sequence && html`<button type="button" class="primary" onClick=${() => rename(free)}>Rename to ${free}</button>`}
+        <button type="button" class="danger" onClick=${replace}>Replace ${counted(taken.length, "place")}</button>
+        <button type="button" onClick=${drop}>Cancel</button>
+      </div>
+    </div>
+  `;
 }
 
 function Source({ take, busy }) {
@@ -94,18 +117,18 @@ function Source({ take, busy }) {
       <input ref=${pictures} class="hidden" type="file" multiple accept="image/*,video/*,.csv,.mcap,.bag,.db3" aria-label="Pictures, a video or bags" tabindex="-1" onChange=${chosen} />
       <input ref=${folder} class="hidden" type="file" webkitdirectory aria-label="A folder" tabindex="-1" onChange=${chosen} />
     </div>
-    <p class="faint small">Poses, times and ids come from a file places.csv among them: its first line names file, and may name id, x, y, z, heading, latitude, longitude, timestamp. Bags of ROS (.mcap, .db3, .bag) are uploaded and read by the service. Poses in EXIF, and trajectories in files of their own, are read by the command line: <code>placerec enrol</code>.</p>
+    <p class="faint small">Poses, times and ids come from a file places.csv among them: its first line names file, and may name id, x, y, z, heading, latitude, longitude, timestamp. ${HEADING} Bags of ROS (.mcap, .db3, .bag) are uploaded and read by the service. Poses in EXIF, and trajectories in files of their own, are read by the command line: <code>placerec enrol</code>.</p>
   `;
 }
 
-function Options({ options, change, cameras, frames, files, busy }) {
+function Options({ options, name, change, cameras, frames, files, busy }) {
   const posed = frames.some((one) => one.fields.x !== undefined);
   const video = files.some((file) => file.type.startsWith("video/"));
   return html`
     <fieldset class="stack" disabled=${busy}>
       <legend class="hidden">How frames are enrolled</legend>
       <div class="fields">
-        <${Field} label="Traverse" hint="Also before the ids that are made from names."><${Typed} maxlength="100" value=${options.sequence} change=${({ value }) => change({ sequence: value.trim() })} /><//>
+        <${Field} label="Traverse" hint=${files.some(isBag) ? "A bag is called as its file, unless a name is given here." : "Also before the ids that are made from names."}><${Typed} maxlength="100" value=${options.sequence ?? name} change=${({ value }) => change({ sequence: value.trim() })} /><//>
         <${Field} label="Camera"><select value=${options.camera} onChange=${(event) => change({ camera: event.target.value })}><option value="">none named</option>${cameras.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select><//>
         <${Field} label="Of the frames, each" hint="1: all of them."><${NumberInput} min="1" step="1" value=${options.every} change=${(every) => change({ every })} /><//>
         ${posed && html`<${Field} label="Metres between two"><${NumberInput} min="0" step="0.1" value=${options.metres} change=${(between) => change({ metres: between })} /><//>`}
@@ -116,18 +139,32 @@ function Options({ options, change, cameras, frames, files, busy }) {
   `;
 }
 
-function Preview({ read, chosen, wrong }) {
-  const posed = chosen.filter((one) => one.fields.x !== undefined || one.fields.latitude !== undefined).length;
+function Preview({ read, plan, name }) {
+  if (plan === undefined) return html`<${Loading} what=${read ? "Comparing with the map" : "Reading the files"} />`;
+  if (plan === null) return html`<h2>0 frames</h2>${read.remarks.map((one) => html`<p class="notice">${one}</p>`)}`;
+  const { frames, sequence, known, wrong } = plan;
+  const posed = frames.filter((one) => one.fields.x !== undefined || one.fields.latitude !== undefined).length;
   return html`
-    <h2>${counted(chosen.length, "frame")}${chosen.length < read.frames.length && html` <span class="faint">of ${integer(read.frames.length)}</span>`}</h2>
-    ${chosen.length > 0 && html`<p>${chosen[0].id}${chosen.length > 1 && html` to ${chosen.at(-1).id}`}; ${posed === 0 ? "without poses" : posed === chosen.length ? "all with poses" : `${integer(posed)} with poses`}.</p>`}
+    <h2>${counted(frames.length, "frame")}${frames.length < read.frames.length && html` <span class="faint">of ${integer(read.frames.length)}</span>`}</h2>
+    <p>${frames[0].id}${frames.length > 1 && html` to ${frames.at(-1).id}`}; ${posed === 0 ? "without poses" : posed === frames.length ? "all with poses" : `${integer(posed)} with poses`}.</p>
+    ${sequence !== name && html`<p class="notice">The map has a traverse ${name} already; these frames are the traverse ${sequence}.</p>`}
+    ${known > 0 && html`<p>${integer(known)} of them ${known === 1 ? "is" : "are"} there already, with ${known === 1 ? "this picture" : "these pictures"}; the enrolment goes on.</p>`}
     ${read.remarks.map((one) => html`<p class="notice">${one}</p>`)}
     ${wrong && html`<p class="notice" role="alert">${wrong}</p>`}
   `;
 }
 
-function Sent({ map, sending, sequence }) {
-  const { state, done, total, created, replaced, same, left, refused, error } = sending;
+/** The poses that frames are to get. */
+function Poses({ plan }) {
+  const drawn = useMemo(() => planOfFrames(plan.frames), [plan]);
+  return drawn && html`
+    <${SmallPlan} plan=${drawn} look=${plan} label=${`The poses of these frames: ${integer(drawn.posed)}.`} />
+    <p class="faint small">A line at each frame points along its heading.</p>
+  `;
+}
+
+function Sent({ map, sending }) {
+  const { state, done, total, created, replaced, same, left, refused, error, sequence } = sending;
   return html`
     <${Progress} done=${done} total=${total} label="Frames sent" />
     <p role="status">${integer(done)} of ${integer(total)}: ${integer(created)} new, ${integer(replaced)} replaced, ${integer(same)} were there${left > 0 && html`, ${integer(left)} left out as nothing had moved`}${refused.length > 0 && html`, ${integer(refused.length)} refused`}.</p>
@@ -156,18 +193,21 @@ function Growing({ map, count }) {
   `;
 }
 
-const NOTHING_SENT = { state: null, done: 0, total: 0, stored: 0, created: 0, replaced: 0, same: 0, left: 0, refused: [], error: null };
+const NOTHING_SENT = { state: null, replaces: false, sequence: "", done: 0, total: 0, stored: 0, created: 0, replaced: 0, same: 0, left: 0, refused: [], error: null };
 
-/** Sending frames in batches, one after the other; what is stored is not sent again when it is gone on with. */
-function useSending(map) {
-  const [told, setTold] = useState(NOTHING_SENT);
+/** Sending frames in batches, one after the other; what is stored is not sent again when it is gone on with.
+ *
+ * inputs: of the frames; what was sent of others is not shown.
+ */
+function useSending(map, inputs) {
+  const [told, setTold] = useStateOf(inputs, NOTHING_SENT);
   const run = useRef(null);
   useEffect(() => () => run.current?.abort(), []);
-  const start = async (frames, options) => {
+  const start = async ({ frames }, options) => {
     const controller = new AbortController();
     run.current = controller;
     const reader = new FrameReader(options);
-    const count = { ...NOTHING_SENT, state: "running", total: frames.length, refused: [] };
+    const count = { ...NOTHING_SENT, state: "running", replaces: options.replace, sequence: options.sequence, total: frames.length, refused: [] };
     const tell = () => setTold({ ...count, refused: [...count.refused] });
     tell();
     try {
@@ -222,19 +262,19 @@ async function sendBatch(map, batch, options, signal, count) {
   let wanted = batch;
   if (globalThis.crypto?.subtle) {
     const entries = await Promise.all(batch.map(async (one) => ({ ...entryOf(one, options), sha256: await digestOf(one.blob) })));
-    const { items } = await posted(map, entries, [], signal);
+    const { items } = await posted(map, entries, [], options, signal);
     wanted = batch.filter((one, number) => !noted(one, items[number], count, true));
   }
   if (wanted.length === 0) return;
-  const { items } = await posted(map, wanted.map((one, number) => ({ ...entryOf(one, options), file: `frame${number}` })), wanted, signal);
+  const { items } = await posted(map, wanted.map((one, number) => ({ ...entryOf(one, options), file: `frame${number}` })), wanted, options, signal);
   wanted.forEach((one, number) => noted(one, items[number], count, false));
 }
 
-async function posted(map, entries, files, signal) {
+async function posted(map, entries, files, { replace }, signal) {
   const form = new FormData();
   form.append("places", JSON.stringify(entries));
   files.forEach(({ blob }, number) => form.append(`frame${number}`, blob, `frame${number}`));
-  return (await send("POST", mapPath(map, "places"), { body: form, signal })).json();
+  return (await send("POST", mapPath(map, "places"), { query: { replace }, body: form, signal })).json();
 }
 
 /** Note what became of a frame; whether that is the end of it. */
@@ -250,9 +290,4 @@ function noted({ frame }, item, count, first) {
   else if (item.change === "unchanged") count.same += 1;
   else count.replaced += 1;
   return true;
-}
-
-async function digestOf(blob) {
-  const bytes = new Uint8Array(await crypto.subtle.digest("SHA-256", await blob.arrayBuffer()));
-  return Array.from(bytes, (one) => one.toString(16).padStart(2, "0")).join("");
 }

@@ -8,7 +8,7 @@ import { counted, decimal, integer, metres, percent } from "../shared/formats.js
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { Result } from "../shared/result.js";
 import { href } from "../shared/router.js";
 import { html, useMemo, useState } from "../shared/view.js";
@@ -212,47 +212,50 @@ function Gaps({ map, items, count, byMeasure }) {
 
 // Pruning and merging: a dry run first, whose report says what it would cost; then the same for good
 
-function useTrial(path) {
-  const [state, setState] = useState({ order: null, job: null, report: null, error: null });
-  const start = async (order) => {
-    setState({ order, job: null, report: null, error: null });
+const UNTRIED = { dry: true, running: false, job: null, report: null, error: null };
+
+/** A trial of what is ordered, and then the work itself: as soon as something else is ordered, nothing is known of it. */
+function useTrial(path, order) {
+  const [state, setState] = useStateOf(JSON.stringify([path, order]), UNTRIED);
+  const start = async (dry) => {
+    setState({ ...UNTRIED, dry, running: true });
     try {
-      setState({ order, job: await post(path, order), report: null, error: null });
+      const job = await post(path, { ...order, dry_run: dry });
+      setState((old) => ({ ...old, job }));
     } catch (error) {
-      setState({ order, job: null, report: null, error });
+      setState({ ...UNTRIED, dry, error });
     }
   };
-  const ended = (job) => setState((old) => ({ ...old, report: job.state === "succeeded" ? job.result : null }));
-  return { ...state, start, ended };
+  const ended = (job) => setState((old) => ({ ...old, running: false, report: job.state === "succeeded" ? job.result : null }));
+  return { ...state, preview: () => start(true), apply: () => start(false), ended };
 }
 
 function Prune({ map }) {
   const [loss, setLoss] = useState(1);
   const [dialog, setDialog] = useState(null);
-  const trial = useTrial(mapPath(map, "prune"));
-  const { report, job, order } = trial;
-  const apply = () => trial.start({ ...order, dry_run: false });
+  const trial = useTrial(mapPath(map, "prune"), { max_recall_loss: loss / 100 });
+  const { report, job, dry } = trial;
   const removed = report?.removed ?? 0;
   return html`
     <section class="panel" aria-label="Prune">
       <h2>Prune</h2>
       <p class="faint">Deletes places whose neighbours can stand in for them.</p>
       <${Field} label=${html`Recall that may be lost: <strong>${decimal(loss, 1)} %</strong>`}>
-        <input type="range" min="0" max="10" step="0.5" value=${loss} onInput=${(event) => setLoss(event.target.valueAsNumber)} />
+        <input type="range" min="0" max="10" step="0.5" disabled=${trial.running} value=${loss} onInput=${(event) => setLoss(event.target.valueAsNumber)} />
       <//>
-      <div class="row"><button type="button" onClick=${() => trial.start({ dry_run: true, max_recall_loss: loss / 100 })}>Preview the loss</button></div>
+      <div class="row"><button type="button" disabled=${trial.running} onClick=${trial.preview}>Preview the loss</button></div>
       ${trial.error && html`<${Trouble} error=${trial.error} />`}
-      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Pruning"} />`}
+      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${dry ? "Dry run" : "Pruning"} />`}
       ${report && html`
         <${Facts} rows=${[
-          [order.dry_run ? "Would go" : "Gone", `${integer(removed)} of ${integer(report.places)} places`],
+          [dry ? "Would go" : "Gone", `${integer(removed)} of ${integer(report.places)} places`],
           ["Recall before", shareText(report.recall_before)],
           ["Recall after", shareText(report.recall_after)],
           ["Measured on", `${report.measured_on}, ${integer(report.queries)} queries`],
         ]} />
-        ${removed > 0 && order.dry_run && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Delete ${integer(removed)} places</button></div>`}
+        ${removed > 0 && dry && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Delete ${integer(removed)} places</button></div>`}
       `}
-      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Delete the places" close=${() => setDialog(null)} send=${apply}>
+      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Delete the places" close=${() => setDialog(null)} send=${trial.apply}>
         <p>${integer(removed)} places go, with their pictures. This cannot be undone; export the map first if they may be wanted again.</p>
       <//>`}
     </section>
@@ -268,37 +271,46 @@ function Merge({ map }) {
   const [from, setFrom] = useState("");
   const [conflict, setConflict] = useState("refuse");
   const [dialog, setDialog] = useState(null);
-  const trial = useTrial(mapPath(map, "merge"));
-  const { report, job, order } = trial;
+  const trial = useTrial(mapPath(map, "merge"), { from, on_conflict: conflict });
+  const { report, job, dry } = trial;
   const own = maps.data?.find((one) => one.id === map);
   const others = (maps.data || []).filter((one) => one.id !== map && one.encoder === own?.encoder);
-  const apply = () => trial.start({ ...order, dry_run: false });
   return html`
     <section class="panel" aria-label="Merge">
       <h2>Merge</h2>
       <p class="faint">Copies the places of another map of the same encoder into this one; the other stays as it is.</p>
       ${others.length === 0 ? html`<p>There is no other map of this encoder.</p>` : html`
-        <div class="fields">
+        <fieldset class="fields" disabled=${trial.running} aria-label="What is merged">
           <${Field} label="From"><select value=${from} onChange=${(event) => setFrom(event.target.value)}><option value="">choose …</option>${others.map((one) => html`<option value=${one.id}>${one.id} (${integer(one.places)})</option>`)}</select><//>
           <${Field} label="Where names conflict"><select value=${conflict} onChange=${(event) => setConflict(event.target.value)}><option value="refuse">refuse</option><option value="rename">rename what comes</option><option value="skip">skip it</option></select><//>
-        </div>
-        <div class="row"><button type="button" disabled=${!from} onClick=${() => trial.start({ from, dry_run: true, on_conflict: conflict })}>Preview the merge</button></div>
+        </fieldset>
+        <div class="row"><button type="button" disabled=${!from || trial.running} onClick=${trial.preview}>Preview the merge</button></div>
       `}
       ${trial.error && html`<${Trouble} error=${trial.error} />`}
-      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Merging"} />`}
+      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${dry ? "Dry run" : "Merging"} />`}
       ${report && html`
+        <p role="status">${mergeText(report, dry, from)}</p>
+        ${report.coming > 0 && dry && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="primary" onClick=${() => setDialog(true)}>Copy ${counted(report.coming, "place")}</button></div>`}
         <${Facts} rows=${[
-          [order.dry_run ? "Would come" : "Came", `${integer(report.coming)} places`],
-          ["Known here already", integer(report.known)],
           ["Skipped", integer(report.skipped.count)],
           report.conflicts.length > 0 && ["Conflicts", html`<ul>${report.conflicts.map((one) => html`<li>${one}</li>`)}</ul>`],
           report.overlap && ["Overlap", html`<${Result} value=${report.overlap} />`],
         ]} />
-        ${report.coming > 0 && order.dry_run && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Copy ${integer(report.coming)} places</button></div>`}
       `}
-      ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
-        <p>${integer(report.coming)} places of ${order.from} come into ${map}.</p>
+      ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${trial.apply}>
+        <p>${counted(report.coming, "place")} of ${from} come into ${map}.</p>
       <//>`}
     </section>
   `;
+}
+
+/** What a merge would bring, or has brought, in a sentence. */
+function mergeText({ coming, known, conflicts, skipped }, dry, from) {
+  const of = html`<strong>${from}</strong>`;
+  const there = `${integer(known)} ${known === 1 ? "was" : "were"} there already`;
+  if (!dry) return html`${counted(coming, "place")} of ${of} came; ${there}.`;
+  if (conflicts.length > 0) return html`Nothing of ${of} can be copied as long as there are conflicts.`;
+  const all = coming + known + skipped.count;
+  const share = known === 0 ? `None of ${counted(all, "place")}` : known === all ? `All ${counted(all, "place")}` : `${integer(known)} of ${counted(all, "place")}`;
+  return html`${share} of ${of} ${known < 2 ? "is" : "are"} there already; ${coming === 0 ? "nothing would come" : `${integer(coming)} would come`}.`;
 }

@@ -4,19 +4,18 @@ import { Dialog, Field, Head, Moment, Nothing, Pager, Progress, Trouble, Typed }
 import { duration, integer } from "../shared/formats.js";
 import { CancelJob, hasEnded, JobState, useJob } from "../shared/jobs.js";
 import { Result } from "../shared/result.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
-import { html, useEffect, useState } from "../shared/view.js";
+import { html, useState } from "../shared/view.js";
 
 const STATES = ["queued", "running", "succeeded", "failed", "cancelled"];
 
 export default function Jobs({ query }) {
   const { map = "", state = "" } = query;
-  const [cursors, setCursors] = useState([""]);
+  const [cursors, setCursors] = useStateOf(JSON.stringify([map, state]), [""]);
   const cursor = cursors.at(-1);
   const jobs = useResource((signal) => get("/jobs", { map, state, limit: 50, cursor }, { signal }), [map, state, cursor], { every: 3000 });
   const [open, setOpen] = useState(null);
-  useEffect(() => setCursors([""]), [map, state]);
   return html`
     <${Head} title="Jobs" note="Long work in the background, the newest first." />
     <div class="filters" role="search" aria-label="Filters">

@@ -15,11 +15,11 @@ export default function Keys() {
   const [dialog, setDialog] = useState(null);
   const close = () => setDialog(null);
   const tools = { open: setDialog, close, changed: keys.reload };
-  const create = () => setDialog(html`<${Create} first=${keys.data?.length === 0} ...${tools} />`);
+  const create = () => setDialog(html`<${Create} first=${keys.data.length === 0} ...${tools} />`);
   return html`
     <${Head} title="Keys" note="Each caller has a key of its own, so that one can be deleted alone.">
       <label class="row"><input type="checkbox" checked=${ended} onChange=${() => setEnded(!ended)} /> also ended ones</label>
-      <button type="button" class="primary" onClick=${create}>Create a key</button>
+      <button type="button" class="primary" disabled=${keys.data === undefined} onClick=${create}>Create a key</button>
     <//>
     <${Shown} resource=${keys}>
       ${(items) => {
@@ -152,24 +152,17 @@ function Narrow({ key_: key, close, changed }) {
   `;
 }
 
-/** A name for the key after one: robot-7 goes on as robot-7.2, for two keys in force have no name in common. */
-function nextName(name) {
-  const [, stem, number] = /^(.*?)(?:\.(\d+))?$/.exec(name);
-  return `${stem}.${Number(number || 1) + 1}`;
-}
-
 const ENDS = { 0: "at once", 1: "in an hour", 24: "in a day", 168: "in a week" };
 
-/** Another key that may do the same takes the place of one, which goes on for a while. */
+/** Another key of the same name that may do the same takes the place of one, which goes on for a while. */
 function Rotate({ key_: key, close, changed }) {
   const [hours, setHours] = useState("24");
-  const [name, setName] = useState(nextName(key.name));
   const { guarded, box } = useLocking();
   const made = useRef(null);
   const rotate = guarded(async (query) => {
-    const { role, learn, maps, expires_at: expires } = key;
+    const { id, name, role, learn, maps, expires_at: expires } = key;
     // If the old one could not be ended, this is tried again with the new one that there is by then.
-    made.current ??= await (await send("POST", "/keys", { query, json: { name, role, maps, learn: role === "enrol" && learn, expires_at: expires } })).json();
+    made.current ??= await (await send("POST", "/keys", { query, json: { name, role, maps, learn: role === "enrol" && learn, expires_at: expires, replaces: id } })).json();
     if (key.own) await useKey(made.current.key, { known: true });
     const end = new Date(Date.now() + Number(hours) * 3_600_000);
     if (hours === "0") await send("DELETE", pathOf("keys", key.id), { query });
@@ -182,9 +175,8 @@ function Rotate({ key_: key, close, changed }) {
     close();
   };
   return html`
-    <${FormDialog} title=${`Rotate ${key.name}`} action="Make the new key" ready=${name.trim() !== ""} close=${cancel} send=${rotate}>
-      <p>A new key of the same role, maps and end is made, and shown once. Give it to whoever uses the old one before that ends.</p>
-      <${Field} label="Name of the new key"><input required maxlength="64" value=${name} onInput=${(event) => setName(event.target.value)} autocomplete="off" spellcheck=${false} /><//>
+    <${FormDialog} title=${`Rotate ${key.name}`} action="Make the new key" close=${cancel} send=${rotate}>
+      <p>A new key of the same name, role, maps and end is made, and shown once. Give it to whoever uses the old one before that ends.</p>
       <${Field} label="The old one ends">
         <select value=${hours} onChange=${(event) => setHours(event.target.value)}>${Object.entries(ENDS).map(([value, text]) => html`<option value=${value}>${text}</option>`)}</select>
       <//>

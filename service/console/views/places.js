@@ -7,7 +7,7 @@ import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { Place } from "../shared/place.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
 import { html, useEffect, useState } from "../shared/view.js";
 
@@ -28,13 +28,9 @@ export default function Places({ map, rest, query }) {
 function List({ map, query }) {
   const filter = Object.fromEntries(FILTERS.filter((name) => query[name]).map((name) => [name, query[name]]));
   const present = JSON.stringify(filter);
-  const [cursors, setCursors] = useState([""]);
-  const [chosen, setChosen] = useState(new Set());
+  const [cursors, setCursors] = useStateOf(present, [""]);
+  const [chosen, setChosen] = useStateOf(present, new Set());
   const [dialog, setDialog] = useState(null);
-  useEffect(() => {
-    setCursors([""]);
-    setChosen(new Set());
-  }, [present]);
   const cursor = cursors.at(-1);
   const page = useResource((signal) => get(mapPath(map, "places"), { ...filter, limit: PAGE, cursor }, { signal }), [map, filter, cursor]);
   const about = useResource((signal) => get(mapPath(map), {}, { signal }), [map]);

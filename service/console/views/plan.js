@@ -12,7 +12,7 @@ import { PlanCanvas } from "../shared/plan_canvas.js";
 import { contentOf, presentTints } from "../shared/plan_content.js";
 import { readPlan } from "../shared/plan_data.js";
 import { Robots } from "../shared/robots.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
 import { html, useEffect, useMemo, useRef, useState } from "../shared/view.js";
 
@@ -44,32 +44,34 @@ function Drawing({ map, plan, query, changed }) {
   const [strips, setStrips] = useState(plan.posed === 0);
   const [off, setOff] = useState(new Set());
   const [showGaps, setShowGaps] = useState(true);
-  const [misleading, setMisleading] = useState(null);
+  const [misleading, setMisleading] = useStateOf(plan, null); // numbers of places are those of one plan
   const [live, setLive] = useState(plan.posed > 0);
   const [theme, setTheme] = useState(isDark());
   const [grid, setGrid] = useState(false);
   const [point, setPoint] = useState(null);
   const [catching, setCatching] = useState(false);
-  const [selected, setSelected] = useState([]);
+  const drawn = useMemo(() => ({ plan, strips }), [plan, strips]);
+  const [selected, setSelected] = useStateOf(drawn, []);
   const floor = useFloor(map);
-  const [hovered, setHovered] = useState(null);
+  const [hovered, setHovered] = useStateOf(plan, null);
   const [view, setView] = useState(null);
   const drawing = useRef(null);
   const [ground, places, above] = [useRef(null), useRef(null), useRef(null)];
   const chosen = query.place !== undefined ? plan.index.get(query.place) ?? null : null;
   const choose = (number) => restate({ place: number === null ? "" : plan.ids[number] });
   const latest = useRef({});
-  latest.current = { choose, chosen, plan };
+  const seen = useRef({}); // as it is drawn: what the pointer meets
+  latest.current = { choose, chosen, plan, setHovered, setSelected };
 
   useEffect(() => onTheme(() => setTheme(isDark())), []);
   useEffect(() => {
     drawing.current = new PlanCanvas(places.current, above.current, {
-      onChoose: (number) => latest.current.choose(number),
-      onHover: setHovered,
+      onChoose: (number) => seen.current.choose(number),
+      onHover: (number) => seen.current.setHovered(number),
       onView: setView,
       onPoint: setPoint,
       onLasso: (numbers) => {
-        setSelected(numbers);
+        seen.current.setSelected(numbers);
         setCatching(false);
       },
       ground: ground.current,
@@ -82,13 +84,13 @@ function Drawing({ map, plan, query, changed }) {
   const shape = `${strips} ${map}`;
   const fitted = useRef(null);
   useEffect(() => {
+    seen.current = latest.current;
     drawing.current.mark({ tints: presentTints() });
     drawing.current.show(content, fitted.current !== shape);
     if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);
     fitted.current = shape;
   }, [content]);
   useEffect(() => drawing.current.mark({ chosen, hovered, misleading: misleading || [], selected }), [chosen, hovered, misleading, selected]);
-  useEffect(() => setSelected([]), [plan, strips]);
   useEffect(() => {
     drawing.current.catching = catching;
   }, [catching]);

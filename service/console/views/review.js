@@ -2,6 +2,7 @@
 import { get, getTagged, may, patch, post, remove, save } from "../shared/api.js";
 import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Name, Nothing, NumberInput, Pager, Pill, say, Verdict } from "../shared/elements.js";
 import { bytes, counted, decimal, integer, percent } from "../shared/formats.js";
+import { HeadingArrow } from "../shared/heading.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource } from "../shared/resource.js";
@@ -102,7 +103,8 @@ function Frames({ map, labelled, keeps }) {
       bringBack(frame.id);
       page.reload();
     };
-    say(labelText(told.frame.label), frame.label?.new ? undefined : undo);
+    if (frame.label?.new) say(labelText(told.frame.label));
+    else say(labelText(told.frame.label), undo, "labelled");
     page.reload();
   };
   const discard = (frame) => {
@@ -169,7 +171,7 @@ function useDiscards(map, setDone) {
       setDone((old) => new Map([...old].filter(([one]) => one !== id)));
       cameBack();
       return undefined;
-    });
+    }, "thrown away");
   };
   return { put };
 }
@@ -301,6 +303,7 @@ function Enrol({ frame, close, send }) {
         <${Field} label="Traverse"><input maxlength="128" value=${fields.sequence} onInput=${change("sequence")} /><//>
       </div>
       <div class="fields narrow">${POSE.map((name) => html`<${Field} label=${name}><input type="number" step="any" value=${fields[name]} onInput=${change(name)} /><//>`)}</div>
+      <${HeadingArrow} heading=${fields.heading} geographic=${fields.latitude !== ""} />
     <//>
   `;
 }

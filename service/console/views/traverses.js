@@ -8,7 +8,7 @@ import { mapPath } from "../shared/map_path.js";
 import { Matrix } from "../shared/matrix.js";
 import { CalibrationOutcome } from "../shared/outcome.js";
 import { Thumbnail } from "../shared/pictures.js";
-import { Shown, useResource } from "../shared/resource.js";
+import { Shown, useResource, useStateOf } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
 import { html, useState } from "../shared/view.js";
 
@@ -65,7 +65,7 @@ function Compare({ map, items, query }) {
   const names = items.map((one) => one.name);
   const asked = names.includes(query.query) ? query.query : names[1];
   const reference = names.includes(query.reference) ? query.reference : names.find((name) => name !== asked);
-  const [job, setJob] = useState(null);
+  const [job, setJob] = useStateOf(JSON.stringify([map, asked, reference]), null);
   const scores = useResource((signal) => readScores(map, asked, reference, signal), [map, asked, reference]);
   const there = scores.data !== undefined;
   const compared = useResource(async (signal) => (there ? get(mapPath(map, "similarity"), { query: asked, reference }, { signal }) : null), [map, asked, reference, there]);
@@ -77,9 +77,9 @@ function Compare({ map, items, query }) {
   const [dialog, setDialog] = useState(null);
   const close = () => setDialog(null);
   const submit = (order) => post(mapPath(map, "align"), { sequence: asked, ...order }).then(setJob, (error) => setJob({ error }));
-  const undo = () => submit({ with: [] });
+  const undo = (sequence = asked) => submit({ sequence, with: [] });
   const ask = () => setDialog(html`<${Align} names=${[asked, reference]} close=${close} send=${(poses) => submit({ with: [reference], poses })} />`);
-  const askBack = () => setDialog(html`<${Undo} name=${asked} close=${close} send=${undo} />`);
+  const askBack = () => setDialog(html`<${Undo} name=${asked} close=${close} send=${() => undo()} />`);
   return html`
     <section class="stack" aria-label="Comparison">
       <div class="filters">
@@ -148,7 +148,7 @@ function Alignment({ job, changed, undo }) {
     setResult(told.result);
     if (told.state !== "succeeded" || !told.result?.stored) return;
     changed();
-    if (!back) say(`${told.result.sequence} was aligned.`, undo);
+    if (!back) say(`${told.result.sequence} was aligned.`, () => undo(told.result.sequence));
   };
   const back = job.arguments.with?.length === 0;
   const what = back ? "Undoing the alignment" : job.arguments.dry_run ? "Alignment, a dry run" : "Alignment";

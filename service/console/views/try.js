@@ -43,12 +43,13 @@ export default function Try({ map }) {
     const added = files.slice(0, MOST).map((file) => ({ id: (number.current += 1), file, name: file.name || "frame", state: "waiting" }));
     setAsked((old) => [...added, ...old].slice(0, MOST));
     setShown(added[0]?.id ?? null);
+    const asking = present.current; // as it was chosen when they were handed in
     for (const one of added) {
       try {
         const frame = await readable(one.file);
         urls.current.set(one.id, frame.url);
         change(one.id, { frame, state: "asking" });
-        const answer = await query(map, frame, present.current);
+        const answer = await query(map, frame, asking);
         change(one.id, { answer, state: "answered" });
       } catch (error) {
         change(one.id, { error, state: "failed" });

@@ -6,7 +6,7 @@ import { JobProgress } from "../shared/jobs.js";
 import { ExportMap } from "../shared/export_map.js";
 import { mapPath } from "../shared/map_path.js";
 import { Result } from "../shared/result.js";
-import { useResource } from "../shared/resource.js";
+import { useResource, useStateOf } from "../shared/resource.js";
 import { go, href } from "../shared/router.js";
 import { html, useState } from "../shared/view.js";
 
@@ -49,7 +49,7 @@ export default function Upkeep({ map }) {
 
 /** One kind of work: a button, the job as it goes on, and its result. */
 function Work({ title, action, path, query, order, off, ready = true, onDone, children, fields }) {
-  const [state, setState] = useState({});
+  const [state, setState] = useStateOf(JSON.stringify([path, order]), {});
   const start = async () => {
     setState({ busy: true });
     try {
@@ -68,7 +68,7 @@ function Work({ title, action, path, query, order, off, ready = true, onDone, ch
       <h2>${title}</h2>
       <p class="faint">${children}</p>
       ${off && html`<p>${off}</p>`}
-      ${fields}
+      ${fields && html`<fieldset class="stack" disabled=${running} aria-label=${title}>${fields}</fieldset>`}
       <div class="row"><button type="button" disabled=${Boolean(off) || running || !ready} onClick=${start}>${action}</button></div>
       ${state.error && html`<${Trouble} error=${state.error} />`}
       ${state.job && html`<${JobProgress} key=${state.job.id} job=${state.job} onEnd=${ended} what=${title} />`}

@@ -25,7 +25,7 @@ METHODS = ("get", "post", "put", "patch", "delete")
 SENT = (
     *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Erasing", "Merging", "Reencoding"),
     *("CalibrationOrder", "CameraDefinition", "NewKey", "KeyChanges", "Deletion", "LabelOrder"),
-    "RecordingOrder",
+    *("RecordingOrder", "TraverseToCompare"),
 )
 """Schemas of bodies. They lose their required fields, which the calls take by position."""
 

@@ -154,6 +154,10 @@ def tour(client: Client, folder: Path) -> None:
     assert lab.places.thumbnail("p1").startswith(b"\xff\xd8")
     lab.places.delete("q2")
     assert lab.places.delete_many(ids=["q1", "q9"], dry_run=False).missing == ["q9"]
+    compared = lab.places.compare([{"id": "p1"}, {"id": "new"}], sequence="monday", named=False)
+    assert [one.id for one in compared.taken] == ["p1"] and compared.free == "monday~2"
+    (kept,) = lab.enrol([NewPlace("p1", jpeg(77))], replace=False)
+    assert isinstance(kept.error, problems.PlacesTaken)
     plan = lab.plan()
     assert len(plan.ids) == plan.places == 13
     covered = lab.coverage(x=2.5, y=0.0, k=2)

@@ -40,7 +40,7 @@ def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> Non
     assert "4 unchanged" in again.stdout
 
     (monday / "2.jpg").write_bytes(jpeg(7))
-    replaced = placerec("enrol", monday, "--map", "lab")
+    replaced = placerec("enrol", monday, "--map", "lab", "--replace")
     assert "1 replaced, 3 unchanged" in replaced.stdout
 
 
@@ -171,15 +171,42 @@ def test_a_camera_that_is_not_there_is_refused_before_a_map_is_made(
 
 
 @pytest.mark.thorough
-def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Placerec, monday: Path) -> None:
-    placerec("enrol", monday, "--map", "lab", "--create")
-    tuesday = monday.rename(monday.with_name("tuesday"))
-    refused = placerec("enrol", tuesday, "--map", "lab", status=1)
-    assert "4 ids of this traverse belong" in refused.stderr
-    assert "--id-prefix tuesday-" in refused.stderr
-    placerec("enrol", tuesday, "--map", "lab", "--id-prefix", "tuesday-")
-    sequences = json.loads(placerec("maps", "sequences", "list", "lab", "--json").stdout)
-    assert [(one["name"], one["places"]) for one in sequences] == [("monday", 4), ("tuesday", 4)]
+def test_another_folder_replaces_nothing_unless_it_is_to(
+    placerec: Placerec, tmp_path: Path, server: Server, map_id: str
+) -> None:
+    """Cameras count from 000: two folders have files of the same names, and may be called the same."""
+    there = ("--map", map_id, "--url", str(server.client.base_url))
+    first, second = many(tmp_path / "left", 3), tmp_path / "night" / "left"
+    second.mkdir(parents=True)
+    for number in range(3):
+        (second / f"{number}.jpg").write_bytes(jpeg(100 + number, 96, 72))
+    placerec("enrol", first, *there)
+    refused = placerec("enrol", second, *there, status=1).stderr
+    assert "3 of 3 frames exist already in the traverse 'left', with other pictures." in refused
+    assert "--sequence 'left~2' --id-prefix 'left~2-'" in refused and "--replace" in refused
+    moved = placerec("enrol", first, *there, "--sequence", "right", status=1).stderr
+    assert "3 of 3 frames exist already in the traverse 'left', with these very pictures." in moved
+    assert "--sequence left to go on with it" in moved
+    before = {one: place["updated_at"] for one, place in server.places(map_id).items()}
+    assert len(before) == 3, "nothing was sent"
+    assert "3 unchanged" in placerec("enrol", first, *there).stdout
+    # Beside it, and broken off, and gone on with by the same command.
+    (second / "2.jpg").rename(tmp_path / "2.jpg")
+    beside = ("--sequence", "left~2", "--id-prefix", "left~2-")
+    assert "2 created" in placerec("enrol", second, *there, *beside).stdout
+    (tmp_path / "2.jpg").rename(second / "2.jpg")
+    assert "1 created, 2 unchanged" in placerec("enrol", second, *there, *beside).stdout
+    assert {one: place["updated_at"] for one, place in server.places(map_id).items() if one in before} == before
+    # Other names of files: nobody chose this name of a traverse, so it is another one, also when it is gone on with.
+    for number in range(3):
+        (second / f"{number}.jpg").rename(second / f"n{number}.jpg")
+    third = placerec("enrol", second, *there)
+    assert "sequence left~3: 3 created" in third.stdout and "these frames are in 'left~3'" in third.stderr
+    assert "sequence left~3: 3 unchanged" in placerec("enrol", second, *there).stdout
+    # The word.
+    for number in range(3):
+        (second / f"n{number}.jpg").rename(second / f"{number}.jpg")
+    assert "sequence left: 3 replaced" in placerec("enrol", second, *there, "--replace").stdout
 
 
 @pytest.mark.thorough
@@ -250,6 +277,12 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
         self.answer(200, "application/json", {"items": [], "next_cursor": None})
 
     def do_POST(self) -> None:
+        if self.path.endswith(":compare"):
+            length = int(self.headers["Content-Length"])
+            sequence = json.loads(self.rfile.read(length))["sequence"]
+            compared = {"sequence": sequence, "free": sequence, "known": 0, "taken": []}
+            self.answer(200, "application/json", compared)
+            return
         frames = self.rfile.read(int(self.headers["Content-Length"])).count(b"filename=")
         type(self).taken += 1
         if self.taken == 1:
@@ -295,7 +328,9 @@ def test_many_frames_keep_their_order_and_are_not_sent_twice(
 
     (folder / "17.jpg").write_bytes(jpeg(170, 96, 72))
     (folder / "30.jpg").write_bytes(jpeg(300, 96, 72))
-    second = placerec("enrol", folder, "--map", map_id, "--url", url)
+    refused = placerec("enrol", folder, "--map", map_id, "--url", url, status=1)
+    assert "1 of 60 frames exist already in the traverse 'many', with other pictures." in refused.stderr
+    second = placerec("enrol", folder, "--map", map_id, "--url", url, "--replace")
     assert "60 of 60 frames are places" in second.stdout
     assert "1 created, 1 replaced, 58 unchanged" in second.stdout and "2 sent" in second.stdout
 

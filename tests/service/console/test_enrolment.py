@@ -329,3 +329,101 @@ def test_all_maps_are_exported(admin: Operator, keyed: Server) -> None:
     assert sorted(saved) == sorted(f"{name}.tar" for name in maps)
     admin.leave()
     keyed.client.delete("/v1/maps/another")
+
+
+def test_a_second_folder_replaces_nothing_by_chance(admin: Operator, keyed: Server, tmp_path: Path) -> None:
+    """Cameras count from 000: day and night both have a folder left, with files of the same names."""
+    keyed.create_map("clash")
+    folders = {name: tmp_path / name / "left" for name in ("day", "night")}
+    for first, folder in zip((0, 4), folders.values(), strict=True):
+        folder.mkdir(parents=True)
+        for number in range(3):
+            (folder / f"{number:03d}.jpg").write_bytes(world.frame(first + number))
+    page = admin.go("maps/clash/enrol")
+    chosen, traverse = page.get_by_role("region", name="To enrol"), page.get_by_label("Traverse")
+    status = chosen.locator("p[role=status]", has_text="of 3:")
+
+    def choose(name: str) -> None:
+        page.get_by_label("A folder").set_input_files(folders[name])
+
+    def enrolled() -> dict[str, str]:
+        return {one: place["sequence"] for one, place in keyed.places("clash").items()}
+
+    choose("day")
+    chosen.get_by_role("button", name="Enrol 3 frames").click()
+    expect(status).to_have_text("3 of 3: 3 new, 0 replaced, 0 were there.")
+    choose("night")  # it is called as its folder, and made unique
+    expect(chosen).to_contain_text("The map has a traverse left already; these frames are the traverse left~2.")
+    expect(traverse).to_have_value("left~2")
+    expect(status).to_have_count(0)
+    chosen.get_by_role("button", name="Enrol 3 frames").click()
+    expect(status).to_have_text("3 of 3: 3 new, 0 replaced, 0 were there.")
+    both = {f"{name}-{number:03d}": name for name in ("left", "left~2") for number in range(3)}
+    assert enrolled() == both
+    for name, called in (("day", "left"), ("night", "left~2")):  # the very same is gone on with
+        keyed.client.delete(f"/v1/maps/clash/places/{called}-002")
+        choose(name)
+        expect(chosen).to_contain_text("2 of them are there already, with these pictures; the enrolment goes on.")
+        expect(traverse).to_have_value(called)
+        chosen.get_by_role("button", name="Enrol 3 frames").click()
+        expect(status).to_have_text("3 of 3: 1 new, 0 replaced, 2 were there.")
+    assert enrolled() == both
+
+    sent: list[str] = []
+    page.on("request", lambda one: sent.append(one.url) if one.method == "POST" and ":compare" not in one.url else None)
+    traverse.fill("left")  # over the pictures of the day
+    traverse.press("Tab")
+    clash = chosen.get_by_role("alert")
+    expect(clash).to_contain_text("3 of these 3 frames exist already in the traverse left, with other pictures.")
+    expect(chosen.get_by_role("button", name="Enrol")).to_have_count(0)
+    clash.get_by_role("button", name="Rename to left~3").click()
+    expect(traverse).to_have_value("left~3")
+    expect(clash).to_have_count(0)
+    traverse.fill("left")
+    traverse.press("Tab")
+    clash.get_by_role("button", name="Cancel").click()
+    expect(chosen).to_have_count(0)
+    choose("night")
+    assert sent == [] and enrolled() == both
+    clash.get_by_role("button", name="Replace 3 places").click()
+    expect(status).to_have_text("3 of 3: 0 new, 3 replaced, 0 were there.")
+
+
+def test_poses_are_seen_with_their_headings_before_they_are_sent(
+    admin: Operator, keyed: Server, tmp_path: Path
+) -> None:
+    keyed.create_map("headed")
+    page = admin.go("maps/headed/enrol")
+    page.get_by_label("A folder").set_input_files(recording(tmp_path / "drive", 3))
+    chosen = page.get_by_role("region", name="To enrol")
+    chosen.get_by_role("img", name=re.compile("The poses of these frames: 3")).wait_for()
+    expect(page.get_by_role("region", name="Frames", exact=True)).to_contain_text("counter-clockwise from +x")
+    admin.go(f"maps/{world.LAB}/places/monday-00").get_by_role("button", name="Edit").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("heading").fill("90")
+    dialog.get_by_role("img", name="Points 0 degrees clockwise from +y").wait_for()
+    dialog.get_by_label("Pose").select_option("geographic")
+    dialog.get_by_role("img", name="Points 90 degrees clockwise from north").wait_for()
+
+
+@pytest.mark.thorough
+def test_a_bag_of_other_pictures_replaces_nothing_by_chance(admin: Operator, keyed: Server, tmp_path: Path) -> None:
+    keyed.create_map("bags")
+    page = admin.go("maps/bags/enrol")
+    bag = page.get_by_role("region", name="walk.mcap")
+
+    def choose(first: int) -> None:
+        file = tmp_path / str(first) / "walk.mcap"
+        file.parent.mkdir()
+        write_mcap(file, [compressed(START + n * 10**9, world.frame(first + n)) for n in range(2)])
+        page.get_by_label("Pictures, a video or bags").set_input_files(file)
+
+    choose(0)
+    bag.get_by_role("button", name="Upload and enrol").click()
+    expect(bag.get_by_role("status")).to_contain_text("2 of 2 frames were taken: 2 created")
+    choose(4)
+    bag.get_by_role("button", name="Upload and enrol").click()
+    expect(bag.get_by_role("alert")).to_contain_text("2 of 2 frames exist already in the traverse 'walk', with other")
+    bag.get_by_role("button", name="Rename to walk~2").click()
+    expect(bag.get_by_role("status")).to_contain_text("2 of 2 frames were taken: 2 created")
+    assert sorted(one["sequence"] for one in keyed.places("bags").values()) == ["walk", "walk", "walk~2", "walk~2"]

@@ -74,7 +74,7 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     page.get_by_text("Enrolled as p9.").wait_for()
     assert keyed.client.get(f"/v1/maps/{doubtful}/places/p9").json()["pose"]["x"] == 30
     panel.get_by_role("button", name="It is p1").click()
-    page.get_by_text("Labelled as p1.").wait_for()
+    page.get_by_text("2 labelled").wait_for()
     panel.get_by_role("button", name="Another place").click()
     page.get_by_role("dialog").get_by_label("Id of the place").fill("p0")
     page.get_by_role("dialog").get_by_role("button", name="Label").click()
@@ -280,6 +280,26 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     with page.expect_download() as saved:
         dialog.get_by_role("button", name="Export").click()
     assert Path(saved.value.path()).stat().st_size > 10_000
+
+
+def test_labels_given_quickly_are_one_message_that_takes_all_back(
+    admin: Operator, keyed: Server, doubtful: str
+) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
+    expect(queue).to_have_count(3)
+    request = page.get_by_role("region", name="Frame to be labelled").locator("code")
+    first = request.inner_text()
+    for left in (2, 1, 0):
+        page.keyboard.press("1")
+        expect(queue).to_have_count(left)
+    told = page.locator(".message")
+    expect(told).to_have_count(1)
+    expect(told).to_contain_text("3 labelled")
+    told.get_by_role("button", name="Undo").click()
+    expect(queue).to_have_count(3)
+    expect(request).to_have_text(first)
+    assert keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"] == []
 
 
 def test_a_frame_becomes_a_look_and_is_taken_back(admin: Operator, keyed: Server, doubtful: str) -> None:

@@ -253,9 +253,33 @@ def test_what_does_not_fit_is_told_and_the_bag_stays_for_another_try(taking: Ser
     # The same frames as another traverse would take these places away from it.
     assert put(taking, "tries", "two.bag", 0, data).status_code == 200
     problem = enrolled(taking, "tries", "two.bag", topic=CAMERA, sequence="tuesday")["problem"]
-    assert problem["type"].endswith("invalid-recording") and "another traverse" in problem["detail"]
+    assert problem["type"].endswith("places-taken") and "in the traverse 'monday', with these very" in problem["detail"]
     again = enrolled(taking, "tries", "two.bag", topic=CAMERA, sequence="tuesday", id_prefix="t-", keep_standing=True)
     assert again["result"]["changes"] == {"created": 6}
+
+
+@pytest.mark.thorough
+def test_another_bag_replaces_nothing_unless_it_is_to(taking: Server, tmp_path: Path) -> None:
+    """Ids are made of stamps: of a robot without a clock, every bag begins at the same."""
+    taking.create_map("stamped")
+
+    def enrol(pictures: int, after: int = 0, **order: Any) -> dict[str, Any]:
+        said = [compressed(START + (after + n) * SECOND, jpeg(pictures + n)) for n in range(3)]
+        data = write_mcap(tmp_path / "walk.mcap", said).read_bytes()
+        taking.client.delete("/v1/maps/stamped/recordings/walk.mcap")  # one whose job failed is still there
+        assert put(taking, "stamped", "walk.mcap", 0, data).status_code == 200
+        return enrolled(taking, "stamped", "walk.mcap", keep_standing=True, **order)
+
+    assert enrol(10)["result"]["changes"] == {"created": 3}
+    problem = enrol(20)["problem"]
+    assert problem["type"].endswith("places-taken")
+    assert "3 of 3 frames exist already in the traverse 'walk', with other pictures." in problem["detail"]
+    again = enrol(10)["result"]
+    assert (again["changes"], again["sequence"], again["remarks"]) == ({"unchanged": 3}, "walk", [])
+    later = enrol(30, after=60)["result"]
+    assert (later["changes"], later["sequence"]) == ({"created": 3}, "walk~2")
+    assert later["remarks"] == ["The map has a traverse walk already; these frames are in walk~2."]
+    assert enrol(20, replace=True)["result"]["changes"] == {"replaced": 3}
 
 
 @pytest.mark.thorough

@@ -290,6 +290,7 @@ class AsyncMap:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
+        replace: bool = True,
     ) -> list[Enrolled]:
         """Enrol many frames in their order, and return what became of each.
 
@@ -307,8 +308,10 @@ class AsyncMap:
             places: read in a thread when their turn comes.
             known: ids that the map has; found out if left out.
             encoder: name or identity that the map must have.
+            replace: whether a frame replaces the place of another frame that has its id; otherwise its ``error`` is
+                ``PlacesTaken``.
         """
-        return [one async for one in self.enrol_each(places, known=known, encoder=encoder)]
+        return [one async for one in self.enrol_each(places, known=known, encoder=encoder, replace=replace)]
 
     async def enrol_each(
         self,
@@ -316,6 +319,7 @@ class AsyncMap:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
+        replace: bool = True,
     ) -> AsyncGenerator[Enrolled]:
         """Enrol many frames as ``enrol`` does, and yield what became of each as soon as it is known.
 
@@ -327,11 +331,11 @@ class AsyncMap:
                 print(one.place.id, one.change or one.error)
 
         Args:
-            places, known, encoder: as of ``enrol``.
+            places, known, encoder, replace: as of ``enrol``.
         """
         if known is None:
             known = {place.id async for place in self.places.list()}
-        options = {"encoder": encoder}
+        options = {"encoder": encoder, "replace": None if replace else False}
         lasting = self.connection.lasting(PATIENCE)
         enrolment = AsyncEnrolment(lasting, self.path + "/places", places, known, options)
         async with aclosing(enrolment.run()) as outcomes:

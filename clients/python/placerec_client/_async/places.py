@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Unpack
 
@@ -88,6 +88,22 @@ class AsyncPlaces(OldNames, forget="delete", forget_many="delete_many"):
         """
         path = self._path + ":delete"
         return await self._connection.ask(models.DeletedPlaces, "POST", path, json=fields(options))
+
+    async def compare(
+        self, places: Sequence[parameters.FrameToCompare], **options: Unpack[parameters.TraverseToCompare]
+    ) -> models.TraverseComparison:
+        """Compare a traverse with what the map has, before its frames are sent; nothing is stored.
+
+        First send the ids alone; then, of the places that are ``taken``, the ids with the SHA-256 of the frames.
+
+        Args:
+            places: each frame's ``id`` and, where its bytes were read, ``sha256`` in hexadecimal.
+            options: ``sequence``, ``named``, ``camera``.
+        """
+        path = self._path + ":compare"
+        return await self._connection.ask(
+            models.TraverseComparison, "POST", path, json={"places": places, **fields(options)}
+        )
 
     async def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
         """Return the latest answers in which a place was a match."""

@@ -289,6 +289,7 @@ class Map:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
+        replace: bool = True,
     ) -> list[Enrolled]:
         """Enrol many frames in their order, and return what became of each.
 
@@ -306,8 +307,10 @@ class Map:
             places: read in a thread when their turn comes.
             known: ids that the map has; found out if left out.
             encoder: name or identity that the map must have.
+            replace: whether a frame replaces the place of another frame that has its id; otherwise its ``error`` is
+                ``PlacesTaken``.
         """
-        return [one for one in self.enrol_each(places, known=known, encoder=encoder)]
+        return [one for one in self.enrol_each(places, known=known, encoder=encoder, replace=replace)]
 
     def enrol_each(
         self,
@@ -315,6 +318,7 @@ class Map:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
+        replace: bool = True,
     ) -> Generator[Enrolled]:
         """Enrol many frames as ``enrol`` does, and yield what became of each as soon as it is known.
 
@@ -326,11 +330,11 @@ class Map:
                 print(one.place.id, one.change or one.error)
 
         Args:
-            places, known, encoder: as of ``enrol``.
+            places, known, encoder, replace: as of ``enrol``.
         """
         if known is None:
             known = {place.id for place in self.places.list()}
-        options = {"encoder": encoder}
+        options = {"encoder": encoder, "replace": None if replace else False}
         lasting = self.connection.lasting(PATIENCE)
         enrolment = Enrolment(lasting, self.path + "/places", places, known, options)
         with closing(enrolment.run()) as outcomes:

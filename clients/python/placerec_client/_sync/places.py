@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Unpack
 
@@ -89,6 +89,20 @@ class Places(OldNames, forget="delete", forget_many="delete_many"):
         """
         path = self._path + ":delete"
         return self._connection.ask(models.DeletedPlaces, "POST", path, json=fields(options))
+
+    def compare(
+        self, places: Sequence[parameters.FrameToCompare], **options: Unpack[parameters.TraverseToCompare]
+    ) -> models.TraverseComparison:
+        """Compare a traverse with what the map has, before its frames are sent; nothing is stored.
+
+        First send the ids alone; then, of the places that are ``taken``, the ids with the SHA-256 of the frames.
+
+        Args:
+            places: each frame's ``id`` and, where its bytes were read, ``sha256`` in hexadecimal.
+            options: ``sequence``, ``named``, ``camera``.
+        """
+        path = self._path + ":compare"
+        return self._connection.ask(models.TraverseComparison, "POST", path, json={"places": places, **fields(options)})
 
     def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
         """Return the latest answers in which a place was a match."""
