@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unicodedata import normalize
 
 import cv2
@@ -44,13 +45,16 @@ from tests.core.recordings.test_plausibility import (
     walked,
     without_headings,
 )
+from tests.service.map_jobs import finished
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server, text, typed
 
 FRAMES = [jpeg(number, 128, 96) for number in range(3)]
 GREY = cv2.cvtColor(scene(1, 64, 48), cv2.COLOR_BGR2GRAY)
 TEN_BITS, THERMAL = GREY.astype(np.uint16) * 4, 29_000 + GREY.astype(np.uint16)
-METRES, DEGREES = {"x": 1, "y": 2}, {"latitude": 48.5, "longitude": 2.25}
+METRES: dict[str, Any] = {"x": 1, "y": 2}
+DEGREES: dict[str, Any] = {"latitude": 48.5, "longitude": 2.25}
+NO_POSES = Poses()
 NOW = datetime.now(UTC).replace(microsecond=0) - timedelta(minutes=5)
 
 
@@ -62,7 +66,7 @@ class Ways:
     server: Server
     map: str
 
-    def recording(self, path: Path, poses: Poses = Poses(), topic: str | None = None) -> str:
+    def recording(self, path: Path, poses: Poses = NO_POSES, topic: str | None = None) -> str:
         """What is said of a recording, and how many of its frames have a pose."""
         try:
             with open_recording(path, topic, poses) as found:
@@ -74,7 +78,7 @@ class Ways:
     def walk(self, fault: Fault, source: Callable[..., tuple[Path, Poses]] = bag) -> str:
         return self.recording(*source(walked(fault), self.folder))
 
-    def bag(self, *said: Said, topic: str | None = None, poses: Poses = Poses()) -> str:
+    def bag(self, *said: Said, topic: str | None = None, poses: Poses = NO_POSES) -> str:
         return self.recording(bags.write_mcap(self.folder / "one.mcap", said), poses, topic)
 
     def pixels(self, name: str, data: bytes, width: int = 64, height: int = 48, step: int = 0) -> str:
@@ -98,7 +102,7 @@ class Ways:
         return self.command("enrol", path, "--map", self.map, *words)
 
     def http(
-        self, method: str, path: str, data: bytes = b"", headers: dict[str, str] | None = None, **parameters: object
+        self, method: str, path: str, data: bytes = b"", headers: dict[str, str] | None = None, **parameters: Any
     ) -> str:
         response = self.server.client.request(
             method,
@@ -109,10 +113,10 @@ class Ways:
         )
         return shown(response)
 
-    def query(self, data: bytes = FRAMES[0], headers: dict[str, str] | None = None, **parameters: object) -> str:
+    def query(self, data: bytes = FRAMES[0], headers: dict[str, str] | None = None, **parameters: Any) -> str:
         return self.http("POST", "/query", data, headers, **parameters)
 
-    def put(self, data: bytes = FRAMES[0], place: str = "new", **parameters: object) -> str:
+    def put(self, data: bytes = FRAMES[0], place: str = "new", **parameters: Any) -> str:
         return self.http("PUT", f"/places/{place}", data, **parameters)
 
     def frames(self, *sent: dict[str, object]) -> str:
@@ -178,21 +182,19 @@ def empty_split(ways: Ways) -> str:
 
 
 def restarted(ways: Ways) -> str:
-    path, _ = bag(walked(restart), ways.folder)
+    told = [moved(one.stamp, one.x, one.y) for one in walked(restart)]
+    seen = [compressed(START + number * SECOND, jpeg(number, 64, 48)) for number in range(20)]
+    path = bags.write_mcap(ways.folder / "walk.mcap", sorted([*told, *seen], key=lambda said: said.received))
     return ways.enrol(path, "--pose-topic", "/odom")
 
 
-def batch(ways: Ways, *places: dict[str, object], job: bool = False) -> str:
+def batch(ways: Ways, *places: dict[str, Any], job: bool = False) -> str:
     parts = [("places", ("places.json", json.dumps([{**one, "file": "a"} for one in places]), "application/json"))]
     parts.append(("a", ("a.jpg", FRAMES[0], "image/jpeg")))  # type: ignore[arg-type]
-    path = f"/v1/maps/{ways.map}/places" + (":enrol" if job else "")
-    response = ways.server.client.post(path, files=parts)
-    if not job:
-        return "; ".join(str(one.get("problem", {}).get("detail", one["status"])) for one in response.json()["items"])
-    until = response.json()
-    while until["state"] in ("queued", "running"):
-        until = ways.server.client.get(f"/v1/jobs/{until['id']}", params={"wait": "10"}).json()
-    return json.dumps(until["result"])
+    path = f"/v1/maps/{ways.map}/places"
+    response = ways.server.client.post(path, files=parts, params={"background": str(job).lower()})
+    result = finished(ways.server, response.json())["result"] if job else response.json()
+    return "; ".join(str(one.get("problem", {}).get("detail", one["status"])) for one in result["items"])
 
 
 def twice(ways: Ways) -> str:
@@ -207,7 +209,7 @@ def twice(ways: Ways) -> str:
 
 def one_name(ways: Ways) -> str:
     """A traverse that is written in one form of Unicode and asked for in another."""
-    said = ways.put(place="café", sequence=normalize("NFD", "été"))
+    said = ways.put(place="cafe", sequence=normalize("NFD", "été"))
     assert said.startswith("20"), said
     found = ways.server.client.get(f"/v1/maps/{ways.map}/places", params={"sequence": normalize("NFC", "été")}).json()
     return f"found {len(found['items'])} in {found['items'][0]['sequence']!r}"
@@ -222,14 +224,15 @@ BAYER = (TEN_BITS[::2] * 8).tobytes()
 YEARS = 20 * 365.25 * 86_400
 
 ROWS: list[Row] = [
-    ("two publishers on one topic, bag", lambda w: w.walk(two_publishers), r"alternates between two publishers.*\[0 of"),
+    ("two publishers on one topic, bag", lambda w: w.walk(two_publishers),
+        r"alternates between two publishers.*\[0 of"),
     ("two publishers on one topic, command", lambda w: w.enrol(bag(walked(two_publishers), w.folder)[0],
         "--pose-topic", "/odom"), r"exit 1.*lose their pose.*--allow-lost-poses"),
     ("a spike of 10⁶ m, bag", lambda w: w.walk(spike), r"/odom leaps once, by 999 99\d m"),
     ("a jump in /tf", lambda w: w.walk(spike, transforms), r"/tf .*leaps once"),
     ("a line of 5 000 km, TUM", far_line, r"path\.tum.* leaps once, by \d \d\d\d \d\d\d m.*line 101"),
     ("odometry begins anew, bag", lambda w: w.walk(restart), r"begins anew.*~2"),
-    ("odometry begins anew, command", restarted, r"exit 0.*begins anew.*walk, walk~2.*path 9\.\d m|path 9.*walk~2"),
+    ("odometry begins anew, command", restarted, r"exit 0.*walk, walk~2.*begins anew.*Path 9\.\d m"),
     ("a NaN, bag", lambda w: w.walk(no_number), r"1 of 200 .*a number that is none"),
     ("a NaN, TUM", lambda w: w.walk(no_number, tum), r"1 of 200 .*a number that is none"),
     ("1e308, bag", lambda w: w.bag(compressed(START, FRAMES[0]), *(moved(START + n * SECOND // 9,
@@ -245,8 +248,8 @@ ROWS: list[Row] = [
         r"1 of 2 .*no fix.*\[1 of 2"),
     ("poses that leap, job", lambda w: batch(w, *({"id": f"j{n}", "x": 1e6 if n == 3 else n, "y": 0,
         "timestamp": ahead(n)} for n in range(8)), job=True), r"j3.*(speed|m/s|m within)"),
-    ("names of data sets", lambda w: w.enrol(folder(w, {f"@0548164.{n}@4180910@10@S@@@p{n}@@{n}@@@@2018@@.jpg": FRAMES[n]
-        for n in range(3)})), r"exit 0.*UTM.*3 with a pose"),
+    ("names of data sets", lambda w: w.enrol(folder(w, {f"@0548164.{n}@4180910@10@S@@@p{n}@@{n}@@@@2018@@.jpg":
+        FRAMES[n] for n in range(3)})), r"exit 0.*3 with a pose.*UTM zone 10N"),
     ("a frame an hour back", lambda w: w.frames({"timestamp": ahead(0)}, {"timestamp": ahead(-3600)},
         {"timestamp": ahead(-3599)}), r"clock went back: .*then taken"),
     ("one stamp twenty years ahead", lambda w: w.frames({"timestamp": ahead(0)}, {"timestamp": ahead(YEARS)},
@@ -261,7 +264,8 @@ ROWS: list[Row] = [
         r"^\[0 of 1 .* node: uint16 \(48, 64, 3\)"),
     ("bayer_rggb16", lambda w: w.pixels("bayer_rggb16", BAYER, height=24), r"^\[0 of 1 .* node: uint16 \(24, 64, 3\)"),
     ("nv12", lambda w: w.pixels("nv12", bytes(64 * 72)), r"^\[0 of 1 .* node: uint8 \(48, 64, 3\)"),
-    ("an unknown encoding", lambda w: w.pixels("32FC1", bytes(64 * 48 * 4)), r"'32FC1' is not read.*node: Unfit.*32FC1"),
+    ("an unknown encoding", lambda w: w.pixels("32FC1", bytes(64 * 48 * 4)),
+        r"'32FC1' is not read.*node: Unfit.*32FC1"),
     ("ten bits of sixteen, HTTP", lambda w: w.put(png16(TEN_BITS)), r"422 .*reach only \d+ of 65535"),
     ("ten bits of sixteen, query", lambda w: w.query(png16(TEN_BITS)), r"200 few-values"),
     ("ten bits of sixteen, command", lambda w: w.enrol(folder(w, {"a.png": png16(TEN_BITS)})),
@@ -273,15 +277,17 @@ ROWS: list[Row] = [
         r"depth image, which shows no place"),
     ("Bayer within PNG", lambda w: w.bag(compressed(START, encoded(GREY, ".png"), form="bayer_rggb8; png compressed "
         "bayer_rggb8")), r"^\[0 of 1"),
-    ("an empty split", empty_split, r"split_1\.mcap.*left out"),
+    ("an empty split", empty_split, r"left out.*split_1\.mcap is not"),
     ("NFC and NFD", one_name, r"found 1 in 'été'"),
     ("a compressed body", lambda w: w.query(headers={"Content-Encoding": "gzip"}), r"415 .*gzip"),
-    ("another digest", lambda w: w.query(headers={"Content-Digest": "sha-256=:" + 43 * "A" + "=:"}), r"400 .*digest"),
-    ("image/jpg", lambda w: w.query(headers={"Content-Type": "image/jpg"}), r"200 taken"),
+    ("another digest", lambda w: w.query(headers={"Content-Digest": "sha-256=:" + 43 * "A" + "=:"}), r"4\d\d digest-mismatch"),
+    ("image/jpg", lambda w: w.query(headers={"Content-Type": "image/jpg"}), r"^200"),
     ("k=1_0", lambda w: w.query(k="1_0"), r"422 .*k"),
     ("k=+5", lambda w: w.query(k="+5"), r"422 .*k"),
-    ("metres and degrees, HTTP", lambda w: w.put(**METRES) and w.put(place="other", **DEGREES), r"4\d\d .*a map has one"),
-    ("metres and degrees, batch", lambda w: batch(w, {"id": "m", **METRES}, {"id": "d", **DEGREES}), r"a map has one kind"),
+    ("metres and degrees, HTTP", lambda w: w.put(**METRES) and w.put(place="other", **DEGREES),
+        r"4\d\d .*a map has one"),
+    ("metres and degrees, batch", lambda w: batch(w, {"id": "m", **METRES}, {"id": "d", **DEGREES}),
+        r"a map has one kind"),
     ("metres and degrees, query", lambda w: w.put(**METRES) and w.query(near_latitude=48, near_longitude=2, radius=5),
         r"4\d\d .*"),
     ("odometry_heading=400", lambda w: w.frames({"frame": 0}, {"odometry_x": 0, "odometry_y": 0,
