@@ -151,7 +151,9 @@ def enrol(
         from core.recordings.paths import check_lost_poses, traverse_of, way_of  # here because it takes a moment
 
         name = opened.name if sequence is None else sequence
-        traverses = [_checked_sequence(one) for one in dict.fromkeys(traverse_of(name, one) for one in opened.frames)]
+        for one in {traverse_of(name, frame) for frame in opened.frames}:
+            _checked_sequence(one)
+        traverses = dict[str, None]()  # of the chosen frames, in their order
         if not allow_lost_poses:
             check_lost_poses(opened)
 
@@ -160,7 +162,9 @@ def enrol(
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             if (way := way_of(chosen)) is not None:
                 remark(f"{way[0].upper()}{way[1:]}.")
-            return [FrameToSend(taken, traverse_of(name, taken), camera) for taken in chosen]
+            to_send = [FrameToSend(taken, traverse_of(name, taken), camera) for taken in chosen]
+            traverses.update(dict.fromkeys(one.sequence for one in to_send))
+            return to_send
 
         report, frames = run(
             _enrol(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}, opened.intrinsics)
