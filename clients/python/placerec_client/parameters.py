@@ -268,6 +268,11 @@ class EnrolPlaces(TypedDict, total=False):
     POST …/align does; the job's result has the reports in `aligned`.
     """
 
+    most_speed: float | None
+    """With background: metres a second of the vehicle at most; 60 if left out. A place is refused with
+    `implausible-pose` whose pose is reached faster, by the timestamps of its traverse.
+    """
+
     batch: str | None
     """A name for this batch, for example a random one, to which another batch can refer with after."""
 
@@ -1130,6 +1135,14 @@ class RecordingOrder(TypedDict, total=False):
 
     largest_gap: float
     """Seconds between poses that are bridged."""
+
+    most_speed: float
+    """Metres a second of the vehicle at most: poses that are reached faster are left out."""
+
+    allow_lost_poses: bool
+    """Also enrol a bag of which more than a tenth of the frames lose their pose, as no vehicle can have driven so;
+    without it, the job fails and nothing is enrolled.
+    """
 
     every_metres: float | None
 

@@ -337,19 +337,28 @@ class Map:
             for outcome in outcomes:
                 yield outcome
 
-    def enrol_by_job(self, places: Sequence[NewPlace], *, align: bool = False, encoder: str | None = None) -> Job:
+    def enrol_by_job(
+        self,
+        places: Sequence[NewPlace],
+        *,
+        align: bool = False,
+        encoder: str | None = None,
+        most_speed: float | None = None,
+    ) -> Job:
         """Send many frames in one request, and return the job that enrols them.
 
         Args:
             places: all are read twice; none of them is held in memory.
             align: whether the job then finds which frames show places that the map had already.
             encoder: name or identity that the map must have.
+            most_speed: metres a second of the vehicle; places whose poses are reached faster are refused, by default
+                at 60.
 
         Raises:
             InvalidFrame, InvalidName, InvalidParameter: a frame cannot be read, or no place can have its id or its
                 fields; nothing is enrolled.
         """
-        options = {"align": align or None, "encoder": encoder}
+        options = {"align": align or None, "encoder": encoder, "most_speed": most_speed}
         return enrol_by_job(self.connection.lasting(PATIENCE), self.path + "/places", places, options)
 
     def query_or_enrol(
