@@ -37,7 +37,7 @@ BASELINE = 0.5
 """Seconds over which the speed before a sample is measured, at least."""
 
 LONGEST_EXCURSION = 5.0
-"""Seconds, or five usual steps, for which a track may be left and is still followed."""
+"""Seconds, or ten usual steps, for which a track may be left and is still followed."""
 LEAST_PART = 5
 """Samples of a part of a trajectory that is believed beside larger ones."""
 BY_FAR = 4
@@ -309,7 +309,7 @@ def _followed(measure: _Measure) -> Integers:
     breaks = _leaps(measure) + 1
     if not breaks.size:
         return tracks
-    patience = max(LONGEST_EXCURSION, 5 * float(np.median(np.diff(measure.seconds))))
+    patience = max(LONGEST_EXCURSION, 10 * float(np.median(np.diff(measure.seconds))))
     starts, ends = [0, *breaks.tolist()], [*breaks.tolist(), count]
     measure.prepare(np.array(ends) - 1)
     ends_at, sizes, numbers, made = [ends[0] - 1], [ends[0]], [0], 1  # of the tracks that are followed
@@ -356,10 +356,10 @@ def _resolved(measure: _Measure) -> _Found:
             around = (seconds[other] >= seconds[max(begin, 0)] - LONGEST_EXCURSION) & (
                 seconds[other] <= seconds[min(end, count - 1)] + LONGEST_EXCURSION
             )
-            decided = len(together) * BY_FAR <= int(around.sum())
+            turns = len(np.unique(np.searchsorted(other, together)))  # how often one follows the other
+            decided = turns == 1 or len(together) * BY_FAR <= int(around.sum())
             theirs = other[around] if decided else other[(other >= begin) & (other <= end)]
             rest &= (mine < begin) | (mine > end)
-            turns = len(np.unique(np.searchsorted(theirs, together)))  # how often one follows the other
             if turns > 2 and len(together) * 10 > len(theirs):
                 pairs.append(_Pair(theirs, together, decided))
             if not decided:

@@ -193,9 +193,9 @@ class JudgedTrajectory:
             largest = int(np.argmax(sizes))
             held = held[segments == (largest if sizes[largest] >= BY_FAR * sizes[segments[0]] else segments[0])]
         oriented = np.where(found.turned[:, None], quaternions, math.nan)
-        taken, first = np.unique(times[held], return_index=True)
-        held = held[first]
-        trajectory = Trajectory(taken, places[held], oriented[held], geographic, found.part[held])
+        trajectory = Trajectory(times[:0], places[:0], oriented[:0], geographic)
+        if held.size:
+            trajectory = Trajectory.of_samples(times[held], places[held], oriented[held], geographic, found.part[held])
         return cls(trajectory, np.unique(times), begins, found.remarks)
 
     def covers(self, nanoseconds: ArrayLike, largest_gap: float) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ from service.errors.faults import (
     BatchOutOfOrder,
     BodyTooLarge,
     EncoderNotInstalled,
+    ImplausiblePose,
     InvalidRequest,
     JobQueueFull,
     MalformedBody,
@@ -156,7 +157,7 @@ async def enrol_place(
     openapi_extra=BATCH_BODY,
     responses={
         202: {"model": JobView, "description": "With `background`: the job that enrols the frames."},
-        **problem_documentation(*ENROLMENT_PROBLEMS, BatchOutOfOrder, JobQueueFull, StagingFull),
+        **problem_documentation(*ENROLMENT_PROBLEMS, BatchOutOfOrder, ImplausiblePose, JobQueueFull, StagingFull),
     },
 )
 async def enrol_places(

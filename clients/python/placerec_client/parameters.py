@@ -268,9 +268,9 @@ class EnrolPlaces(TypedDict, total=False):
     POST …/align does; the job's result has the reports in `aligned`.
     """
 
-    replace: bool
-    """Whether a frame replaces the place of another frame that has its id; else it fails alone with 409
-    places-taken. The same frame is never one of these.
+    most_speed: float | None
+    """With background: metres a second of the vehicle at most; 60 if left out. A place is refused with
+    `implausible-pose` whose pose is reached faster, by the timestamps of its traverse.
     """
 
     batch: str | None
@@ -1061,11 +1061,6 @@ class NewKey(TypedDict, total=False):
     expires_at: datetime | str | None
     """When it expires; null or left out: never."""
 
-    replaces: str | None
-    """The id of a key in force whose name this one has, to take its place. Then end that one, by its `expires_at` or
-    by deleting it.
-    """
-
 
 class KeyChanges(TypedDict, total=False):
     """A merge patch (RFC 7396) of a key; fields that are left out stay. The key can only be narrowed."""
@@ -1124,9 +1119,6 @@ class RecordingOrder(TypedDict, total=False):
     sequence: str | None
     """The traverse; null: as the file is called."""
 
-    named: bool
-    """Whether somebody chose the traverse's name; another one is made unique, as `places:compare` does."""
-
     id_prefix: str
     """Before the ids, which are made of topic and stamp."""
 
@@ -1144,6 +1136,14 @@ class RecordingOrder(TypedDict, total=False):
     largest_gap: float
     """Seconds between poses that are bridged."""
 
+    most_speed: float
+    """Metres a second of the vehicle at most: poses that are reached faster are left out."""
+
+    allow_lost_poses: bool
+    """Also enrol a bag of which more than a tenth of the frames lose their pose, as no vehicle can have driven so;
+    without it, the job fails and nothing is enrolled.
+    """
+
     every_metres: float | None
 
     every_degrees: float | None
@@ -1153,26 +1153,8 @@ class RecordingOrder(TypedDict, total=False):
     keep_standing: bool
     """Also enrol frames in which nothing changes, as where the robot stood."""
 
-    replace: bool
-    """Replace places of other frames that have these ids; else it is refused."""
-
     align: bool
     """Then find which frames show places that the map had already."""
-
-
-class TraverseToCompare(TypedDict, total=False):
-    """A traverse that would be enrolled."""
-
-    sequence: str | None
-    """The traverse's name; null: it has none."""
-
-    named: bool
-    """Whether somebody chose this name. Another one, such as that of a folder, is made unique: NAME~2 and so on,
-    unless the map has these very frames under such a name already.
-    """
-
-    camera: str | None
-    """The camera of the map that took the frames."""
 
 
 class Label(TypedDict):
@@ -1457,13 +1439,3 @@ class PoseChanges(TypedDict):
     longitude: NotRequired[float | None]
 
     heading: NotRequired[float | None]
-
-
-class FrameToCompare(TypedDict):
-    """A frame that would be enrolled."""
-
-    id: str
-    """Id of its place."""
-
-    sha256: NotRequired[str | None]
-    """Of its bytes, where they were read already."""

@@ -285,6 +285,10 @@ class ImageTooSmall(Problem):
     """422 ``image-too-small``: The image is smaller than 16 pixels on one side."""
 
 
+class ImplausiblePose(Problem):
+    """422 ``implausible-pose``: No vehicle can have been at the pose."""
+
+
 class InvalidArchive(Problem):
     """422 ``invalid-archive``: The file is not a valid export of a map."""
 
@@ -587,6 +591,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "digest-mismatch": DigestMismatch,
     "empty-image": EmptyImage,
     "image-too-small": ImageTooSmall,
+    "implausible-pose": ImplausiblePose,
     "invalid-archive": InvalidArchive,
     "invalid-cursor": InvalidCursor,
     "invalid-field": InvalidField,

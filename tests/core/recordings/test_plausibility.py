@@ -322,6 +322,13 @@ def test_a_car_that_drives_as_cars_can_is_believed(rate: int) -> None:
     assert found.remarks == [] and found.kept.all() and not found.part.any()
 
 
+def test_an_excursion_of_a_slow_receiver_costs_its_own_samples_alone() -> None:
+    times, way = START + np.arange(120) * SECOND, 5.0 * np.arange(120)[:, None] * [1, 0, 0]
+    way[60:65] += [0, 3000, 0]
+    found = judge(times, way, None, Source("slow"))
+    assert np.flatnonzero(~found.kept).tolist() == list(range(60, 65)) and not found.part[found.kept].any()
+
+
 def test_the_limit_of_speed_is_a_setting() -> None:
     """An aeroplane."""
     times, way = START + np.arange(100) * SECOND, 240.0 * np.arange(100)[:, None] * [1, 0, 0]
