@@ -1,4 +1,4 @@
-"""The outcome of a check that may wait for a disk or a server, for those who must not."""
+"""The finding of a check that may wait for a disk or a server, for those who must not."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from service.errors.problems import told
 from service.worker_threads import in_thread
 
 ANSWER_SECONDS = 1.0
-"""How long a caller waits for an outcome."""
+"""How long a caller waits for a finding."""
 
 WRONG_SECONDS = 1.0
 """How long it counts that something is wrong."""
 
 
-class Outcome(NamedTuple):
-    """The outcome of a check.
+class Finding(NamedTuple):
+    """The finding of a check.
 
     text: "ok", or what is wrong.
     public: the same for those who may not know addresses, paths and peers of the installation.
@@ -31,8 +31,8 @@ class Outcome(NamedTuple):
     is_full: bool = False
 
     @classmethod
-    def of(cls, state: str, public: str) -> Outcome:
-        """That of a state, "ok" or what is wrong."""
+    def of(cls, state: str, public: str) -> Finding:
+        """The finding of a state, "ok" or what is wrong."""
         return cls() if state == "ok" else cls(state, public)
 
     def told(self, confided: bool) -> str:
@@ -41,32 +41,32 @@ class Outcome(NamedTuple):
 
 
 class Probe:
-    """Runs a check in a thread, one at a time, and remembers its outcome for a while.
+    """Runs a check in a thread, one at a time, and remembers its finding for a while.
 
     Args:
         check: raises a PlacerecError if something is wrong.
         seconds: how long it counts that nothing is wrong; anything else counts for ``WRONG_SECONDS``.
-        silent: the outcome while the check takes longer than ``ANSWER_SECONDS``.
+        silent: the finding while the check takes longer than ``ANSWER_SECONDS``.
     """
 
     def __init__(self, check: Callable[[], None], seconds: float, silent: str) -> None:
-        self._check, self._seconds, self._silent = check, seconds, Outcome(silent, silent)
-        self._task: asyncio.Task[Outcome] | None = None
+        self._check, self._seconds, self._silent = check, seconds, Finding(silent, silent)
+        self._task: asyncio.Task[Finding] | None = None
         self._began = 0.0
 
-    async def outcome(self) -> Outcome:
-        """The outcome of the latest check, within ``ANSWER_SECONDS``."""
+    async def finding(self) -> Finding:
+        """The finding of the latest check, within ``ANSWER_SECONDS``."""
         task = self._task
-        seconds = self._seconds if task is None or not task.done() or task.result() == Outcome() else WRONG_SECONDS
+        seconds = self._seconds if task is None or not task.done() or task.result() == Finding() else WRONG_SECONDS
         if task is None or (task.done() and time.monotonic() - self._began > seconds):
             self._began = time.monotonic()
             task = self._task = asyncio.create_task(in_thread(self._run))
         await asyncio.wait({task}, timeout=ANSWER_SECONDS)
         return task.result() if task.done() else self._silent
 
-    def _run(self) -> Outcome:
+    def _run(self) -> Finding:
         try:
             self._check()
         except PlacerecError as error:
-            return Outcome(str(error), told(error, False), isinstance(error, StorageFull))
-        return Outcome()
+            return Finding(str(error), told(error, False), isinstance(error, StorageFull))
+        return Finding()

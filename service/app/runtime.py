@@ -18,7 +18,7 @@ from core.disk.files import check_writable
 from core.errors import PlacerecError, StoreUnavailable
 from service.access.keyring import Keyring
 from service.administration.audit_trail import AuditTrail
-from service.app.probe import Outcome, Probe
+from service.app.probe import Finding, Probe
 from service.backups.backups import Backups
 from service.engine.encoders import NO_ENCODER
 from service.engine.engine import Engine
@@ -68,26 +68,26 @@ DISPENSABLE = frozenset({"pictures", "others"})
 
 @dataclass(frozen=True)
 class Condition:
-    """What the checks of a service have found.
+    """The findings of the checks of a service.
 
-    checks: the outcome of each, by its name.
+    checks: the finding of each, by its name.
     """
 
-    checks: Mapping[str, Outcome]
+    checks: Mapping[str, Finding]
 
     @property
-    def lacking(self) -> Mapping[str, Outcome]:
+    def lacking(self) -> Mapping[str, Finding]:
         """The checks without which it cannot answer queries; room to write is none of them."""
-        bad = {name: one for name, one in self.checks.items() if one != Outcome() and not one.is_full}
+        bad = {name: one for name, one in self.checks.items() if one != Finding() and not one.is_full}
         return {name: one for name, one in bad.items() if name not in DISPENSABLE}
 
     @property
-    def degraded(self) -> Outcome | None:
-        """Why it takes no writes, though it answers; None: it takes them."""
+    def degraded(self) -> Finding | None:
+        """The reason for which it takes no writes, though it answers; None: it takes them."""
         return next((one for one in self.checks.values() if one.is_full), None)
 
     def told(self, confided: bool) -> str:
-        """What it lacks to answer queries, in a sentence; empty: nothing."""
+        """The things that it lacks to answer queries, in a sentence; empty: nothing."""
         return "; ".join(f"{name}: {one.told(confided)}" for name, one in self.lacking.items())
 
     def told_checks(self, confided: bool) -> dict[str, str]:
@@ -268,28 +268,28 @@ class Runtime:
     async def check_readiness(self) -> Condition:
         """Check whether the service can answer queries, and take writes."""
         checks = {"encoder": self._encoder()}
-        checks["maps"] = Outcome() if self._database is None else await self._database.outcome()
-        checks["disk"] = await self._disk.outcome()
+        checks["maps"] = Finding() if self._database is None else await self._database.finding()
+        checks["disk"] = await self._disk.finding()
         if self.shared is not None:
-            checks["replica"] = Outcome.of(self.shared.replica.state, "It is cut off from the other services.")
-            checks["keys"] = Outcome.of("ok" if self._keyring is None else self._keyring.state, KeysUnreadable.public)
+            checks["replica"] = Finding.of(self.shared.replica.state, "It is cut off from the other services.")
+            checks["keys"] = Finding.of("ok" if self._keyring is None else self._keyring.state, KeysUnreadable.public)
         if self.stopping:
-            checks["service"] = Outcome("it is stopping", "it is stopping")
+            checks["service"] = Finding("it is stopping", "it is stopping")
         if self.settings.objects is not None:
-            checks["pictures"] = await self._pictures.outcome()
+            checks["pictures"] = await self._pictures.finding()
         if self.shared is not None:
             others = self.shared.differences
-            checks["others"] = Outcome.of(others.state, others.public_state)
+            checks["others"] = Finding.of(others.state, others.public_state)
         found = Condition(checks)
         self._note_readiness(found)
         self.degraded = found.degraded is not None
         return found
 
-    def _encoder(self) -> Outcome:
+    def _encoder(self) -> Finding:
         """The state of the default encoder, and of what computes it."""
         if self.engine.encoder_state == "ok":
-            return Outcome.of(self.engine.queue.encoders.state, NO_ENCODER)
-        return Outcome(self.engine.encoder_state, self.engine.public_encoder_state)
+            return Finding.of(self.engine.queue.encoders.state, NO_ENCODER)
+        return Finding(self.engine.encoder_state, self.engine.public_encoder_state)
 
     def _note_readiness(self, found: Condition) -> None:
         """Log when it becomes another one; that the encoder is being loaded is no news."""

@@ -216,7 +216,7 @@ class Encoders(Protocol):
 
 
 NO_ENCODER = "No frame can be encoded now; the log of the service says why."
-"""What those are told of a state that is not "ok" who may not know the addresses of an installation."""
+"""The text of a state that is not "ok" for those who may not know the addresses of an installation."""
 
 MakeEncoders = Callable[[Limits, Metrics], Encoders]
 """Makes the encoders, given the largest frame that is decoded and where to count."""

@@ -57,7 +57,7 @@ CLOCK_SECONDS = 2.0
 """A clock that is off by more is reported."""
 
 Difference = tuple[str, str, str]
-"""What differs, in a sentence; the same without the address of another service; and the values."""
+"""A difference in a sentence; the same without the address of another service; and the values."""
 
 log = logging.getLogger("placerec.shared")
 

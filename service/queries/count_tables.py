@@ -97,7 +97,7 @@ RUN_TRIALS = Table(
 )  # fmt: skip
 
 
-# Robots that are lost, or were (:mod:`service.queries.lost_robots`).
+# Robots that are lost, or were (:mod:`service.queries.histories.lost_robots`).
 LOST_ROBOTS = Table(
     "lost_robots", _METADATA, _map(), Column("robot", text(), primary_key=True),
     *_texts("since", "until", "key", "session", "camera", "place"), **_FORM,

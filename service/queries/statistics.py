@@ -48,6 +48,7 @@ from service.queries.counts import (
     monday_of,
 )
 from service.queries.given_answers import MapKey
+from service.queries.histories.lost_robots import LostRobot, LostRobots, forget_lost, put_changes, read_lost
 from service.queries.histories.run_trials import RunTrials, forget_run_trials, put_run_trials, read_run_trials
 from service.queries.histories.tables import (
     AlarmState,
@@ -60,7 +61,6 @@ from service.queries.histories.tables import (
     read_usual,
 )
 from service.queries.histories.usual_scores import UsualScores
-from service.queries.lost_robots import LostRobot, LostRobots, forget_lost, put_changes, read_lost
 from service.queries.recent_answers import RecentAnswers
 
 MOST_WAITING = 50_000
@@ -118,7 +118,7 @@ class QueryStatistics:
         self.recent = RecentAnswers(ledger if shared else None)
         """The latest answers."""
         self.watch = LostRobots()
-        """What robots are told, and so which are lost."""
+        """The robots, by what they are told, and so which of them are lost."""
         self.lost = 0
         """How many counts were dropped because the ledger refuses."""
         self._writing = threading.Lock()  # held while counts are on their way from memory to the ledger

@@ -22,8 +22,8 @@ from service.http.routing import EngineDep, PrincipalDep, StrictRoute, single_va
 from service.queries.answers import StatisticsDep
 from service.queries.counts import HourCount
 from service.queries.given_answers import GivenAnswer, MapKey
+from service.queries.histories.lost_robots import LISTED_FOR, LostRobot, robot_of
 from service.queries.histories.tables import AlarmState
-from service.queries.lost_robots import LISTED_FOR, LostRobot, robot_of
 from service.queries.schemas import EstimatedPose
 from service.queries.statistics import QueryStatistics, map_key
 from service.sessions.routes import SessionsDep
@@ -238,7 +238,7 @@ def _by_map(sessions: Iterable[Session]) -> dict[MapKey, list[Session]]:
 
 
 Groups = dict[str, list[GivenAnswer]]
-"""The answers of each robot, the latest first, by its name (:func:`service.queries.lost_robots.robot_of`)."""
+"""The answers of each robot, the latest first, by its name (``robot_of``)."""
 
 
 def _groups(map_: Map, sessions: list[Session], statistics: QueryStatistics) -> Groups:

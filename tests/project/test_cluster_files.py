@@ -345,7 +345,7 @@ def test_alerts_count_by_series_of_the_service() -> None:
     described = set(re.findall(r"`(placerec_\w+)`", (ROOT / "docs/reference/metrics-and-logs.md").read_text()))
     paths = set(json.loads((ROOT / "openapi.json").read_text())["paths"])
     (group,) = yaml.safe_load((DOCKER / "alerts.yaml").read_text())["groups"]
-    assert len(group["rules"]) == 4
+    assert len(group["rules"]) == 5
     for rule in group["rules"]:
         assert set(rule) == {"alert", "expr", "for", "labels", "annotations"}
         expression = rule["expr"]

@@ -12,7 +12,7 @@ from core.disk.files import disk_errors
 from core.errors import InvalidModel, PlacerecError, StorageFailure, StorageFull
 from core.ledger.outage import Unreachable
 from service.access.roles import ANONYMOUS, NOBODY, OWNER, Principal
-from service.app.probe import Outcome, Probe
+from service.app.probe import Finding, Probe
 from service.app.runtime import Condition
 from service.errors.faults import KeysUnreadable, NotReady
 from service.errors.problems import problem_of
@@ -20,36 +20,36 @@ from service.errors.problems import problem_of
 PG = Unreachable("PostgreSQL", 'cannot be reached: connection to server at "10.0.0.3", port 5432 failed')
 
 
-def outcome_of(error: PlacerecError | None) -> Outcome:
+def finding_of(error: PlacerecError | None) -> Finding:
     """What a probe says whose check raises an error."""
 
     def check() -> None:
         if error is not None:
             raise error
 
-    return asyncio.run(Probe(check, 1, "silent").outcome())
+    return asyncio.run(Probe(check, 1, "silent").finding())
 
 
-def condition(**outcomes: Outcome) -> Condition:
+def condition(**findings: Finding) -> Condition:
     """The condition of a service with these checks."""
-    return Condition(outcomes)
+    return Condition(findings)
 
 
 def test_a_full_disk_degrades_and_another_fault_of_it_is_unready() -> None:
-    full = condition(encoder=Outcome(), disk=outcome_of(StorageFull("The disk is full.")))
+    full = condition(encoder=Finding(), disk=finding_of(StorageFull("The disk is full.")))
     full.require(confided=False)
     assert full.degraded is not None and full.degraded.text == "The disk is full."
-    failing = condition(encoder=Outcome(), disk=outcome_of(StorageFailure("The disk refused to write.")))
+    failing = condition(encoder=Finding(), disk=finding_of(StorageFailure("The disk refused to write.")))
     assert failing.degraded is None
     with pytest.raises(NotReady, match="disk: The disk refused to write"):
         failing.require(confided=False)
-    sound = condition(disk=outcome_of(None))
+    sound = condition(disk=finding_of(None))
     sound.require(confided=False)
     assert sound.degraded is None
 
 
 def test_a_service_that_is_not_ready_names_addresses_to_those_who_may_know_them() -> None:
-    found = condition(maps=outcome_of(PG))
+    found = condition(maps=finding_of(PG))
     with pytest.raises(NotReady) as told:
         found.require(confided=True)
     assert "10.0.0.3" in str(told.value) and "5432" in told.value.checks["maps"]

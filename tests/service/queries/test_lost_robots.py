@@ -18,7 +18,7 @@ from service.app.runtime import Runtime
 from service.queries import recent_answers
 from service.queries.count_tables import TABLES, statistics_file
 from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame
-from service.queries.lost_robots import LostRobot
+from service.queries.histories.lost_robots import LostRobot
 from service.queries.statistics import QueryStatistics, map_key
 from service.sessions.schemas import NewSession
 from service.upkeep.fleet import FleetState, read_fleet
