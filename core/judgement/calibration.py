@@ -342,9 +342,8 @@ def adjust_calibration(
     In no case more answers are recognized in the map without their place, or off the map, than before; with fewer than
     ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.
 
-    With fewer than ``FEWEST_OF_A_KIND`` strangers no answer becomes likelier: known places say nothing of strangers.
-    Where their answers are wrong more often than stated, the curve is shifted down.  With fewer known places nothing
-    changes.
+    With fewer than ``FEWEST_OF_A_KIND`` strangers, or known places, no answer becomes likelier: those of one kind say
+    nothing of the other.  Where answers are wrong more often than stated, the curve is shifted down.
 
     Args:
         trials: judged with ``base``, each frame in the map as it is, and perhaps in the map without its place, too.
@@ -371,10 +370,8 @@ def adjust_calibration(
 
 def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None) -> Calibration:
     assert base.curve is not None
-    two, kinds = trials.two, Kinds.of(trials.two)
-    if kinds.known < FEWEST_OF_A_KIND:
-        return base
-    down, leads = not kinds.enough, share_of_leads(two.margin, base)
+    two = trials.two
+    down, leads = not Kinds.of(two).enough, share_of_leads(two.margin, base)
     curve = moved_curve(base.curve, two.decision, two.imagined, two.right, leads, down)
     moved = base.model_copy(update={"curve": curve})
     moved = moved.model_copy(update={"geometry": _adjusted_terms(trials.three, moved, curve, down)})

@@ -48,6 +48,9 @@ TOGETHER = 16
 FEW_FRAMES = 50
 """A calibration from fewer frames comes with a warning."""
 
+DRAWN = 3
+"""Every third labelled frame of a place is a stranger, too: it is asked in the map without its place."""
+
 FROM_ITSELF = (
     "The frames are the map's own: one walk in one light. A second visit differs more, so the probabilities are too "
     "high; calibrate from a second traverse or from labelled frames as soon as there are any."
@@ -332,10 +335,12 @@ def adjust_to_labels(
     """The encoder's calibration, adjusted to a map's answers to labelled queries; nothing is stored.
 
     Labels of one kind move the map's own one, where it has one (:func:`core.judgement.calibration.adjust_calibration`).
+    With labels of both kinds, some strangers are drawn from the map as well (``DRAWN``): those that were labelled may
+    resemble nothing in it.
 
     Returns:
-        The calibration, and the answers to strangers that are drawn from the map: to the labelled frames in the map
-        without their places.  None of them has a part in it.
+        The calibration, and the answers to further strangers that are drawn from the map.  None of them has a part in
+        it.
 
     Raises:
         CalibrationImpossible: there are too few.
@@ -344,10 +349,12 @@ def adjust_to_labels(
     """
     base = encoder.calibration
     trials = run_trials(map_, encoder, snapshot, queries, base, advance)
-    drawn = ~trials.two.known & np.isin(trials.two.frame, trials.two.frame[trials.two.known])
-    asked = trials.take(~drawn).answered(base)
+    two = trials.two
+    drawn = ~two.known & np.isin(two.frame, two.frame[two.known])
+    beside = drawn & ~(Kinds.of(two.take(~drawn)).enough & (two.frame % DRAWN == 0))
+    asked = trials.take(~beside).answered(base)
     found = adjust_calibration(asked, base, source, present=calibration_of(map_, encoder))
-    return found, trials.take(drawn)
+    return found, trials.take(beside)
 
 
 def one_sided(kinds: Kinds) -> str | None:
@@ -372,7 +379,7 @@ def calibration_warnings(found: FittedCalibration, method: str, target: Target |
     warned = {"map": FROM_ITSELF, "labels": FROM_DOUBT, "runs": FROM_RUNS}
     warnings = [warned[method]] if method in warned else []
     if (lopsided := one_sided(Kinds.of(found.trials))) is not None:
-        warnings.append(f"{lopsided} The curve that was in force stays, and no answer becomes likelier.")
+        warnings.append(f"{lopsided} The curve that was in force stays, or falls, and no answer becomes likelier.")
     if aligned:
         warnings.append(
             f"Which place {aligned} of the frames show is known from an alignment alone, not from poses of their own: "

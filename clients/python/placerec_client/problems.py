@@ -133,6 +133,10 @@ class BatchOutOfOrder(Problem):
     """409 ``batch-out-of-order``: The batch before it is not stored."""
 
 
+class CalibrationWorse(Problem):
+    """409 ``calibration-worse``: The calibration would make answers worse."""
+
+
 class FrameNeeded(Problem):
     """409 ``frame-needed``: The frame has to be sent."""
 
@@ -553,6 +557,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "head-too-slow": HeadTooSlow,
     "backup-folder-missing": BackupFolderMissing,
     "batch-out-of-order": BatchOutOfOrder,
+    "calibration-worse": CalibrationWorse,
     "frame-needed": FrameNeeded,
     "frame-out-of-order": FrameOutOfOrder,
     "images-missing": ImagesMissing,

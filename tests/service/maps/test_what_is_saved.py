@@ -48,8 +48,9 @@ def filled(client: TestClient) -> None:
     rows = np.array(map_.rows_of(["p"]), np.int64)
     (vector,), (local,) = map_.snapshot().descriptors_at(rows), map_.snapshot().locals_at(rows)
     map_.enrol([Enrolment(look_address("p", digest.hex()[:16]), PlaceFields(), vector, 1, digest, local, run="s-1")])
-    proposal = {"verdict": "unknown", "camera": None, "proposal": {"place": "p", "run": "s-1"}}
-    for number, answer in enumerate(({"verdict": "unknown", "camera": "front"}, proposal)):
+    proposal: dict[str, Any] = {"verdict": "unknown", "camera": None, "proposal": {"place": "p", "run": "s-1"}}
+    plain: dict[str, Any] = {"verdict": "unknown", "camera": "front"}
+    for number, answer in enumerate((plain, proposal)):
         map_.review.keep(jpeg(20 + number), answer, ReviewSetting())
     (first, *_) = sorted(map_.review.page(None, 10).frames, key=lambda one: one.number)
     labelled = client.post(f"{HALL}/review/{first.number}", json={"place": "p"})

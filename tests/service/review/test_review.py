@@ -323,7 +323,8 @@ def test_ten_labels_move_the_encoders_curve(server: Server) -> None:
     for one in kept(server, "moved", 10):
         label(server, "moved", one["id"], **shown[one["sha256"]])
     report = server.client.post("/v1/maps/moved/calibrate", json={"method": "labels"}).json()
-    assert report["stored"] and report["measurement"]["trials"] == 10, "each frame is asked once, of the map as it is"
+    trials, known = report["measurement"]["trials"], report["measurement"]["known"]
+    assert report["stored"] and known == 6 and 10 < trials <= 16, "some are asked in the map without their places, too"
     before, after = report["previous"], report["calibration"]
     assert after["margin"] == before["margin"] and after["curve"] != before["curve"]
     assert server.client.get("/v1/maps/moved").json()["calibration"]["source"] == "labels"
