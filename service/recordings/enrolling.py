@@ -104,6 +104,7 @@ def enrol_recording(
         recording = reader.recording()
         sequence = order.sequence or recording.name
         if "camera" not in context.notes:
+            recording.check_format()
             context.remember(camera=_complete_camera(engine, map_, order.camera, recording))
         mask = map_.cameras.mask(order.camera)
         if "chosen" in context.notes:  # by an attempt before this one
