@@ -135,7 +135,7 @@ def _sample(frames: Sequence[RecordedFrame]) -> Iterator[bytes]:
         try:
             data = frames[number * len(frames) // min(SAMPLE, len(frames))].load()
         except (InvalidImage, InvalidRecording, OSError):
-            continue  # what is wrong with it is said where it is enrolled
+            return  # what is wrong with it is said where it is enrolled; another one may be as costly to find damaged
         if not has_16_bits(data):
             return
         yield data

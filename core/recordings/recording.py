@@ -85,6 +85,24 @@ class Recording:
                 f"{time_text(max(ahead))}, which are left out: the clock of the recording was wrong."
             )
 
+    def check_format(self) -> None:
+        """Check that a frame of a bag has a format that is read; the first one has, of a bag that can be used.
+
+        Raises:
+            InvalidRecording: none has.
+        """
+        first: UnsupportedFormat | None = None
+        for frame in self.frames if self.continuous else ():
+            try:
+                frame.load()
+                return
+            except UnsupportedFormat as error:
+                first = first or error
+            except (InvalidImage, InvalidRecording, OSError):  # a damaged one, which is left out alone
+                return
+        if first is not None:
+            raise InvalidRecording(f"None of the {len(self.frames)} frames of {self.name} can be used. {first}")
+
     def close(self) -> None:
         """Close its files; frames cannot be loaded after that."""
         self._close()
@@ -164,11 +182,9 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
     bag = Bag(path)
     try:
         chosen = bag.choose(topic, IMAGE_TYPES, "pictures")
-        frames = bag.frames(chosen)
-        _check_format(chosen, frames)
         recording = Recording(
             path.resolve().name if path.is_dir() else path.name.removesuffix(".zstd").rpartition(".")[0],
-            frames,
+            bag.frames(chosen),
             continuous=True,
             intrinsics=bag.intrinsics(chosen),
             _close=bag.close,
@@ -185,25 +201,6 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
         bag.close()
         raise
     return recording
-
-
-def _check_format(topic: str, frames: list[RecordedFrame]) -> None:
-    """Check that a topic has a picture of a format that is read; the first one has, of a bag that can be used.
-
-    Raises:
-        InvalidRecording: it has none.
-    """
-    first: UnsupportedFormat | None = None
-    for frame in frames:
-        try:
-            frame.load()
-            return
-        except UnsupportedFormat as error:
-            first = first or error
-        except (InvalidImage, InvalidRecording, OSError):  # a damaged one, which is left out alone
-            return
-    if first is not None:
-        raise InvalidRecording(f"None of the {len(frames)} frames of {topic} can be used. {first}")
 
 
 def _open_folder(path: Path, prefix: str, by_names: bool) -> Recording:

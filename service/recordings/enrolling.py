@@ -139,6 +139,7 @@ def enrol_recording(
         if not order.allow_lost_poses:
             _check_lost_poses(recording)
         if "camera" not in context.notes:
+            recording.check_format()
             context.remember(camera=_complete_camera(engine, map_, order.camera, recording))
         mask = map_.cameras.mask(order.camera)
         if "chosen" in context.notes:  # by an attempt before this one

@@ -155,6 +155,7 @@ class RecordingOptions:
         with recording:
             for sentence in recording.remarks:
                 remark(sentence)
+            recording.check_format()
             yield recording
 
     @property

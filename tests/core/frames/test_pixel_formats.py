@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.errors import InvalidImage, InvalidRecording
+from core.errors import InvalidImage
 from core.frames.pixel_formats import NAMES
 from core.recordings import open_recording
 from placerec_client import InvalidFrame, Picture
@@ -253,6 +253,6 @@ def test_other_files_stay_as_they_are(read: Any, form: str, data: bytes, tmp_pat
     ],
 )
 def test_other_transports_are_refused_by_their_name(read: Any, form: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises((InvalidRecording, UnfitPicture)) as refused:
+    with pytest.raises((InvalidImage, UnfitPicture)) as refused:
         read(tmp_path, form, bytes(12) + encoded(DEEP[..., 1], ".png"))
     assert said in str(refused.value)

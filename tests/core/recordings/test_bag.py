@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -232,8 +233,11 @@ def test_a_file_of_a_bag_that_is_none_is_left_out(suffix: str, content: bytes, t
     ],
 )
 def test_a_topic_of_which_no_picture_can_be_used_is_refused_once(said: list[Said], why: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidRecording, match=f"None of the 20 frames of /.* can be used. .*{why}"):
-        open_recording(write_mcap(tmp_path / "a.mcap", said))
+    with open_recording(write_mcap(tmp_path / "deep.mcap", said)) as recording:
+        with pytest.raises(InvalidRecording, match=f"None of the 20 frames of deep can be used. .*{why}"):
+            recording.check_format()
+        recording.frames = [*recording.frames[:3], replace(recording.frames[0], load=lambda: jpeg(1))]
+        recording.check_format()
 
 
 def test_a_bag_of_videos_names_them(tmp_path: Path) -> None:
