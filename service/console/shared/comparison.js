@@ -66,7 +66,8 @@ export async function toEnrol(map, frames, { sequence, chosen, camera }, signal)
     if (wrong !== null) return { frames: made, sequence: name, known: 0, taken: [], free: name, wrong };
     const found = await compared(map, made, name, camera, signal);
     const continues = found.taken.length === 0 && (found.known > 0 || found.free === name);
-    if (chosen || continues || found.free === name || number === MOST_NAMES) return { ...found, frames: made, sequence: name, wrong };
+    const unsure = found.taken.some((one) => one.same === null); // they may be these very frames
+    if (chosen || continues || unsure || found.free === name || number === MOST_NAMES) return { ...found, frames: made, sequence: name, wrong };
   }
 }
 

@@ -9,7 +9,6 @@ import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource, useStateOf } from "../shared/resource.js";
-import { Result } from "../shared/result.js";
 import { href } from "../shared/router.js";
 import { html, useMemo, useState } from "../shared/view.js";
 
@@ -294,7 +293,7 @@ function Merge({ map }) {
         <${Facts} rows=${[
           ["Skipped", integer(report.skipped.count)],
           report.conflicts.length > 0 && ["Conflicts", html`<ul>${report.conflicts.map((one) => html`<li>${one}</li>`)}</ul>`],
-          report.overlap && ["Overlap", html`<${Result} value=${report.overlap} />`],
+          ...(report.overlap ? overlapRows(report.overlap) : []),
         ]} />
       `}
       ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${trial.apply}>
@@ -302,6 +301,15 @@ function Merge({ map }) {
       <//>`}
     </section>
   `;
+}
+
+/** How much of the ground both maps have, by places of the other one that were asked here. */
+function overlapRows({ examined, recognized, metres_apart: apart, pairs }) {
+  return [
+    ["Recognized here", `${integer(recognized)} of ${counted(examined, "place")} that were examined`],
+    Number.isFinite(apart) && ["Their poses differ by", metres(apart)],
+    pairs?.length > 0 && ["The most alike", html`<ul>${pairs.slice(0, 8).map((one) => html`<li>${one.place} and ${one.match} <span class="faint">${decimal(one.score)}</span></li>`)}</ul>`],
+  ];
 }
 
 /** What a merge would bring, or has brought, in a sentence. */

@@ -389,6 +389,27 @@ def test_a_second_folder_replaces_nothing_by_chance(admin: Operator, keyed: Serv
     expect(status).to_have_text("3 of 3: 0 new, 3 replaced, 0 were there.")
 
 
+@pytest.mark.thorough
+def test_over_plain_http_nobody_guesses_whether_an_enrolment_goes_on(
+    admin: Operator, keyed: Server, tmp_path: Path
+) -> None:
+    keyed.create_map("plain")
+    folder = recording(tmp_path / "drive", 2)
+    page = admin.page
+    admin.foresee("Cross-Origin-Opener-Policy")
+    admin.root = admin.root.replace("127.0.0.1", "console.test")  # for which a browser has no digests
+    admin.go("maps/plain/enrol")
+    chosen = page.get_by_role("region", name="To enrol")
+    page.get_by_label("A folder").set_input_files(folder)
+    chosen.get_by_role("button", name="Enrol 2 frames").click()
+    expect(chosen.locator("p[role=status]", has_text="of 2:")).to_contain_text("2 new")
+    page.get_by_label("A folder").set_input_files(folder)
+    clash = chosen.get_by_role("alert")
+    expect(clash).to_contain_text("2 of these 2 frames exist already in the traverse drive; over plain HTTP")
+    clash.get_by_role("button", name="Replace 2 places").click()
+    expect(chosen.locator("p[role=status]", has_text="of 2:")).to_contain_text("0 new, 0 replaced, 2 were there")
+
+
 def test_poses_are_seen_with_their_headings_before_they_are_sent(
     admin: Operator, keyed: Server, tmp_path: Path
 ) -> None:
