@@ -15,7 +15,7 @@ from tests.project.test_cluster_files import VERSION as KUBERNETES
 from tests.project.test_cluster_files import settings_in
 
 helm = pytest.importorskip("helm_python", reason="Helm's library has a wheel for Linux on x86-64 alone")
-from scripts.manifests import CHART, MANIFESTS, manifests, rendered  # noqa: E402
+from scripts.manifests import CHART, rendered  # noqa: E402
 
 NO = {"enabled": False}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -57,14 +57,6 @@ def secrets_of(objects: list[dict[str, Any]]) -> set[tuple[str, str]]:
         for variable in container.get("env", ())
         if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
     }
-
-
-def test_the_manifests_are_the_chart() -> None:
-    """``scripts/chart`` writes them."""
-    made = manifests()
-    assert set(made) == set(MANIFESTS.rglob("*.yaml"))
-    stale = [path.name for path, text in made.items() if path.read_text() != text]
-    assert not stale, "scripts/chart writes them anew"
 
 
 def test_helm_finds_nothing_wrong() -> None:
