@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests import watch as watching
-from tests.watch import Seen, Watch, missing
+from tests.watch import Watch, missing
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"nobody can watch what a program does: {missing()}")
 
@@ -77,48 +76,3 @@ def test_every_call_is_seen(tmp_path: Path) -> None:
     made = {"made-by-a-child", "folder/renamed", "elsewhere", "made"}
     assert watch.written() == {str(tmp_path / name) for name in made}
     assert watch.written([tmp_path]) == set()
-
-
-def test_nothing_is_changed_for_the_program(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server, Watch(tmp_path) as watch:
-        code = f"import socket, sys; socket.create_connection(('127.0.0.1', {server.getsockname()[1]})); sys.exit(3)"
-        done = subprocess.run([*watch.wrapper, sys.executable, "-c", code])
-    assert done.returncode == 3
-
-
-@pytest.mark.timeout(60)
-def test_a_watch_that_fails_ends_with_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> list[Seen]:
-        raise ValueError("nobody can read this")
-
-    monkeypatch.setattr(watching, "_look", broken)
-    with pytest.raises(RuntimeError, match="has ended before") as told, Watch(tmp_path) as watch:
-        done = subprocess.run(
-            [*watch.wrapper, sys.executable, "-c", f"import os; os.mkdir({str(tmp_path / 'made')!r})"]
-        )
-    assert done.returncode != 0 and not (tmp_path / "made").exists()
-    assert isinstance(told.value.__cause__, ValueError)
-
-
-@pytest.mark.timeout(60)
-@pytest.mark.parametrize(
-    "program", ["raise SystemExit(3)", "import sys, socket as s; s.socket(s.AF_UNIX).connect(sys.argv[1])"]
-)
-def test_a_program_that_puts_itself_under_no_watch_is_waited_for_no_longer(program: str, tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="has ended before"), Watch(tmp_path) as watch:
-        subprocess.run([sys.executable, "-c", program, watch.wrapper[-1]])
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("constant", "value", "said"),
-    [
-        ("_CONTINUE", 1 << 31, "Invalid argument"),
-        ("_memory", lambda *_: (_ for _ in ()).throw(PermissionError()), "memory"),
-    ],
-    ids=["a kernel that cannot let a call go on", "a process that may read no other"],
-)
-@pytest.mark.timeout(60)
-def test_what_is_missing_is_said(constant: str, value: object, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watching, constant, value)
-    assert said in missing.__wrapped__()

@@ -10,11 +10,11 @@ from service.app.application import create_app
 from service.settings import Settings
 
 
-def write_document(path: Path) -> None:
-    """Write the document of an application with default settings."""
+def document() -> str:
+    """The text of the document of an application with default settings."""
     made = create_app(Settings(host="127.0.0.1")).openapi()
-    path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n")
+    return json.dumps(made, indent=2, ensure_ascii=False) + "\n"
 
 
 if __name__ == "__main__":
-    write_document(Path(sys.argv[1]))
+    Path(sys.argv[1]).write_text(document())

@@ -2,8 +2,6 @@
 the Python client, the protocols of evaluation.
 
     python -m tests.documents.reference     # writes them; so does scripts/reference
-
-A test fails while a page differs from what this module renders.
 """
 
 from __future__ import annotations
@@ -235,10 +233,15 @@ PAGES = {
 }
 
 
+def files() -> dict[Path, str]:
+    """The pages and their text."""
+    return {FOLDER / name: render() for name, render in PAGES.items()}
+
+
 def main() -> None:
     """Write the pages."""
-    for name, render in PAGES.items():
-        (FOLDER / name).write_text(render())
+    for path, text in files().items():
+        path.write_text(text)
 
 
 if __name__ == "__main__":

@@ -15,12 +15,6 @@ FOLDERS = ("core", "service", "lab", "benchmarks", OF_CLIENT, OF_NODE, "examples
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
-def module_of(path: Path) -> str:
-    """The dotted name of a file's module (a package's for its ``__init__.py``)."""
-    root = next((one for one in (CLIENT, NODE) if path.is_relative_to(one)), ROOT)
-    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
-
-
 def syntax_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(), path.name)
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
-import sys
 import tarfile
 import zipfile
 from email.parser import Parser
@@ -20,29 +17,6 @@ METADATA = {
     *("Name", "Version", "Summary", "Requires-Python"),
     *("Requires-Dist", "Description-Content-Type"),
 }
-
-
-@pytest.mark.thorough
-@pytest.mark.skipif(shutil.which("git") is None, reason="Git is not installed")
-def test_git_sees_nothing_of_a_build(tmp_path: Path) -> None:
-    checkout, wheels = tmp_path / "checkout", tmp_path / "wheels"
-    shutil.copytree(CLIENT, checkout / CLIENT.name, ignore=shutil.ignore_patterns("*.egg-info", "build"))
-    shutil.copy(ROOT / ".gitignore", checkout)
-
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], cwd=checkout, env=environment, check=True, capture_output=True, text=True
-        )
-        return done.stdout
-
-    git("init", "--quiet")
-    git("add", ".")
-    words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(wheels)]
-    subprocess.run([sys.executable, *words, f"./{CLIENT.name}"], check=True, cwd=checkout)
-    assert list(wheels.glob("*.whl")) and (checkout / CLIENT.name / "build").is_dir()
-    assert git("ls-files", "--others", "--exclude-standard") == ""
 
 
 @pytest.mark.thorough

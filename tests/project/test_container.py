@@ -63,18 +63,6 @@ def test_image_runs_as_a_user_of_its_own() -> None:
     assert re.search(r"install .*--owner placerec .*/data", stage["RUN"])
 
 
-def test_a_new_version_of_the_code_leaves_the_packages_as_they_are_and_slim_has_no_torch() -> None:
-    copied = {name: [argument for what, argument in stage(name) if what == "COPY"] for name in ("", "slim")}
-    for name, packages in (("", "packages-and-torch"), ("slim", "packages-without-torch")):
-        assert copied[name][-2:] == [
-            f"--from={packages} /opt/placerec /opt/placerec",
-            "--from=code /opt/code /opt/code",
-        ]
-        sources = [argument for what, argument in stage(packages) if what == "COPY"]
-        assert sources == ["requirements requirements", "scripts/packages.py scripts/"]
-    assert not any("TORCH_BACKEND=cpu" in argument for _, argument in stage("packages-without-torch"))
-
-
 def test_what_would_report_is_switched_off() -> None:
     """Also where ``ray start`` runs in the image, which imports nothing of the project."""
     assert environment().items() >= SWITCHES.items()

@@ -1,4 +1,4 @@
-"""What imports what: no file in a circle, no crowded folder, nothing undeclared.
+"""What imports what: what users install or copy stands alone, and nothing is undeclared.
 
 Which room may import which is kept by the contracts of import-linter in ``pyproject.toml``; scripts/lint checks them.
 """
@@ -8,8 +8,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import tomllib
-from collections import Counter
-from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -18,77 +16,19 @@ from xml.etree import ElementTree
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from tests.project.sources import CLIENT, FILES, FOLDERS, NODE, ROOT, forbidden_imports, imports_of, module_of
+from tests.project.sources import CLIENT, FILES, FOLDERS, NODE, ROOT, forbidden_imports, imports_of
 from tests.project.test_lock import locked
-
-MOST_MODULES = 16
 
 installed = cache(packages_distributions)
 """The distributions of each top-level module."""
 
 
-def import_graph(files: Iterable[Path]) -> dict[str, set[str]]:
-    """Each file's dotted name (a package's for its ``__init__.py``) and the other files that it imports from."""
-    paths = {module_of(path): path for path in files}
-    graph = {}
-    for name, path in paths.items():
-        imported = {f"{module}.{one}" if f"{module}.{one}" in paths else module for module, one in imports_of(path)}
-        graph[name] = (imported & set(paths)) - {name}
-    return graph
-
-
-def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
-    """The strongly connected components of more than one file."""
-    names = sorted(graph)
-    index = {name: number for number, name in enumerate(names)}
-    edges = [(index[name], index[other]) for name, others in graph.items() for other in others]
-    matrix = coo_array(([1] * len(edges), tuple(zip(*edges, strict=True))), shape=(len(names), len(names)))
-    _, components = connected_components(matrix, directed=True, connection="strong")
-    members: dict[int, list[str]] = {}
-    for name, component in zip(names, components, strict=True):
-        members.setdefault(int(component), []).append(name)
-    return sorted(found for found in members.values() if len(found) > 1)
-
-
-def test_a_circle_is_found() -> None:
-    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
-    assert circles(graph) == [["a", "b", "c"], ["d", "e"]]
-
-
-KNOWN_CROWDS = {"clients/python/placerec_client", "tests/core/storage"}
-"""Folders of tests with more modules, to be divided when one of them grows."""
-
-
-@pytest.mark.thorough
-def test_no_files_import_each_other_in_a_circle() -> None:
-    graph = import_graph(FILES)
-    assert len(graph) > 300
-    assert circles(graph) == []
-
-
-def test_no_folder_is_crowded() -> None:
-    modules = Counter(str(path.parent.relative_to(ROOT)) for path in FILES if path.name != "__init__.py")
-    crowded = {folder: count for folder, count in modules.items() if count > MOST_MODULES}
-    assert set(crowded) <= KNOWN_CROWDS, crowded
-
-
-def test_examples_know_nothing_of_the_project() -> None:
-    """They show what users write, who have the service's address and none of its code."""
-    assert forbidden_imports("examples", {"benchmarks", "core", "lab", "service", "tests"}) == []
-
-
-def test_the_client_knows_nothing_of_the_project() -> None:
-    """It is installed where nothing else of the project is."""
-    forbidden = {"benchmarks", "core", "examples", "lab", "service", "tests"}
-    assert forbidden_imports("clients/python/placerec_client", forbidden) == []
-
-
-def test_the_node_knows_nothing_of_the_project_but_the_client() -> None:
-    forbidden = {"benchmarks", "core", "examples", "lab", "service", "tests"}
-    assert forbidden_imports("clients/ros2/placerec_ros", forbidden) == []
+@pytest.mark.parametrize("folder", ["examples", "clients/python/placerec_client", "clients/ros2/placerec_ros"])
+def test_what_users_copy_or_install_alone_needs_nothing_of_the_project(folder: str) -> None:
+    """The node needs the client, and no other."""
+    others = {"benchmarks", "core", "lab", "service", "tests", "examples"} - {folder}
+    assert forbidden_imports(folder, others) == []
 
 
 def test_the_node_imports_what_its_package_declares() -> None:

@@ -1,21 +1,22 @@
-"""No module runs what it reads: no pickles, no evaluated text, no archives unpacked as they come."""
+"""No module runs what it reads: no evaluated text, no archives unpacked as they come, no pickles.
+
+Modules that read pickles cannot be imported: ruff's ``banned-api`` in ``pyproject.toml`` lists them.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 
 import pytest
 
-from tests.project.sources import FILES, FOLDERS, ROOT, forbidden_imports, syntax_of
-
-PICKLING = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+from tests.project.sources import FILES, ROOT, syntax_of
 
 
 def test_nothing_reads_a_pickle() -> None:
-    assert [line for folder in FOLDERS for line in forbidden_imports(folder, PICKLING)] == []
     calls = []
     for path in FILES:
-        if "allow_pickle" not in (text := path.read_text()) and "read_array" not in text:
+        if not re.search("allow_pickle|read_array", path.read_text()):
             continue
         for node in ast.walk(syntax_of(path)):
             if isinstance(node, ast.Attribute) and ast.unparse(node) == "np.lib.format.read_array":
@@ -33,6 +34,8 @@ RUNNING = {
 }  # fmt: skip
 """Calls by which bytes that were read could run, end the process, or be laid out as files."""
 
+MENTIONED = re.compile("|".join([*(re.escape(name) for name in RUNNING), "shell", r"\.extract"]))
+
 ISOLATED = {
     ("lab/conversion/checkpoints.py", "torch.load(path, map_location='cpu', weights_only=True)"),
     ("lab/conversion/matfiles.py", "loadmat(path, struct_as_record=False)"),
@@ -46,7 +49,7 @@ def test_nothing_runs_what_it_reads(folder: str) -> None:
     """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""
     calls, isolated = [], set()
     for path in FILES:
-        if not path.is_relative_to(ROOT / folder):
+        if not path.is_relative_to(ROOT / folder) or not MENTIONED.search(path.read_text()):
             continue
         for node in ast.walk(syntax_of(path)):
             if isinstance(node, ast.Call):

@@ -7,7 +7,6 @@ import hashlib
 import json
 import lzma
 import os
-import shutil
 import sqlite3
 import subprocess
 from collections.abc import Iterator
@@ -25,7 +24,6 @@ from tests.release.furnishing import (
     ABOUT,
     ARCHIVE,
     CONVERSATION,
-    DATA,
     FIXTURES,
     INTERFACE,
     SURFACE,
@@ -204,12 +202,3 @@ def test_fixtures_of_a_released_version_stay(tmp_path: Path) -> None:
     there = {**os.environ, "GIT_DIR": str(tmp_path / ".git")}
     done = subprocess.run(command, env=there, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "Version 9.9.9 is released" in done.stderr
-
-
-@pytest.mark.thorough
-def test_fixtures_are_made_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(furnishing, "FIXTURES", tmp_path)
-    made = furnishing.write("0.0.0")
-    assert {path.name for path in made.iterdir()} == {DATA, ARCHIVE, CONVERSATION, ABOUT, SURFACE, INTERFACE}
-    assert read((made / CONVERSATION).read_text())
-    shutil.rmtree(made)

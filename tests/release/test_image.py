@@ -16,7 +16,7 @@ import pytest
 
 from scripts.layers import compare
 from tests.project.sources import ROOT
-from tests.project.test_container import final_stage, instructions, stage
+from tests.project.test_container import final_stage, instructions
 
 RUNS = [argument for name, argument in instructions() if name == "RUN"]
 FIND = re.compile(r"find \. -type f -regex '[^']+' -delete")
@@ -59,12 +59,6 @@ def test_bytecode_is_valid_whatever_time_files_have() -> None:
     assert len(compiling) == 2 and all("--invalidation-mode unchecked-hash" in part for part in compiling)
     times = [argument for name, argument in instructions() if name == "ARG" and "SOURCE_DATE_EPOCH" in argument]
     assert len(times) == 2 and len(set(times)) == 1
-
-
-def test_licences_come_before_the_packages_so_that_layers_stay() -> None:
-    for name in ("", "slim"):
-        copied = [argument for what, argument in stage(name) if what == "COPY"]
-        assert copied[0].endswith("/THIRD-PARTY.txt /usr/share/doc/placerec/") and len(copied) == 3
 
 
 def image(folder: Path, layers: list[Mapping[str, bytes]]) -> Path:

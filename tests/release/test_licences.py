@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import re
-import subprocess
-import sys
 
 import pytest
 
-from scripts.licences import PAGE, VENDOR, document, kind_of, licences_of, networks, page
-from tests.project.sources import ROOT
+from scripts.licences import VENDOR, document, kind_of, licences_of, networks
 from tests.project.test_lock import locked
 
 
@@ -35,31 +31,6 @@ def test_texts_come_with_what_is_installed() -> None:
         assert words in text, words
 
 
-@pytest.mark.thorough
-def test_the_page_is_the_lock_s() -> None:
-    """``python -m scripts.licences page`` writes the table."""
-    assert page(PAGE.read_text()) == PAGE.read_text()
-
-
-def test_licences_that_oblige_are_said_to_be_there() -> None:
-    text = PAGE.read_text()
-    before, _, table = text.partition("<!-- begin")
-    for name, licence in re.findall(r"^\| (\S+) \| ([^|]*GPL[^|]*) \|", table, re.MULTILINE):
-        assert name in before or name.partition("-")[0] in before, f"{name} is under {licence.strip()}"
-
-
-def test_the_image_writes_the_file_by_the_script() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "scripts.licences", "texts", "service"], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    dockerfile = (ROOT / "docker/Dockerfile").read_text()
-    assert dockerfile.count("RUN python -m scripts.licences texts ${PROFILE} >/THIRD-PARTY.txt") == 2
-    for stage in ("licences", "licences-without-torch"):
-        assert f"COPY --from={stage} /THIRD-PARTY.txt /usr/share/doc/placerec/" in dockerfile
-    assert "/usr/share/doc/placerec/THIRD-PARTY.txt" in PAGE.read_text()
-
-
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
@@ -72,8 +43,3 @@ def test_the_image_writes_the_file_by_the_script() -> None:
 )
 def test_a_text_says_which_licence_it_is(text: str, kind: str) -> None:
     assert kind_of(text) == kind
-
-
-def test_the_readme_says_what_is_licensed_and_what_is_not() -> None:
-    text = (ROOT / "README.md").read_text()
-    assert "docs/reference/licences.md" in text and "no licence" in text.lower()

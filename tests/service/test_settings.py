@@ -75,11 +75,6 @@ def test_a_typing_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unknown_variables() == ["PLACEREC_QUEUE_LENGHT"]
 
 
-def test_every_setting_says_what_it_does() -> None:
-    for name, field in Settings.model_fields.items():
-        assert field.description, name
-
-
 @pytest.mark.parametrize(
     ("name", "bad"),
     [

@@ -1,9 +1,7 @@
 """The modules of the client that are written: models, parameters and problems from ``openapi.json``, pixel formats
 from the core's.
 
-    python -m tests.clients.python.models     # writes them; so does scripts/client
-
-A test fails while a module differs from what this one renders.
+python -m tests.clients.python.models     # writes them; so does scripts/client
 """
 
 from __future__ import annotations
@@ -265,15 +263,16 @@ def formatted(source: str, name: str) -> str:
     return source
 
 
-def rendered(name: str) -> str:
-    """One of the modules as it should be."""
-    return formatted(MODULES[name](), str((PACKAGE / name).relative_to(ROOT)))
+def files() -> dict[Path, str]:
+    """The modules and their text."""
+    paths = {PACKAGE / name: render for name, render in MODULES.items()}
+    return {path: formatted(render(), str(path.relative_to(ROOT))) for path, render in paths.items()}
 
 
 def main() -> None:
     """Write the modules."""
-    for name in MODULES:
-        (PACKAGE / name).write_text(rendered(name))
+    for path, text in files().items():
+        path.write_text(text)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
     python -m tests.clients.python.twin     # writes it; so does scripts/client
 
-``_async/concurrency.py`` and ``_sync/concurrency.py`` are written by hand: they hide what differs.  A test fails while
-a module of ``_sync`` differs from what this one renders.
+``_async/concurrency.py`` and ``_sync/concurrency.py`` are written by hand: they hide what differs.
 """
 
 from __future__ import annotations
@@ -72,9 +71,15 @@ def spoken(line: str) -> str:
     return re.sub(r"\b(Async[A-Z]\w*|_async|__a\w+__)", lambda found: renamed(found[0]), line)
 
 
-def modules() -> list[str]:
-    """The names of the modules that are written."""
-    return sorted(path.name for path in (PACKAGE / "_async").glob("*.py") if path.name not in BY_HAND)
+def files() -> dict[Path, str]:
+    """The modules and their text."""
+    names = sorted(path.name for path in (PACKAGE / "_async").glob("*.py") if path.name not in BY_HAND)
+    return {PACKAGE / "_sync" / name: rendered(name) for name in names}
+
+
+def left_over() -> list[Path]:
+    """Modules without a counterpart."""
+    return [path for path in (PACKAGE / "_sync").glob("*.py") if not (PACKAGE / "_async" / path.name).exists()]
 
 
 def rendered(name: str) -> str:
@@ -86,12 +91,10 @@ def rendered(name: str) -> str:
 
 def main() -> None:
     """Write the modules, and remove those that have no counterpart."""
-    names = modules()
-    for path in (PACKAGE / "_sync").glob("*.py"):
-        if path.name not in (*names, *BY_HAND):
-            path.unlink()
-    for name in names:
-        Path(PACKAGE / "_sync" / name).write_text(rendered(name))
+    for path in left_over():
+        path.unlink()
+    for path, text in files().items():
+        path.write_text(text)
 
 
 if __name__ == "__main__":

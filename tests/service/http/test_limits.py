@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 from service.settings import PREFIX, Settings
 from tests.service.server import ROOT
 
@@ -27,14 +25,3 @@ NO_LIMITS = {
 
 def test_every_limit_is_on_the_page_and_nothing_else() -> None:
     assert set(ROWS) == set(Settings.model_fields) - NO_LIMITS
-
-
-@pytest.mark.parametrize(("name", "test"), [(name, test) for name, test in ROWS.items() if test])
-def test_what_is_said_to_be_tested_is(name: str, test: str) -> None:
-    file, _, function = test.partition("::")
-    source = (ROOT / "tests" / "service" / file).read_text()
-    assert re.search(rf"^(async )?def {function}\(", source, re.MULTILINE), name
-
-
-def test_the_limits_without_a_test_are_few_and_named() -> None:
-    assert {name for name, test in ROWS.items() if not test} <= {"bulk_timeout", "import_timeout", "max_session_memory"}

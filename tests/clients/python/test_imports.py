@@ -1,4 +1,4 @@
-"""What is written from ``openapi.json`` and from the asynchronous half is up to date."""
+"""Importing the client is quick: what a program does not use is not loaded."""
 
 from __future__ import annotations
 
@@ -6,25 +6,6 @@ import subprocess
 import sys
 
 import pytest
-
-from tests.clients.python import models, twin
-from tests.clients.python.models import PACKAGE
-
-
-@pytest.mark.parametrize("name", models.MODULES)
-def test_a_module_says_what_openapi_json_says(name: str) -> None:
-    assert (PACKAGE / name).read_text() == models.rendered(name), "run scripts/client"
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", twin.modules())
-def test_both_halves_are_the_same(name: str) -> None:
-    assert (PACKAGE / "_sync" / name).read_text() == twin.rendered(name), "run scripts/client"
-
-
-def test_no_module_is_left_over() -> None:
-    halves = [{path.name for path in (PACKAGE / half).glob("*.py")} for half in ("_async", "_sync")]
-    assert halves[0] == halves[1]
 
 
 @pytest.mark.thorough
