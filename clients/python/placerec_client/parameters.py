@@ -273,6 +273,11 @@ class EnrolPlaces(TypedDict, total=False):
     `implausible-pose` whose pose is reached faster, by the timestamps of its traverse.
     """
 
+    replace: bool
+    """Whether a frame replaces the place of another frame that has its id; else it fails alone with 409
+    places-taken. The same frame is never one of these.
+    """
+
     batch: str | None
     """A name for this batch, for example a random one, to which another batch can refer with after."""
 
@@ -581,11 +586,14 @@ class SendFrame(TypedDict, total=False):
 
     frame: int | None
     """The robot's own number of the frame; numbers grow. A missing number is a frame that did not arrive; the last
-    number again is the same frame sent again, and gets the same answer.
+    number again is the same frame sent again, and gets the same answer. A smaller one is refused, unless it is
+    smaller by more than 1000, or the timestamp says that the robot counts anew.
     """
 
     timestamp: datetime | str | None
-    """When the frame was taken; never before the last one."""
+    """When the frame was taken. One up to a second before the last one is refused; where it goes back by more, or
+    leaps ahead by more than a day, the robot's clock was set, and the run goes on by it.
+    """
 
     forward: float | None
     """Odometry: metres forward since the last frame that the service took in, in the direction that the robot faced
@@ -613,7 +621,7 @@ class SendFrame(TypedDict, total=False):
     """Metres in odometry's frame; with odometry_x."""
 
     odometry_heading: float | None
-    """Degrees counter-clockwise from +x of odometry's frame to where the camera looks; with odometry_x."""
+    """Degrees counter-clockwise from +x of odometry's frame to where the camera looks, -360 to 360; with odometry_x."""
 
     odometry_covariance: str | Sequence[float] | None
     """The covariance of odometry_x, odometry_y and odometry_heading: nine numbers row by row, separated by commas,
@@ -1040,13 +1048,18 @@ class CalibrationOrder(TypedDict, total=False):
 
 
 class CameraDefinition(TypedDict, total=False):
-    """Which part of a camera's frames is ignored, and which direction each pixel looks in."""
+    """Which part of a camera's frames is ignored, which direction each pixel looks in, and which values it has."""
 
     mask: Mask | None
     """The part that is ignored; null if nothing is."""
 
     intrinsics: Intrinsics | None
     """Of the upright frame, as in ROS's CameraInfo; null if they are not known."""
+
+    value_range: tuple[int, int] | None
+    """The values of frames of 16 bits that become black and white, such as [0, 1023] of a camera of ten bits; null:
+    the upper 8 bits are used.
+    """
 
 
 class NewKey(TypedDict, total=False):
@@ -1060,6 +1073,11 @@ class NewKey(TypedDict, total=False):
 
     expires_at: datetime | str | None
     """When it expires; null or left out: never."""
+
+    replaces: str | None
+    """The id of a key in force whose name this one has, to take its place. Then end that one, by its `expires_at` or
+    by deleting it.
+    """
 
 
 class KeyChanges(TypedDict, total=False):
@@ -1119,6 +1137,9 @@ class RecordingOrder(TypedDict, total=False):
     sequence: str | None
     """The traverse; null: as the file is called."""
 
+    named: bool
+    """Whether somebody chose the traverse's name; another one is made unique, as `places:compare` does."""
+
     id_prefix: str
     """Before the ids, which are made of topic and stamp."""
 
@@ -1153,8 +1174,26 @@ class RecordingOrder(TypedDict, total=False):
     keep_standing: bool
     """Also enrol frames in which nothing changes, as where the robot stood."""
 
+    replace: bool
+    """Replace places of other frames that have these ids; else it is refused."""
+
     align: bool
     """Then find which frames show places that the map had already."""
+
+
+class TraverseToCompare(TypedDict, total=False):
+    """A traverse that would be enrolled."""
+
+    sequence: str | None
+    """The traverse's name; null: it has none."""
+
+    named: bool
+    """Whether somebody chose this name. Another one, such as that of a folder, is made unique: NAME~2 and so on,
+    unless the map has these very frames under such a name already.
+    """
+
+    camera: str | None
+    """The camera of the map that took the frames."""
 
 
 class Label(TypedDict):
@@ -1281,6 +1320,88 @@ class AlarmChanges(TypedDict):
     quiet_stretches: NotRequired[int | None]
 
 
+class Curve(TypedDict):
+    """P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), d a decision value."""
+
+    slope: float
+    """Log odds gained by a decision value greater by one."""
+
+    intercept: float
+    """Log odds at the decision value 0."""
+
+    imagined_slope: NotRequired[float]
+    """Added to the slope where the whole background is imagined; left out if 0."""
+
+    imagined_intercept: NotRequired[float]
+    """Added to the intercept where the whole background is imagined; left out if 0."""
+
+
+class Environment(TypedDict):
+    """The prior of the scores of other places of one environment, in units of the score (see the module). ``mean``
+    and ``deviation`` are μ₀ and σ₀; ``mean_weight`` and ``deviation_weight`` are κ₀ and ν₀, the number of scores
+    that the prior counts as.
+    """
+
+    mean: float
+
+    deviation: float
+
+    mean_weight: float
+
+    deviation_weight: float
+
+
+class GeometryTerms(TypedDict):
+    """How evidence joins the log odds of the first two stages (see the module)."""
+
+    support: float
+    """Weight of the log odds of the first two stages."""
+
+    slope: float
+    """Log odds gained by an evidence e times greater."""
+
+    lead: NotRequired[float]
+    """Log odds gained where the map has other places and none of them fits nearly as well."""
+
+    intercept: float
+    """Log odds where nothing says anything."""
+
+
+class Calibration(TypedDict):
+    """When to believe a match; measured on frames held out of training. ``threshold`` is on the decision value,
+    ``margin`` on the difference of two scores. ``background_mean`` and ``background_deviation`` describe the score
+    of unrelated frames, in units of the score. ``curve`` gives the probability that a decision value is right; a
+    calibration on frames that are all alike has none. ``decision`` names the kind of decision value. ``environment``
+    describes the scores of other places of one environment, which stand for those that a small map does not have
+    yet; it is measured of the packaged encoders alone, and without it these score as unrelated frames do.
+    ``geometry`` says how geometric evidence joins the probability; without it, or without a curve, evidence changes
+    the order of the candidates only.
+    """
+
+    source: str
+
+    threshold: float
+
+    margin: float
+
+    background_mean: float
+
+    background_deviation: float
+
+    curve: NotRequired[Curve | None]
+
+    decision: NotRequired[str]
+
+    frames: NotRequired[int | None]
+    """Held-out or labelled frames it rests on, if known."""
+
+    environment: NotRequired[Environment | None]
+    """Scores of other places within one environment; null: not measured."""
+
+    geometry: NotRequired[GeometryTerms | None]
+    """How geometric evidence joins the probability; null: it does not."""
+
+
 class CalibrationChanges(TypedDict):
     """Values of a calibration to set by hand, null restores the encoder's value; or which measured one to store."""
 
@@ -1293,6 +1414,9 @@ class CalibrationChanges(TypedDict):
     """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
     was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
     """
+
+    restore: NotRequired[Calibration | None]
+    """Put back, instead, a calibration that the map had, whole, as it was read: to undo a change."""
 
 
 class Pose(TypedDict):
@@ -1439,3 +1563,13 @@ class PoseChanges(TypedDict):
     longitude: NotRequired[float | None]
 
     heading: NotRequired[float | None]
+
+
+class FrameToCompare(TypedDict):
+    """A frame that would be enrolled."""
+
+    id: str
+    """Id of its place."""
+
+    sha256: NotRequired[str | None]
+    """Of its bytes, where they were read already."""
