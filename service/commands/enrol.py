@@ -155,7 +155,7 @@ def enrol(
             _checked_sequence(one)
         traverses = dict[str, None]()  # of the chosen frames, in their order
         if not allow_lost_poses:
-            check_lost_poses(opened)
+            check_lost_poses(opened, remarked=True)
 
         def choose(used: str | None, mask: Mask | None) -> list[FrameToSend]:
             chosen = options.choose(opened, used, mask)
