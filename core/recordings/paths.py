@@ -20,16 +20,20 @@ def traverse_of(name: str, frame: RecordedFrame) -> str:
     return name if frame.segment == 1 else f"{name}~{frame.segment}"
 
 
-def check_lost_poses(recording: Recording) -> None:
+def check_lost_poses(recording: Recording, remarked: bool = False) -> None:
     """Refuse a recording of which more than a tenth of the frames lose their pose.
+
+    Args:
+        remarked: whether the reasons were shown already.
 
     Raises:
         InvalidTrajectory: they do; the text has the reasons, and the option that allows it.
     """
     count = len(recording.frames)
     if recording.lost > MOST_LOST * count:
+        reasons = ", for what is remarked above." if remarked else f": {' '.join(recording.lost_by)}"
         raise InvalidTrajectory(
-            f"{recording.lost} of {count} frames lose their pose, more than a tenth: {' '.join(recording.lost_by)} "
+            f"{recording.lost} of {count} frames lose their pose, more than a tenth{reasons} "
             "Nothing is enrolled. --allow-lost-poses enrols such frames without a pose; --most-speed says how fast the "
             "vehicle can be."
         )

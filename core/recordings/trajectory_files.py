@@ -43,12 +43,15 @@ class TrajectoryFile(NamedTuple):
     poses: int
 
 
-def read_trajectory(path: Path, times: Path | None = None, most_speed: float = MOST_SPEED) -> TrajectoryFile:
+def read_trajectory(
+    path: Path, times: Path | None = None, most_speed: float = MOST_SPEED, absolute: bool = False
+) -> TrajectoryFile:
     """Read a trajectory file; the number of values in its lines decides its form.
 
     Args:
         times: of a file in the form of KITTI: a file with a line of seconds for each pose.
         most_speed: metres a second; no vehicle is faster.
+        absolute: as of ``judge``; so are the coordinates of a ground truth.
 
     Raises:
         InvalidTrajectory: a file cannot be read, a line is malformed, no line has a pose, or the files have different
@@ -61,16 +64,16 @@ def read_trajectory(path: Path, times: Path | None = None, most_speed: float = M
     if values == TUM_VALUES:
         if times is not None:
             raise InvalidTrajectory(f"{path} is in the form of TUM, which has its times itself: give no second file.")
-        return TrajectoryFile(_tum(path, lines, most_speed), False, len(lines))
+        return TrajectoryFile(_tum(path, lines, most_speed, absolute), False, len(lines))
     if values == KITTI_VALUES:
-        return TrajectoryFile(_kitti(path, lines, times, most_speed), times is None, len(lines))
+        return TrajectoryFile(_kitti(path, lines, times, most_speed, absolute), times is None, len(lines))
     raise InvalidTrajectory(
         f"{path.name}, line {lines[0][0]}: {values} values are neither a pose of TUM (time x y z qx qy qz qw) "
         f"nor of KITTI (twelve values of a matrix)."
     )
 
 
-def _tum(path: Path, lines: list[tuple[int, list[str]]], most_speed: float) -> JudgedTrajectory:
+def _tum(path: Path, lines: list[tuple[int, list[str]]], most_speed: float, absolute: bool) -> JudgedTrajectory:
     nanoseconds, rows = list[int](), []
     for number, cells in lines:
         _check_count(path, number, cells, TUM_VALUES)
@@ -85,14 +88,16 @@ def _tum(path: Path, lines: list[tuple[int, list[str]]], most_speed: float) -> J
         lengths = np.linalg.norm(table[:, 3:], axis=1)
         turns = np.where((lengths >= 0.5)[:, None], table[:, 3:] / lengths[:, None], math.nan)
     where = _with_times([f"in line {number}" for number, _ in lines], nanoseconds)
-    return _judged(path, where, nanoseconds, table[:, :3], turns, most_speed)
+    return _judged(path, where, nanoseconds, table[:, :3], turns, most_speed, absolute)
 
 
 def _with_times(where: list[str], nanoseconds: list[int]) -> list[str]:
     return [f"{line}, {taken / NANOSECONDS:.3f} s" for line, taken in zip(where, nanoseconds, strict=True)]
 
 
-def _kitti(path: Path, lines: list[tuple[int, list[str]]], times: Path | None, most_speed: float) -> JudgedTrajectory:
+def _kitti(
+    path: Path, lines: list[tuple[int, list[str]]], times: Path | None, most_speed: float, absolute: bool
+) -> JudgedTrajectory:
     from scipy.spatial.transform import Rotation
 
     for number, cells in lines:
@@ -112,7 +117,7 @@ def _kitti(path: Path, lines: list[tuple[int, list[str]]], times: Path | None, m
     where = [f"in line {number}" for number, _ in lines]
     if times is not None:
         where = _with_times(where, nanoseconds)
-    return _judged(path, where, nanoseconds, positions, turns, most_speed)
+    return _judged(path, where, nanoseconds, positions, turns, most_speed, absolute)
 
 
 def _judged(
@@ -122,6 +127,7 @@ def _judged(
     positions: NDArray[np.float64],
     turns: NDArray[np.float64],
     most_speed: float,
+    absolute: bool,
 ) -> JudgedTrajectory:
     """Judge the poses of lines.
 
@@ -135,7 +141,7 @@ def _judged(
             "in all lines."
         )
     source = Source(path.name, "lines", where.__getitem__)
-    return JudgedTrajectory.of_samples(nanoseconds, positions, turns, source, most_speed=most_speed)
+    return JudgedTrajectory.of_samples(nanoseconds, positions, turns, source, absolute=absolute, most_speed=most_speed)
 
 
 def _times(path: Path) -> list[int]:

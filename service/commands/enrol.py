@@ -185,7 +185,7 @@ def enrol(
         for one in {traverse_of(chosen_name, frame) for frame in opened.frames}:
             _checked_sequence(one)
         if not allow_lost_poses:
-            check_lost_poses(opened)
+            check_lost_poses(opened, remarked=True)
 
         def choose(used: str | None, mask: Mask | None) -> list[FrameToSend]:
             chosen = options.choose(opened, used, mask)

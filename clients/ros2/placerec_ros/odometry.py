@@ -188,7 +188,7 @@ class Odometer:
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
-            self._poses, self._left = [], None
+            self._poses, self._left, self._trusted = [], None, self._beginnings + 1
             self._runs.clear()
             self.frame = self.child = ""
 

@@ -74,7 +74,7 @@ def tum(metres: float, degrees: float, frames: int) -> DatasetLayout:
             raise InvalidGroundTruth(f"{base / 'groundtruth.txt'} has no pose at the time of an image.")
         left_out = len(images) - len(known)
         gaps = f"{left_out} of {len(images)} images have no pose within {TUM_GAP:g} s and are left out."
-        notes = (*judged.remarks, *((gaps,) if left_out else ()))
+        notes = (*((gaps,) if left_out else ()), *judged.remarks)
         chosen = [images[index] for index in known]
         found = _revisits(chosen, [poses[index] for index in known], metres, degrees, frames)
         return LayoutTraverses(found.references, found.queries, found.truth, found.excluded, notes)
@@ -120,7 +120,7 @@ def _revisits(
 
 def _trajectory(path: Path) -> TrajectoryFile:
     try:
-        return read_trajectory(path)
+        return read_trajectory(path, absolute=True)
     except InvalidTrajectory as error:
         raise InvalidGroundTruth(str(error)) from error
 
