@@ -97,13 +97,6 @@ RUN_TRIALS = Table(
 )  # fmt: skip
 
 
-# Robots that are lost, or were (:mod:`service.queries.histories.lost_robots`).
-LOST_ROBOTS = Table(
-    "lost_robots", _METADATA, _map(), Column("robot", text(), primary_key=True),
-    *_texts("since", "until", "key", "session", "camera", "place"), **_FORM,
-)  # fmt: skip
-
-
 def _making(*tables: Table) -> Mapping[DialectName, list[str]]:
     """The statements that make tables, in each dialect."""
     return {
@@ -112,12 +105,7 @@ def _making(*tables: Table) -> Mapping[DialectName, list[str]]:
     }
 
 
-TABLES = Tables(
-    "statistics",
-    6,
-    _METADATA,
-    migrations={3: _making(HISTORY, ALARMS), 4: _making(RUN_TRIALS), 5: _making(LOST_ROBOTS)},
-)
+TABLES = Tables("statistics", 5, _METADATA, migrations={3: _making(HISTORY, ALARMS), 4: _making(RUN_TRIALS)})
 
 # Statements
 

@@ -74,7 +74,7 @@ def _count(
         key = map_key(engine.maps.find(map_id))
         statistics.observe(key, given.verdict, given.best, given.score, given.decision, _period(answer), passed)
         statistics.recent.add(key, given)
-        statistics.watch.observe(key, given)
+        statistics.robots.observe(key, given)
 
 
 def _period(answer: QueryAnswer) -> PlacePeriod | None:

@@ -48,7 +48,7 @@ from service.queries.counts import (
     monday_of,
 )
 from service.queries.given_answers import MapKey
-from service.queries.histories.lost_robots import LostRobot, LostRobots, forget_lost, put_changes, read_lost
+from service.queries.histories.lost_robots import LostRobot, LostRobots, lost_robots_file
 from service.queries.histories.run_trials import RunTrials, forget_run_trials, put_run_trials, read_run_trials
 from service.queries.histories.tables import (
     AlarmState,
@@ -93,7 +93,9 @@ class QueryStatistics:
         sizes: returns the number of places of every map; the counts of other maps are deleted.  It returns None while
             this is not known.
         present: returns the ids of the places of a map.
-        shared: whether other services use the ledger too.  It has the latest answers then, and is not closed here.
+        shared: whether other services use the ledger too.  It has the latest answers then, and which robots are lost,
+            and is not closed here.
+        robots: has which robots are lost, if no other service uses it; None: that is in memory alone.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class QueryStatistics:
         sizes: Callable[[], Mapping[MapKey, int] | None],
         present: Callable[[str], set[str]],
         shared: bool = False,
+        robots: Ledger | None = None,
     ) -> None:
         self._ledger, self._shared = ledger, shared
         self._seconds = min(seconds, SHARED_SECONDS) if shared else seconds
@@ -117,7 +120,7 @@ class QueryStatistics:
         self._written: set[MapKey] = set()
         self.recent = RecentAnswers(ledger if shared else None)
         """The latest answers."""
-        self.watch = LostRobots()
+        self.robots = LostRobots(ledger if shared else robots)
         """The robots, by what they are told, and so which of them are lost."""
         self.lost = 0
         """How many counts were dropped because the ledger refuses."""
@@ -154,8 +157,10 @@ class QueryStatistics:
         def present(map_id: str) -> set[str]:
             return {place.id for place in engine.maps.get(map_id).transfer.outline()}
 
-        ledger = statistics_file(engine.settings.data_dir) if shared is None else shared
-        return cls(ledger, engine.settings.statistics_seconds, sizes, present, shared is not None)
+        directory, seconds = engine.settings.data_dir, engine.settings.statistics_seconds
+        if shared is not None:
+            return cls(shared, seconds, sizes, present, shared=True)
+        return cls(statistics_file(directory), seconds, sizes, present, robots=lost_robots_file(directory))
 
     def start(self) -> None:
         """Begin to write the counts at intervals."""
@@ -170,6 +175,7 @@ class QueryStatistics:
             self.flush()
         if not self._shared:
             self._ledger.close()
+            self.robots.close()
 
     # Counting
 
@@ -226,7 +232,7 @@ class QueryStatistics:
         """
         with self._writing:
             self._write_counts()
-            self._write_alarms()
+        self.robots.flush()
         self.recent.flush()
 
     def _flush_if_room(self) -> None:
@@ -250,14 +256,6 @@ class QueryStatistics:
             raise
         with self._lock:
             self._written |= taken.keys()
-
-    @once_more_if_replaced
-    def _write_alarms(self) -> None:
-        changes = self.watch.changes
-        if changes:
-            with self._ledger.transaction("write down which robots are lost") as connection:
-                put_changes(connection, changes, datetime.now(UTC))
-            self.watch.written(changes)
 
     def _run(self) -> None:
         while not self._stop.wait(self._seconds):
@@ -350,19 +348,10 @@ class QueryStatistics:
             for one, hours in found.items()
         }
 
-    @once_more_if_replaced
     def lost_robots(self) -> list[LostRobot]:
-        """The robots of all maps that are lost, and those that were within the last days; the latest first."""
+        """The robots of all maps that are lost, and those that were within a day; the latest first."""
         self._flush_if_room()
-        with self._ledger.transaction(READ) as connection:
-            return read_lost(connection, self.watch.changes)
-
-    @once_more_if_replaced
-    def forget_lost_robots(self, key: MapKey) -> None:
-        """Delete the alarms of robots of a map."""
-        self.watch.forget(key)
-        with self._ledger.transaction("forget which robots were lost") as connection:
-            forget_lost(connection, key)
+        return self.robots.alarms()
 
     # Histories
 

@@ -9,12 +9,13 @@ from service.events import relay
 from service.jobs import rows
 from service.peers import replica
 from service.queries import count_tables, recent_answers
+from service.queries.histories import lost_robots
 from service.sessions import table as sessions
 from service.telemetry import history
 
 TABLES = (
     replica.TABLES, rows.TABLES, sessions.TABLES, key_table.TABLES, rates.TABLES, audit_trail.TABLES,
-    count_tables.TABLES, recent_answers.TABLES, relay.TABLES, history.TABLES,
+    count_tables.TABLES, recent_answers.TABLES, lost_robots.TABLES, relay.TABLES, history.TABLES,
 )  # fmt: skip
 """The tables of all parts that services share."""
 

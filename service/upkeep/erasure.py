@@ -162,7 +162,7 @@ def erase(rooms: Rooms, context: JobContext) -> Mapping[str, Any]:
     traces = replace(traces, places=frozenset(ids), looks=frozenset(addresses))
     review = _discard(map_, traces, context)
     answers = rooms.statistics.recent.forget(map_key(map_), traces.in_answer)
-    rooms.statistics.forget_lost_robots(map_key(map_))
+    rooms.statistics.robots.forget(map_key(map_))
     rooms.pictures.forget(map_key(map_))
     engine.events.forget(map_.record.id)
     context.check_cancelled()

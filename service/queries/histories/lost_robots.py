@@ -10,15 +10,22 @@ import json
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import bindparam, case, delete, select, update
+from sqlalchemy import Column, MetaData, Table, bindparam, case, delete, select, update
 from sqlalchemy.sql.elements import ColumnElement
 
-from core.ledger import LedgerConnection, Statement
-from service.queries.count_tables import LOST_ROBOTS, MAPS, THE_MAP, number_of, of_map, putting
+from core.disk.sqlite_file import DURABLE
+from core.ledger import Ledger, LedgerConnection, Statement, Tables
+from core.ledger.disposable import DisposableLedger, once_more_if_replaced
+from core.ledger.sqlite import file_of
+from core.ledger.statements import text
+from service.queries.count_tables import putting
 from service.queries.given_answers import GivenAnswer, MapKey
+
+FILE = "robots.sqlite"
 
 RAISED_BY, RAISED_AFTER = 3, timedelta(seconds=30)
 """An alarm is raised by so many answers in a row without a place, the first of which was so long ago."""
@@ -78,15 +85,17 @@ Change = tuple[MapKey, str, LostRobot | None, datetime | None]
 
 
 class LostRobots:
-    """Watches what robots are told.  Any thread may use it; nothing is written here.
+    """Watches what robots are told, and has the alarms.  Any thread may use it.
 
-    changes: of alarms, that are not written yet, in their order.
+    Args:
+        ledger: has the ``TABLES``, and the alarms after a ``flush``; None: they are in memory alone.
     """
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, ledger: Ledger | None = None) -> None:
+        self._ledger = ledger
+        self._lock, self._writing = threading.Lock(), threading.Lock()
         self._watched: OrderedDict[tuple[MapKey, str], _Watched] = OrderedDict()
-        self.changes: list[Change] = []
+        self._changes: list[Change] = []  # that are not written yet, in their order
 
     def observe(self, key: MapKey, answer: GivenAnswer) -> None:
         """Note an answer of a map."""
@@ -111,75 +120,107 @@ class LostRobots:
                 self._change((key, robot, seen.raised, None))
 
     def _change(self, change: Change) -> None:
-        self.changes = [*self.changes[1 - MOST :], change]
+        self._changes = [*self._changes[1 - MOST :], change]
 
+    @once_more_if_replaced
+    def flush(self) -> None:
+        """Write the changes of alarms; raises as the ledger does, and then they stay in memory."""
+        with self._writing:
+            if self._ledger is None or not (changes := self._changes):
+                return
+            with self._ledger.transaction("write down which robots are lost") as connection:
+                _put(connection, changes, datetime.now(UTC))
+            done = {id(one) for one in changes}
+            with self._lock:
+                self._changes = [one for one in self._changes if id(one) not in done]
+
+    @once_more_if_replaced
+    def alarms(self) -> list[LostRobot]:
+        """Robots of all maps that are lost, and those that were within a day; the latest first.
+
+        Raises:
+            StorageFull, StorageFailure: the ledger refuses, or cannot be reached.
+        """
+        found: dict[tuple[MapKey, str], LostRobot] = {}
+        with self._writing:
+            if self._ledger is not None:
+                rows = self._ledger.execute("read which robots are lost", _ALL)
+                found = {(one.map, one.robot): one for one in (_alarm_of(*row) for row in rows)}
+            changes = self._changes
+        for key, robot, raised, cleared in changes:
+            if raised is not None:
+                found[key, robot] = raised
+            elif (before := found.get((key, robot))) is not None and before.until is None:
+                found[key, robot] = before._replace(until=cleared)
+        return sorted(found.values(), key=lambda one: one.since, reverse=True)
+
+    @once_more_if_replaced
     def forget(self, key: MapKey) -> None:
-        """Forget the robots of a map."""
-        with self._lock:
-            self._watched = OrderedDict((one, seen) for one, seen in self._watched.items() if one[0] != key)
-            self.changes = [one for one in self.changes if one[0] != key]
+        """Forget the robots of a map, and their alarms; raises as :meth:`alarms`."""
+        with self._writing:
+            with self._lock:
+                self._watched = OrderedDict((one, seen) for one, seen in self._watched.items() if one[0] != key)
+                self._changes = [one for one in self._changes if one[0] != key]
+            if self._ledger is not None:
+                self._ledger.change("forget which robots were lost", _FORGET, id=key[0], made=key[1])
 
-    def written(self, changes: list[Change]) -> None:
-        """Drop changes that are written."""
-        done = {id(one) for one in changes}
-        with self._lock:
-            self.changes = [one for one in self.changes if id(one) not in done]
+    def close(self) -> None:
+        """Close the file."""
+        if self._ledger is not None:
+            self._ledger.close()
 
 
-_T = LOST_ROBOTS.c
-_COLUMNS = "key", "session", "camera", "place"
+_METADATA = MetaData()
+_ROBOTS = Table(
+    "lost_robots",
+    _METADATA,
+    *(Column(name, text(), primary_key=True) for name in ("map", "made", "robot")),
+    *(Column(name, text(), nullable=False) for name in ("since", "until", "key", "session", "camera", "place")),
+    sqlite_strict=True,
+    sqlite_with_rowid=False,
+)
+TABLES = Tables("lost_robots", 1, _METADATA)
+
+_C = _ROBOTS.c
+_OF_MAP = _C.map == bindparam("id"), _C.made == bindparam("made")
+_WHO = "key", "session", "camera", "place"
 
 
 def _combined(column: ColumnElement[Any], given: ColumnElement[Any]) -> ColumnElement[Any]:
     """An alarm that is raised already stays as old as it is."""
-    return case((_T.until == "", column), else_=given) if column is _T.since else given
+    return case((_C.until == "", column), else_=given) if column is _C.since else given
 
 
-_RAISE = putting(LOST_ROBOTS, _combined)
+_RAISE = putting(_ROBOTS, _combined)
 _CLEAR = Statement(
-    update(LOST_ROBOTS)
-    .values(until=bindparam("moment"))
-    .where(of_map(LOST_ROBOTS), _T.robot == bindparam("one"), _T.until == "")
+    update(_ROBOTS).values(until=bindparam("moment")).where(*_OF_MAP, _C.robot == bindparam("name"), _C.until == "")
 )
-_OLD = Statement(
-    delete(LOST_ROBOTS).where(((_T.until != "") & (_T.until < bindparam("day"))) | (_T.since < bindparam("week")))
+_DELETE_OLD = Statement(
+    delete(_ROBOTS).where(((_C.until != "") & (_C.until < bindparam("day"))) | (_C.since < bindparam("week")))
 )
-_ALL = Statement(
-    select(MAPS.c.id, MAPS.c.made, *LOST_ROBOTS.columns[1:]).join_from(LOST_ROBOTS, MAPS).order_by(_T.since.desc())
-)
-_FORGET = Statement(delete(LOST_ROBOTS).where(_T.map == select(MAPS.c.code).where(*THE_MAP).scalar_subquery()))
+_ALL = Statement(select(*_ROBOTS.columns))
+_FORGET = Statement(delete(_ROBOTS).where(*_OF_MAP))
 
 
-def put_changes(connection: LedgerConnection, changes: list[Change], now: datetime) -> None:
+def lost_robots_file(directory: Path) -> DisposableLedger:
+    """The ledger of one data directory, which this process holds; a damaged file is put aside and made anew."""
+    settings = {**DURABLE, "journal_size_limit": 1 << 20}
+    readable = ["SELECT robot FROM lost_robots LIMIT 0"]
+    return DisposableLedger(file_of(directory / FILE, TABLES, settings, readable, check_whole=False))
+
+
+def _put(connection: LedgerConnection, changes: list[Change], now: datetime) -> None:
     """Raise and clear alarms, and delete those that are listed no longer."""
     for key, robot, raised, cleared in changes:
-        code = number_of(connection, key, now.isoformat())
         if raised is not None:
-            told = [getattr(raised, name) or "" for name in _COLUMNS]
-            connection.execute(_RAISE, rows=json.dumps([(code, robot, raised.since.isoformat(), "", *told)]))
+            told = [getattr(raised, name) or "" for name in _WHO]
+            connection.execute(_RAISE, rows=json.dumps([(*key, robot, raised.since.isoformat(), "", *told)]))
         if cleared is not None:
-            connection.change(_CLEAR, code=code, one=robot, moment=cleared.isoformat())
+            connection.change(_CLEAR, id=key[0], made=key[1], name=robot, moment=cleared.isoformat())
     day, week = (now - LISTED_FOR).isoformat(), (now - 7 * LISTED_FOR).isoformat()
-    connection.change(_OLD, day=day, week=week)
-
-
-def read_lost(connection: LedgerConnection, waiting: list[Change]) -> list[LostRobot]:
-    """All alarms, the latest first, with changes that are not written yet."""
-    rows = (_alarm_of(*row) for row in connection.execute(_ALL))
-    found = {(one.map, one.robot): one for one in rows}
-    for key, robot, raised, cleared in waiting:
-        if raised is not None:
-            found[key, robot] = raised
-        elif (before := found.get((key, robot))) is not None and before.until is None:
-            found[key, robot] = before._replace(until=cleared)
-    return sorted(found.values(), key=lambda one: one.since, reverse=True)
+    connection.change(_DELETE_OLD, day=day, week=week)
 
 
 def _alarm_of(map_id: str, made: str, robot: str, since: str, until: str, *who: str) -> LostRobot:
     ended = datetime.fromisoformat(until) if until else None
     return LostRobot((map_id, made), robot, datetime.fromisoformat(since), ended, *(one or None for one in who))
-
-
-def forget_lost(connection: LedgerConnection, key: MapKey) -> None:
-    """Delete the alarms of a map."""
-    connection.change(_FORGET, id=key[0], made=key[1])

@@ -18,6 +18,7 @@ from service.app.runtime import Runtime
 from service.queries import recent_answers
 from service.queries.count_tables import TABLES, statistics_file
 from service.queries.given_answers import GivenAnswer, MapKey, QueriedFrame
+from service.queries.histories import lost_robots
 from service.queries.histories.lost_robots import LostRobot
 from service.queries.statistics import QueryStatistics, map_key
 from service.sessions.schemas import NewSession
@@ -62,7 +63,7 @@ def send(
         single, run = (LETTERS[letter], None) if frames is None else (LETTERS[frames[number]], LETTERS[letter])
         answer = given(at, single, run, session)
         statistics.recent.add(key, answer)
-        statistics.watch.observe(key, answer)
+        statistics.robots.observe(key, answer)
     return at
 
 
@@ -80,9 +81,10 @@ def counting(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Countin
     def begun() -> QueryStatistics:
         shared = request.param == "postgresql"
         if shared:
-            ledgers.append(PostgresLedger(server.address, [TABLES, recent_answers.TABLES]))
-        ledger = ledgers[-1] if shared else statistics_file(tmp_path)
-        return QueryStatistics(ledger, 3600, lambda: {LAB: 10}, lambda _: set(), shared)
+            ledgers.append(PostgresLedger(server.address, [TABLES, recent_answers.TABLES, lost_robots.TABLES]))
+            return QueryStatistics(ledgers[-1], 3600, lambda: {LAB: 10}, lambda _: set(), shared)
+        robots = lost_robots.lost_robots_file(tmp_path)
+        return QueryStatistics(statistics_file(tmp_path), 3600, lambda: {LAB: 10}, lambda _: set(), robots=robots)
 
     yield begun
     for ledger in ledgers:
@@ -144,7 +146,7 @@ def test_an_alarm_survives_a_restart_and_is_cleared_by_whichever_service_hears_t
     cleared = send(third, "RRR", begin=later + timedelta(seconds=10))
     found = lost(third)
     assert found is not None and (found.since, found.until) == (raised.since, cleared)
-    third.forget_lost_robots(LAB)
+    third.robots.forget(LAB)
     assert lost(third) is None
     third.close()
 
