@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from core.judgement.calibration import FittedCalibration
+from core.judgement.calibration import FEWEST_OUTCOMES, FittedCalibration
 from core.judgement.reliability import brier
 from core.judgement.trials import StagedTrials
 from core.judgement.verdict import Calibration
@@ -26,7 +26,8 @@ WORSE_FOR_STRANGERS = 0.2
 of ``benchmarks.learning.calibration`` (in fog), and from 0.2 to 0.9 where labels had shown no stranger."""
 
 SURE = 2.0
-"""A rise counts that is more than this many of its standard errors: that of a few answers may be chance."""
+"""A rise counts that is more than this many of its standard errors, and of ``FEWEST_OUTCOMES`` answers or more: that of
+a few may be chance."""
 
 
 class Stated(BaseModel):
@@ -109,5 +110,5 @@ def _worse(known: Values, strangers: Values, kinds: list[KindChange | None]) -> 
 def _rises(*kinds: Values, least: float) -> bool:
     """Whether the mean over some kinds of the mean rise of each, float64 [n], is more than ``least``, and no chance."""
     mean = float(np.mean([one.mean() for one in kinds]))
-    variances = [one.var(ddof=1) / len(one) if len(one) > 1 else np.inf for one in kinds]
+    variances = [one.var(ddof=1) / len(one) if len(one) >= FEWEST_OUTCOMES else np.inf for one in kinds]
     return mean > least and mean > SURE * float(np.sqrt(sum(variances))) / len(kinds)

@@ -342,8 +342,9 @@ def adjust_calibration(
     In no case more answers are recognized in the map without their place, or off the map, than before; with fewer than
     ``FEWEST_OUTCOMES`` of them the threshold falls no lower than the base's.
 
-    With fewer than ``FEWEST_OF_A_KIND`` strangers, or known places, no answer becomes likelier: those of one kind say
-    nothing of the other.  Where answers are wrong more often than stated, the curve is shifted down.
+    With fewer than ``FEWEST_OF_A_KIND`` strangers no answer becomes likelier: known places say nothing of strangers.
+    Where their answers are wrong more often than stated, the curve is shifted down.  With fewer known places nothing
+    changes.
 
     Args:
         trials: judged with ``base``, each frame in the map as it is, and perhaps in the map without its place, too.
@@ -363,15 +364,23 @@ def adjust_calibration(
             if base.curve is not None
             else "The encoder's calibration has no curve that could be adjusted."
         )
-    if present is not None and present.curve is not None and not Kinds.of(staged.two).enough:
+    kinds = Kinds.of(staged.two)
+    if present is not None and present.curve is not None and not kinds.enough:
         base = present
-    return _measured(staged, lambda chosen: _adjusted(staged.take(chosen), base, target), source)
+    return _measured(staged, lambda chosen: _adjusted(staged.take(chosen), base, target, kinds), source)
 
 
-def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None) -> Calibration:
+def _adjusted(trials: StagedTrials, base: Calibration, target: Target | None, kinds: Kinds) -> Calibration:
+    """Adjust a calibration to a part of the trials.
+
+    Args:
+        kinds: of all of them.
+    """
     assert base.curve is not None
+    if kinds.known < FEWEST_OF_A_KIND:
+        return base
     two = trials.two
-    down, leads = not Kinds.of(two).enough, share_of_leads(two.margin, base)
+    down, leads = not kinds.enough, share_of_leads(two.margin, base)
     curve = moved_curve(base.curve, two.decision, two.imagined, two.right, leads, down)
     moved = base.model_copy(update={"curve": curve})
     moved = moved.model_copy(update={"geometry": _adjusted_terms(trials.three, moved, curve, down)})

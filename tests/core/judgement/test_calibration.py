@@ -348,7 +348,7 @@ TIMID = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-8), "geometr
         (labels(10, 2, right=10), False, False),
         (labels(200, 0, right=200), False, False),
         (labels(10, 0, right=0), False, True),
-        (labels(0, 10, right=0), False, True),
+        (labels(0, 10, right=0), False, False),
         (labels(2, 30, right=2), False, False),
         (labels(10, 3, right=10), True, False),
     ],
@@ -358,7 +358,7 @@ TIMID = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-8), "geometr
 def test_labels_of_one_kind_make_no_answer_likelier(
     asked: Trials, rises: bool, falls: bool, evidence: float, target: Target | None
 ) -> None:
-    """Ten right answers to known places tell nothing of strangers; wrong answers say that all are less likely."""
+    """Ten right answers to known places tell nothing of strangers, and ten strangers nothing of known places."""
     asked = replace(asked, evidence=np.full(len(asked), evidence))
     found = adjust_calibration(asked, TIMID, "labels", target).calibration
     scores = np.linspace(-0.2, 0.4, 61)
