@@ -70,6 +70,7 @@ class Ways:
         """What is said of a recording, and how many of its frames have a pose."""
         try:
             with open_recording(path, topic, poses) as found:
+                found.check_format()
                 posed = sum(frame.described().pose is not None for frame in found.frames)
                 return " ".join([*found.remarks, f"[{posed} of {len(found.frames)} with a pose]"])
         except PlacerecError as error:
