@@ -12,17 +12,6 @@ DATA = ROOT.parent / "shared" / "datasets" / "eval"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the evaluation images are not at hand")
 
 
-@pytest.mark.thorough
-@needs_data
-def test_a_stretch_of_railway_in_another_season() -> None:
-    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    (counts,) = recalls(encoder, "nordland_tiny", DATA, frames=500).values()
-    single, learnt, given = (counts[how]["wrong"] for how in ("single", "session", "session, given the pace"))
-    assert single > 0.1 * counts["queries"], "or there would be nothing to gain"
-    assert given <= 0.6 * single, "the whole run is held to more below"
-    assert learnt <= 0.6 * single, "one that has to learn the pace"
-
-
 @needs_data
 @pytest.mark.soak
 @pytest.mark.timeout(1500)

@@ -16,14 +16,9 @@ from core.recognition.verification import CANDIDATES
 from lab.training.map_sizes import (
     APART,
     SMALL,
-    STRANGERS,
     ScoredTraverse,
     cut,
-    fit_geometry,
-    fit_small_maps,
-    trials_of_halves,
     trials_of_size,
-    widened,
 )
 
 CALIBRATION = Calibration(
@@ -69,42 +64,6 @@ def test_trials_are_of_known_places_and_of_strangers(size: int) -> None:
     assert trials.known.any() and not trials.known.all()
     assert not trials.right[~trials.known].any()
     assert ((trials.imagined > 0) & (trials.imagined <= 1)).all()
-
-
-@pytest.mark.thorough
-def test_what_is_fitted_makes_probabilities_of_small_maps_honest() -> None:
-    """On traverses of other seeds; in half of the environments strangers score as known places do in the others."""
-    fitted = [(f"made {seed}", traverse(mean, seed)) for seed, mean in enumerate((0.1, 0.14, 0.18, 0.22))]
-    curve = fit_small_maps(CALIBRATION, fitted, repeats=4)
-    assert (curve.slope, curve.intercept) == (37, -3.5), "full maps keep theirs"
-    better = CALIBRATION.model_copy(update={"curve": curve})
-    errors = []
-    for calibration in (CALIBRATION, better):
-        off = []
-        for size in SMALL:
-            for seed, mean in enumerate((0.11, 0.15, 0.19, 0.23)):
-                trials, _ = trials_of_size(traverse(mean, 10 + seed), size, "run", calibration, 4)
-                p, known = trials.probabilities(calibration), trials.known
-                loss = np.square(p - trials.right)
-                off.append((loss[known].mean() + loss[~known].mean()) / 2)
-        errors.append(np.mean(off))
-    assert errors[1] < 0.9 * errors[0]
-
-
-@pytest.mark.thorough
-def test_an_environment_is_widened_until_strangers_of_small_maps_are_refused() -> None:
-    """Of two kinds of traverses, one whose places score much alike."""
-    alike = [("plain 0", traverse(0.12, 0)), ("alike 0", traverse(0.25, 1))]
-    found = widened(CALIBRATION, alike, repeats=1)
-    assert CALIBRATION.environment is not None and found.deviation > CALIBRATION.environment.deviation
-    assert found.model_copy(update={"deviation": CALIBRATION.environment.deviation}) == CALIBRATION.environment
-    better = CALIBRATION.model_copy(update={"environment": found})
-    shares = []
-    for size in SMALL:
-        trials, _ = trials_of_size(alike[1][1], size, "run", better, 1)
-        shares.append(float(trials.recognized(better)[~trials.known].mean()))
-    assert np.mean(shares) <= 4 * STRANGERS, "the other kind and drawn maps, which count as much, have none"
-    assert widened(CALIBRATION, alike[:1], repeats=1) == CALIBRATION.environment, "nothing has to be refused"
 
 
 def verifiable(mean: float, seed: int) -> ScoredTraverse:
@@ -166,14 +125,3 @@ def test_auto_verifies_where_two_stages_leave_doubt() -> None:
     verified = [found.verified for found in whole]
     assert [count > 0 for count in verified] == [worth_verifying(found.judgement, calibration) for found in by_two]
     assert min(verified) == 0 < max(verified) <= CANDIDATES
-
-
-@pytest.mark.thorough
-def test_terms_that_are_fitted_to_some_traverses_hold_on_others() -> None:
-    terms = fit_geometry(CALIBRATION, [("made 0", verifiable(0.1, 0)), ("made 1", verifiable(0.18, 1))], repeats=2)
-    assert terms.slope > 0 > terms.intercept
-    three = CALIBRATION.model_copy(update={"geometry": terms})
-    plain, _ = trials_of_halves(verifiable(0.14, 7), CALIBRATION)
-    verified, _ = trials_of_halves(verifiable(0.14, 7), three, "always")
-    loss = [np.square(trials.probabilities(three) - trials.right).mean() for trials in (plain, verified)]
-    assert loss[1] < 0.85 * loss[0]

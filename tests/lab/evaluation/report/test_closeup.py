@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.lab.evaluation.report.comparisons import Written, make_comparison, written_page
+from tests.lab.evaluation.report.comparisons import make_comparison, written_page
 
 
 @pytest.mark.thorough
@@ -28,13 +28,3 @@ def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
     assert rows[-2] == f"over {mean.threshold:.3f}, the mean score of the queries without a true reference"
     names = {path.name for path in (tmp_path / "report").iterdir()}
     assert {"scores-after-system-0.png", "scores-before-system-0.png", "similarity-system-0.png"} <= names
-
-
-@pytest.mark.thorough
-def test_system_is_described(written: Written) -> None:
-    page, system = written.page, written.comparison.runs[0].about.name
-    section = page.named("section", "run")[0]
-    assert section.attributes["id"] == "run-0" and "Somebody, 2020." in section.text
-    details = page.named("details")[0]
-    for name, value in (("N", "300"), ("layers", "conv3 conv4"), ("identity", f"{system}@0123456789abcdef")):
-        assert f"{name}{value}" in details.text

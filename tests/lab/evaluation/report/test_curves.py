@@ -3,13 +3,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from lab.evaluation import SystemComparison
 from lab.evaluation.protocol.trust import trust_figures
 from lab.evaluation.report.curves import plot_pr, plot_recall, plot_reliability, plot_roc
 from lab.evaluation.report.theme import Cast
-from tests.lab.evaluation.report.comparisons import Written, make_comparison, written_page
+from tests.lab.evaluation.report.comparisons import Written, make_comparison
 
 
 def test_texts_name_all_systems_and_their_areas(tmp_path: Path) -> None:
@@ -37,30 +35,6 @@ def with_probabilities(folder: Path) -> SystemComparison:
         runs.append(replace(run, evaluation=run.evaluation.model_copy(update=figures)))
     assert all(run.evaluation.trust for run in runs)
     return replace(comparison, runs=runs)
-
-
-@pytest.mark.thorough
-def test_the_diagram_and_its_table(tmp_path: Path) -> None:
-    comparison = with_probabilities(tmp_path)
-    page = written_page(tmp_path / "report", comparison)
-    assert "reliability" in [section.attributes.get("id") for section in page.named("section")]
-    assert (tmp_path / "report/reliability.png").read_bytes().startswith(b"\x89PNG")
-    cast = Cast(comparison.runs)
-    plot = plot_reliability(comparison.runs, cast)
-    assert plot is not None
-    for run, mark in zip(comparison.runs, cast.runs, strict=True):
-        assert f"{mark.label} {run.evaluation.ece:.3f}" in plot.alt
-    first = comparison.runs[0].evaluation.trust
-    assert first is not None
-    figures = (
-        first.auc_roc_right,
-        first.reliability.ece,
-        first.reliability.brier,
-        first.reliability.brier_of_base_rate,
-    )
-    cells = [cell.text for cell in page.named("td") if cell.text and not cell.attributes]
-    assert cells[:4] == [f"{value:.3f}" for value in figures]
-    assert f"({first.believed_precision.low:.3f}–{first.believed_precision.high:.3f})" in cells[4]
 
 
 def test_without_probabilities_there_is_no_section(written: Written) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from lab.evaluation.report.gallery import MOST_BOXES, case, gallery, wrong_first
 from lab.evaluation.report.thumbnails import Thumbnails
-from tests.lab.evaluation.report.comparisons import make_comparison, make_run, outcome, written_page
+from tests.lab.evaluation.report.comparisons import make_comparison, make_run, outcome
 
 
 def test_the_most_confident_wrong_match_is_first() -> None:
@@ -37,19 +37,6 @@ def test_which_true_reference_is_shown(tmp_path: Path) -> None:
         (3, None),  # none of the true ones was retained
         (None, None),
     ]
-
-
-@pytest.mark.thorough
-def test_full_page_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    comparison = make_comparison(tmp_path, systems=1)
-    empty = gallery(comparison, comparison.runs[0], Thumbnails(budget=0), None, most=4)
-    assert [len(group.cases) for group in empty] == [0, 0] and sum(group.total for group in empty) == 8
-    small = gallery(comparison, comparison.runs[0], Thumbnails(budget=1), None, most=4)
-    assert sum(len(group.cases) for group in small) == 1
-    monkeypatch.setattr("lab.evaluation.report.page.Thumbnails", lambda: Thumbnails(budget=0))
-    page = written_page(tmp_path / "report", comparison)
-    assert "are left out, to keep the page small" in page.named("section", "run")[0].text
-    assert page.named("article") == page.named("image") == []
 
 
 def test_number_of_cases_and_of_boxes_is_bounded(tmp_path: Path) -> None:

@@ -7,16 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from core.errors import StorageFailure, StorageFull
-from core.frames.traverses import tolerance_truth
 from lab.evaluation import SeverityCurve
-from lab.evaluation.report import page as page_module
 from lab.evaluation.report import write_report
 from lab.evaluation.report.page import write_files
-from lab.evaluation.report.theme import DARK, LIGHT, variables
 from tests.lab.evaluation.report.comparisons import Written, make_comparison, make_run, page_of, write_images
 
 
@@ -135,28 +131,6 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_wrong_matches_come_first(tmp_path: Path) -> None:
-    scores = np.eye(4, dtype=np.float32)
-    scores[1] = [0.9, 0.1, 0, 0]  # wrong, sure
-    scores[2] = [0, 0.3, 0.2, 0]  # wrong, unsure
-    retained, truth = np.arange(4), tolerance_truth(4, 4, 0)
-    comparison = replace(
-        make_comparison(tmp_path, systems=1, count=4),
-        runs=[make_run("mixed", scores, retained, truth)],
-        retained=retained,
-    )
-    _, page = page_of(tmp_path / "report", comparison)
-    articles = page.named("article")
-    assert [element.text.startswith(f"Query {query} ") for element, query in zip(articles, (1, 2, 0, 3), strict=True)]
-    assert [article.attributes["class"] for article in articles] == ["case wrong"] * 2 + ["case right"] * 2
-    assert "Best match 0 wrongscore 0.900" in articles[0].text
-    assert "Truth 1 score 0.100, rank 2" in articles[0].text
-    headings = [heading.text for heading in page.named("h4")]
-    assert headings[0].startswith("Wrong matches all 2")
-    assert headings[1].startswith("Right matches all 2")
-
-
-@pytest.mark.thorough
 def test_without_a_wrong_match_there_is_nothing_to_reject_and_without_negatives_no_roc(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, noise=0)
     html, page = page_of(tmp_path / "report", comparison)
@@ -167,75 +141,6 @@ def test_without_a_wrong_match_there_is_nothing_to_reject_and_without_negatives_
     assert "There is none." in html
     assert "There is no ROC curve: every query has a retained true reference" in html
     assert not (tmp_path / "report" / "roc.png").exists()
-
-
-@pytest.mark.thorough
-def test_without_a_right_match_there_is_no_curve(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=1)
-    backwards = make_run("backwards", -np.eye(8, dtype=np.float32), comparison.retained, comparison.truth)
-    html, _ = page_of(tmp_path / "report", replace(comparison, runs=[backwards]))
-    assert "no precision–recall curve, of backwards" in html
-    assert not (tmp_path / "report" / "pr.png").exists()
-    assert (tmp_path / "report" / "recall.png").exists()
-
-
-@pytest.mark.thorough
-def test_every_query_is_a_negative(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=1)
-    nothing = [np.array([], np.int64)] * 8
-    run = make_run("lost", comparison.runs[0].scores, comparison.retained, nothing)
-    html, page = page_of(tmp_path / "report", replace(comparison, truth=nothing, runs=[run]))
-    assert "no query has a retained true reference" in html
-    assert len(page.named("article")) == 8
-    assert "True reference" in page.named("article")[0].text
-
-
-@pytest.mark.thorough
-def test_one_query_and_one_reference(tmp_path: Path) -> None:
-    html, page = page_of(tmp_path / "report", make_comparison(tmp_path, systems=1, count=1))
-    assert "1 query" in html
-    assert len(page.named("article")) == 1
-
-
-@pytest.mark.thorough
-def test_more_systems_than_hues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Two plots of each system, which take most of the time and know of no other system.
-    monkeypatch.setattr("lab.evaluation.report.closeup.plot_fates", lambda *_: [])
-    comparison = make_comparison(tmp_path, systems=10, retained=range(6))
-    _, page = page_of(tmp_path / "report", comparison)
-    assert len(page.named("section", "run")) == 10 > len(LIGHT.hues)
-    rows = [element for element in page.named("th") if element.attributes["scope"] == "row"]
-    names = [row.text for row in rows if "data-value" in row.attributes]
-    assert names == [run.about.name for run in comparison.runs]
-    assert len(list((tmp_path / "report").glob("similarity-*.png"))) == 10
-
-
-@pytest.mark.thorough
-def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, retained=range(6))
-    second = comparison.runs[1]
-    seen: list[Path] = []
-
-    def regions(path: Path) -> list[tuple[float, float, float, float]]:
-        seen.append(path)
-        return [(0.25, 0.5, 0.75, 1.0)] * 3  # the same box from several maps is drawn once
-
-    page = page_of(tmp_path / "report", replace(comparison, regions=regions, regions_of=second.identity))[1]
-    rectangles = [rectangle for rectangle in page.named("rect") if rectangle.attributes["width"] == "24.0"]
-    assert len(rectangles) == len(seen) > 0
-    wanted = {"x": "12.0", "y": "18.0", "width": "24.0", "height": "18.0"}
-    assert all(rectangle.attributes == wanted for rectangle in rectangles)
-    sections = page.named("section", "run")
-    assert ["regions of interest" in section.text for section in sections] == [False, True]
-
-
-@pytest.mark.thorough
-def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=1)
-    comparison.queries[3].unlink()
-    without = replace(comparison, references=[])
-    _, page = page_of(tmp_path / "report", without)
-    assert sum(article.text.count("no image") for article in page.named("article")) >= len(page.named("article")) * 2
 
 
 @pytest.mark.thorough
@@ -261,23 +166,6 @@ def test_no_run_no_report(tmp_path: Path) -> None:
 
 
 # How it looks
-
-
-def test_every_colour_that_is_used_is_defined_for_both_themes(written: Written) -> None:
-    (style,) = written.page.named("style")
-    used = set(re.findall(r"var\((--[\w-]+)\)", written.html)) - {"--size"}  # set on each bar
-    light, dark = (set(re.findall(r"(--[\w-]+):", part)) for part in style.text.split("@media", 1)[:2])
-    assert used <= light | dark
-    assert style.text.index(LIGHT.paper) < style.text.index("prefers-color-scheme: dark") < style.text.index(DARK.paper)
-    for name in variables(LIGHT):
-        assert style.text.count(f"--{name}:") == 2, name
-
-
-def test_style_and_script_are_whole(written: Written) -> None:
-    folder = Path(page_module.__file__).parent
-    (style,), (script,) = written.page.named("style"), written.page.named("script")
-    assert (folder / "page.css").read_text("utf-8").strip() in style.text
-    assert (folder / "page.js").read_text("utf-8").strip() == script.text.strip()
 
 
 # Its files
