@@ -258,6 +258,11 @@ class QueryStatistics:
             self._written |= taken.keys()
 
     def _run(self) -> None:
+        with suppress(
+            PlacerecError
+        ):  # the files are made while there is room, so that they can be read when it is gone
+            self.last_day()
+            self.lost_robots()
         while not self._stop.wait(self._seconds):
             try:
                 self.flush()
