@@ -15,7 +15,7 @@ from core.numerals import check_numeral
 from core.places import Pose
 
 FIELDS = 14
-"""Of a whole name; a short one has but the first of them."""
+"""The fields of a whole name; a short one has but the first of them."""
 
 
 @dataclass(frozen=True)

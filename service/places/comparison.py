@@ -41,7 +41,7 @@ class FrameToCompare(BaseModel):
 
     id: Annotated[str, Field(max_length=128)] = Field(description="Id of its place.")
     sha256: str | None = Field(
-        default=None, pattern="^[0-9a-f]{64}$", description="Of its bytes, where they were read already."
+        default=None, pattern="^[0-9a-f]{64}$", description="The digest of its bytes, where they were read already."
     )
 
 

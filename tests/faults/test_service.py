@@ -29,6 +29,7 @@ from tests.faults.injection import attached
 from tests.service.places.test_durability import answers
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
+from tests.service.wire import eventually
 from tests.syscalls import strace
 
 needs_strace = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
@@ -122,11 +123,8 @@ def wait_for_readiness(server: Server, status: int) -> httpx.Response:
 
 def degraded_soon(server: Server, expected: bool = True) -> str | None:
     """Why the service, which is ready, takes no writes; the probe looks at the disk once a second."""
-    until = time.monotonic() + 60
-    while ((reason := wait_for_readiness(server, 200).json()["degraded"]) is not None) != expected:
-        assert time.monotonic() < until
-        time.sleep(0.1)
-    return str(reason) if expected else None
+    assert eventually(lambda: (wait_for_readiness(server, 200).json()["degraded"] is not None) == expected, seconds=60)
+    return str(wait_for_readiness(server, 200).json()["degraded"]) if expected else None
 
 
 @pytest.mark.thorough

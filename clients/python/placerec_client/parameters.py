@@ -1572,4 +1572,4 @@ class FrameToCompare(TypedDict):
     """Id of its place."""
 
     sha256: NotRequired[str | None]
-    """Of its bytes, where they were read already."""
+    """The digest of its bytes, where they were read already."""

@@ -28,7 +28,7 @@ Array = NDArray[Any]
 
 COLOURS = scene(5, 64, 48)
 DEEP = COLOURS.astype(np.uint16) * 200 + np.arange(64, dtype=np.uint16)[None, :, None]
-"""Of 16 bits, with something in the lower eight."""
+"""16 bits, with something in the lower eight."""
 NOISE = np.random.default_rng(3).integers(0, 256, (48, 64, 2)).astype(np.uint8)
 HALVED = np.random.default_rng(4).integers(0, 256, (72, 64)).astype(np.uint8)
 

@@ -18,6 +18,7 @@ from service.telemetry import history
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
+from tests.service.wire import eventually
 from tests.syscalls import audit, is_sqlite_index, is_success_response, strace, strace_arguments
 
 TRAVERSE = 12
@@ -260,9 +261,7 @@ def test_a_service_on_a_full_file_system_answers_queries_even_if_it_starts_there
         for path in ("/v1/maps", "/v1/fleet", "/v1/jobs", "/v1/service", "/v1/service/history", "/metrics"):
             assert server.client.get(path).status_code == 200, path
     (small_disk / "ballast").unlink()
-    until = time.monotonic() + 60
-    while server.client.get("/readyz").json()["degraded"] is not None and time.monotonic() < until:
-        time.sleep(0.1)
+    assert eventually(lambda: server.client.get("/readyz").json()["degraded"] is None, seconds=60)
     assert server.enrol("yard", "taken", jpeg(2)).status_code == 201
     assert set(server.places("yard")) == {"p1", "taken"}
     assert server.client.post("/v1/maps/yard/verify").json()["ok"]
