@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from xdist.scheduler import LoadFileScheduling
 
 from tests.servers.postgres import Postgres, postgres_programs, running_postgres
 from tests.servers.process import Missing
@@ -21,22 +19,26 @@ for name in ("FORCE_COLOR", "PY_COLORS", "CLICOLOR_FORCE", "GITHUB_ACTIONS", "TT
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-PAGES, PROJECT = "tests/documents/test_commands.py", "tests/project/"
 LONGEST = (
-    PAGES,
+    "tests/core/storage/files/test_failed_sync.py",
+    "tests/service/upkeep/",
     "tests/service/places/",
     "tests/service/commands/",
-    "tests/service/console/",
-    "tests/core/storage/files/test_failed_sync.py",
-    "tests/service/sessions/test_sessions.py",
-    "tests/service/upkeep/",
     "tests/lab/evaluation/report/",
+    "tests/lab/training/",
+    "tests/service/console/",
     "tests/clients/",
+    "tests/service/sessions/test_sessions.py",
     "tests/service/engine/",
     "tests/benchmarks/",
-    "tests/lab/training/",
+    "tests/fuzz/",
+    "tests/core/cluster/",
+    "tests/durability/",
 )
-"""Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end."""
+"""Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end.
+
+Beside the first ones .ci/run checks types, so that those that wait for a browser or a robot come later.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -46,25 +48,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if item.get_closest_marker("postgres"):
                 item.add_marker(pytest.mark.skip(reason=why))
     items.sort(key=lambda item: next((rank for rank, name in enumerate(LONGEST) if item.nodeid.startswith(name)), 99))
-
-
-class Scheduling(LoadFileScheduling):  # type: ignore[misc]
-    """The tests of one file stay together, for they share a server, and those of the project, which parse all files.
-
-    The documents' pages are apart, for together they would take minutes.
-    """
-
-    def _split_scope(self, nodeid: str) -> str:
-        if nodeid.startswith(PROJECT):
-            return PROJECT
-        return nodeid if nodeid.startswith(PAGES) else nodeid.partition("::")[0]
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
-    """One that begins with the longest files, not with those of most tests."""
-    config.option.loadscopereorder = False
-    return Scheduling(config, log)
 
 
 def _why_no_postgres() -> str:
