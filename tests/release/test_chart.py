@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def objects_of(values: dict[str, Any]) -> list[dict[str, Any]]:
-    texts = [text for path, text in rendered(values).items() if path.endswith(".yaml")]
+@cache
+def files_of(variant: str) -> dict[str, str]:
+    return rendered(VARIANTS[variant])
+
+
+@cache
+def objects_of(variant: str) -> list[dict[str, Any]]:
+    texts = [text for path, text in files_of(variant).items() if path.endswith(".yaml")]
     return [one for text in texts for one in yaml.safe_load_all(text) if one is not None]
 
 
@@ -65,9 +72,9 @@ def test_helm_finds_nothing_wrong() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("values", VARIANTS.values(), ids=VARIANTS)
-def test_what_is_rendered_is_valid(values: dict[str, Any]) -> None:
-    found = objects_of(values)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_is_rendered_is_valid(variant: str) -> None:
+    found = objects_of(variant)
     for one in found:
         kubernetes_validate.validate(one, KUBERNETES, strict=True)
         assert one["metadata"]["namespace"] == "placerec"
@@ -76,24 +83,24 @@ def test_what_is_rendered_is_valid(values: dict[str, Any]) -> None:
     assert not {"Namespace", "Secret"} & {kind for kind, _ in names}, "passwords would stand in the release"
 
 
-@pytest.mark.parametrize("values", VARIANTS.values(), ids=VARIANTS)
-def test_the_service_knows_its_variables(values: dict[str, Any]) -> None:
-    found = objects_of(values)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_service_knows_its_variables(variant: str) -> None:
+    found = objects_of(variant)
     (told,) = (one["data"] for one in found if one["kind"] == "ConfigMap" and one["metadata"]["name"] == "placerec")
     (service,) = (one for one in containers_of(found) if one["name"] == "placerec")
     assert settings_in({**told, **{one["name"]: one for one in service["env"]}}) <= set(Settings.model_fields)
 
 
-@pytest.mark.parametrize("values", VARIANTS.values(), ids=VARIANTS)
-def test_the_notes_make_the_secrets_that_pods_wait_for(values: dict[str, Any]) -> None:
-    notes = rendered(values)["NOTES.txt"].replace("\\\n", " ")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_notes_make_the_secrets_that_pods_wait_for(variant: str) -> None:
+    notes = files_of(variant)["NOTES.txt"].replace("\\\n", " ")
     made = {
         (name, key)
         for name, keys in re.findall(r"create secret generic (\S+) (.*)", notes)
         for key in re.findall(r"--from-literal=(\w+)=", keys)
     }
-    assert secrets_of(objects_of(values)) <= made
-    assert {name for name, _ in made} == {name for name, _ in secrets_of(objects_of(values))}
+    assert secrets_of(objects_of(variant)) <= made
+    assert {name for name, _ in made} == {name for name, _ in secrets_of(objects_of(variant))}
 
 
 @pytest.mark.parametrize(
@@ -112,21 +119,21 @@ def test_the_notes_make_the_secrets_that_pods_wait_for(values: dict[str, Any]) -
     ],
 )
 def test_what_is_left_out_is_nowhere(variant: str, word: str) -> None:
-    def words(values: dict[str, Any]) -> str:
-        texts = (yaml.safe_dump(one) for one in objects_of(values) if one["kind"] != "NetworkPolicy" or "kind" in word)
+    def words(variant: str) -> str:
+        texts = (yaml.safe_dump(one) for one in objects_of(variant) if one["kind"] != "NetworkPolicy" or "kind" in word)
         return " ".join(" ".join(texts).split()) + " "
 
     shown = word if "metadata" not in word else "serviceName: seaweedfs"
-    assert shown in words({}) and shown not in words(VARIANTS[variant])
+    assert shown in words("defaults") and shown not in words(variant)
 
 
 def test_without_ray_the_service_is_the_image_s_own_program() -> None:
-    (service,) = (one for one in containers_of(objects_of({"ray": NO})) if one["name"] == "placerec")
+    (service,) = (one for one in containers_of(objects_of("without Ray")) if one["name"] == "placerec")
     assert "command" not in service and "args" not in service
 
 
 def test_values_reach_what_they_name() -> None:
-    found = objects_of(VARIANTS["all given"])
+    found = objects_of("all given")
     images = {container["image"] for container in containers_of(found)}
     assert "registry.example.org/placerec:1" in images and "placerec:cluster" not in images
     by_name = {(one["kind"], one["metadata"]["name"]): one for one in found}

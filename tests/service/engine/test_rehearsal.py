@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,12 @@ CACHE = "[cache] "
 
 @pytest.mark.thorough
 @pytest.mark.timeout(600)  # of a slow machine whose cache is empty
-def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_first_request_compiles_or_loads_a_loop_or_needs_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the image ``slim``, which has no torch: nothing loads it that does not need it."""
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")  # what it tells is there when a request is answered
     server = Server(tmp_path, {"rehearsal": True}, forked=False)
@@ -34,27 +40,11 @@ def test_no_first_request_compiles_or_loads_a_loop(tmp_path: Path, monkeypatch: 
             prepare()(0)
             jobs = server.client.get("/v1/jobs").raise_for_status().json()["items"]
             assert all(job["state"] == "succeeded" for job in jobs), name
+            assert "Traceback" not in server.log_file.read_text(), name
             if new := loops(server)[before:]:
                 later[name] = new
         assert later == {}
         assert {job["kind"] for job in jobs} == {"align", "prune"}
-    finally:
-        server.kill()
-
-
-@pytest.mark.thorough
-@pytest.mark.timeout(600)
-def test_a_service_without_torch_enrols_and_recognizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in the image ``slim``: nothing loads torch that does not need it."""
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    server = Server(tmp_path, {"rehearsal": True}, forked=False)
-    try:
-        server.wait(seconds=500)
-        enrol(server.client)
-        for name, prepare in kinds(server.client).items():
-            prepare()(0)
-            assert "Traceback" not in server.log_file.read_text(), name
         assert server.client.get("/readyz").json()["status"] == "ready"
     finally:
         server.kill()

@@ -52,7 +52,7 @@ def do(line: str, folder: Path, url: str) -> str:
     return done.stdout
 
 
-@pytest.mark.thorough
+@pytest.mark.soak
 @pytest.mark.timeout(1200)
 def test_a_robot_that_is_carried_off_drives_on(service: Server, tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{service.port}"

@@ -10,7 +10,6 @@ from core.errors import InvalidGroundTruth, InvalidTraverse
 from lab.evaluation.data.datasets import find_dataset, open_dataset
 from lab.evaluation.data.layouts import existing
 from lab.evaluation.data.poses import near
-from lab.evaluation.data.presets import DATASETS
 from lab.evaluation.data.truth_files import read_positions
 from tests.lab.evaluation.data import trees
 from tests.lab.evaluation.data.trees import Build
@@ -141,13 +140,6 @@ EXACT = {
     "corridor": [5, 6],
 }
 """The true references of query 5 where they are not the fifth alone; sets of one drive have another test."""
-
-
-def test_every_layout_has_a_tree() -> None:
-    """Those of nordland.2760 have a test of their own: their queries are fewer."""
-    every = {(dataset.name, layout.publisher) for dataset in DATASETS for layout in dataset.layouts}
-    assert every - TREES.keys() == {("nordland.2760", name) for name in ("VPR-Bench", "GSV-Cities", VG)}
-    assert TREES.keys() <= every
 
 
 @pytest.mark.thorough

@@ -239,15 +239,6 @@ def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_same_comparison_same_bytes(tmp_path: Path, written: Written) -> None:
-    write_report(tmp_path, written.comparison)
-    first, second = (
-        {path.name: path.read_bytes() for path in folder.iterdir()} for folder in (tmp_path, written.folder)
-    )
-    assert first == second
-
-
-@pytest.mark.thorough
 def test_failure_while_it_is_made_writes_nothing(tmp_path: Path) -> None:
     def regions(path: Path) -> None:
         raise RuntimeError(path.name)
