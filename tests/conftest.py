@@ -20,19 +20,25 @@ settings.register_profile("any machine", deadline=None, suppress_health_check=[H
 settings.load_profile("any machine")
 
 LONGEST = (
+    "tests/core/storage/files/test_failed_sync.py",
+    "tests/service/upkeep/",
     "tests/service/places/",
     "tests/service/commands/",
-    "tests/service/console/",
-    "tests/core/storage/files/test_failed_sync.py",
-    "tests/service/sessions/test_sessions.py",
-    "tests/service/upkeep/",
     "tests/lab/evaluation/report/",
+    "tests/lab/training/",
+    "tests/service/console/",
     "tests/clients/",
+    "tests/service/sessions/test_sessions.py",
     "tests/service/engine/",
     "tests/benchmarks/",
-    "tests/lab/training/",
+    "tests/fuzz/",
+    "tests/core/cluster/",
+    "tests/durability/",
 )
-"""Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end."""
+"""Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end.
+
+Beside the first ones .ci/run checks types, so that those that wait for a browser or a robot come later.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
 from benchmarks.day.robots import Asking, Mode, Verify
-from benchmarks.day.situations import SITUATIONS, moments
+from benchmarks.day.situations import SITUATIONS, Moment, moments
 from benchmarks.day.walks import WalkPair, drawn
 from placerec_client import Client
 from tests.service.server import Server
@@ -100,3 +101,33 @@ def test_a_session_goes_on_after_a_restart(day: Day) -> None:
     told = day.drive("odometry", "restart")
     assert told.again == 0
     assert told.count("right") == len(told.outcomes)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", SITUATIONS)
+def test_a_situation_is_the_same_each_time(walk: WalkPair, name: str) -> None:
+    first, second = (list(moments(SITUATIONS[name], walk, 0.1)) for _ in range(2))
+    assert first == second
+    seconds = [moment.second for moment in first]
+    assert len(first) > 1
+    assert np.allclose(np.diff(seconds), 1 / SITUATIONS[name].rate)
+    assert all(bool(moment.right) == (moment.aside == 0) for moment in first)
+
+
+def _ways(way: list[Moment]) -> tuple[np.ndarray, np.ndarray]:
+    """How far each frame is from the one before, in truth and by the wheels, in metres."""
+    truth = np.array([[moment.pose.x, moment.pose.y] for moment in way])
+    wheels = np.array([[moment.wheels.x, moment.wheels.y] for moment in way])
+    return tuple(np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (truth, wheels))
+
+
+@pytest.mark.parametrize("name", ["passing", "reverse", "stop and go", "leaving and coming back", "pace 0.3"])
+def test_wheels_measure_how_far_a_robot_goes(walk: WalkPair, name: str) -> None:
+    truth, wheels = _ways(list(moments(SITUATIONS[name], walk)))
+    assert np.allclose(wheels, truth, rtol=0.1)
+
+
+def test_wheels_do_not_notice_that_a_robot_is_carried(walk: WalkPair) -> None:
+    truth, wheels = _ways(list(moments(SITUATIONS["carried off"], walk, SHORT)))
+    assert truth.max() > 10
+    assert wheels[truth.argmax()] == 0

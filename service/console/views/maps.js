@@ -9,6 +9,7 @@ import { mapPath } from "../shared/map_path.js";
 import { MapSettings } from "../shared/map_settings.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href } from "../shared/router.js";
+import { NOT_SAVED, SAVED } from "../shared/saved.js";
 import { html, useState } from "../shared/view.js";
 
 export default function Maps() {

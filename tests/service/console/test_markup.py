@@ -276,7 +276,9 @@ def test_texts_of_robots(admin: Operator) -> None:
     known: dict[str, Any] = {"verdict": "unknown", "pose": None, "recognized_at": None, "last_at": AT, "lost_since": AT}
     known |= {"verdicts": [], "answers": 1} | dict.fromkeys(names) | {"map": LAB}
     robots = [known | {name: MARKUP} for name in names]
-    told = {"at": "2026-11-20T10:01:00Z", "maps": [], "robots": robots, "alarms": []}
+    lost = {"map": LAB, "name": MARKUP, "session": MARKUP, "camera": MARKUP, "place": MARKUP, "raised": True}
+    lost |= {"since": AT, "cleared_at": None, "last_at": AT}
+    told = {"at": "2026-11-20T10:01:00Z", "maps": [], "robots": robots, "alarms": [], "lost": [lost]}
     admin.page.route("**/v1/fleet", lambda route: route.fulfill(json=told))
     for view in ("robots", "home"):
         page = admin.go(view)
