@@ -29,6 +29,8 @@ class RecordedFrame:
     embedded: whether the timestamp, and the pose unless there is one, are those of the EXIF data of its bytes, which
         ``described`` reads.
     segment: from 1: a part of its recording, which is a traverse of its own, for its coordinates are.
+    local: where it was taken in the coordinates of its segment alone, if it has no pose for that; frames of one segment
+        are compared by it, and it is stored nowhere.
     """
 
     id: str
@@ -39,6 +41,7 @@ class RecordedFrame:
     nanoseconds: int | None = None
     embedded: bool = False
     segment: int = 1
+    local: Pose | None = None
 
     def described(self, data: bytes | None = None, with_zeros: bool = False) -> RecordedFrame:
         """The frame with the pose and the time in its bytes, if that is where they are.

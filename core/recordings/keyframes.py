@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from core.places import Pose
 from core.recordings.frame import NANOSECONDS, RecordedFrame
 
 Describe = Callable[[RecordedFrame], NDArray[np.float32] | None]
@@ -69,6 +70,7 @@ def keyframes(
     """The first frame and then each that is far enough from the keyframe before it.
 
     A frame is judged by the measures that are known of it and of the keyframe; a frame without any is left out.
+    Metres and degrees are those within a segment: its first frame that has them is far from those before.
     The pose and the time of a keyframe are read if its bytes have them.
 
     Args:
@@ -132,10 +134,10 @@ def pose_noise(frames: Sequence[RecordedFrame]) -> float:
     waits or drives: the median of such differences, whose coordinates have six times the variance.  A second, for
     poses between those of a receiver are interpolated.  0 if there are few poses.
     """
-    poses = [frame.pose for frame in frames if frame.pose is not None]
+    poses = [pose for frame in frames if (pose := _pose(frame)) is not None]
     if len(poses) < LEAST_POSES or len({pose.kind() for pose in poses}) > 1:
         return 0.0
-    times = [frame.nanoseconds for frame in frames if frame.pose is not None and frame.nanoseconds is not None]
+    times = [frame.nanoseconds for frame in frames if _pose(frame) is not None and frame.nanoseconds is not None]
     step = float(np.median(np.diff(times))) if len(times) > 1 else float(NANOSECONDS)
     second = int(np.clip(round(NANOSECONDS / max(step, 1.0)), 1, len(poses) // 3))
     positions = np.array([pose.position() for pose in poses])
@@ -144,8 +146,9 @@ def pose_noise(frames: Sequence[RecordedFrame]) -> float:
 
 
 def _judgeable(frame: RecordedFrame, descriptor: NDArray[np.float32] | None, spacing: Spacing) -> bool:
-    heading = None if frame.pose is None else frame.pose.heading
-    known = (frame.pose, heading, frame.nanoseconds, descriptor)
+    pose = _pose(frame)
+    heading = None if pose is None else pose.heading
+    known = (pose, heading, frame.nanoseconds, descriptor)
     wanted = (spacing.metres, spacing.degrees, spacing.seconds, spacing.change)
     return any(fact is not None and measure is not None for fact, measure in zip(known, wanted, strict=True))
 
@@ -176,18 +179,24 @@ def _is_far(
     )
 
 
+def _pose(frame: RecordedFrame) -> Pose | None:
+    """Where a frame lies among those of its segment."""
+    return frame.local if frame.pose is None else frame.pose
+
+
 def _metres(one: RecordedFrame, other: RecordedFrame) -> float | None:
-    """Between two frames; endless if the pose of one is in metres and that of the other in degrees."""
-    if one.pose is None or other.pose is None:
+    """Between two frames of a segment; endless if the pose of one is in metres and that of the other in degrees."""
+    first, second = _pose(one), _pose(other)
+    if first is None or second is None or one.segment != other.segment:
         return None
-    if one.pose.kind() != other.pose.kind():
+    if first.kind() != second.kind():
         return float("inf")
-    return float(np.linalg.norm(one.pose.position() - other.pose.position()))
+    return float(np.linalg.norm(first.position() - second.position()))
 
 
 def _degrees(one: RecordedFrame, other: RecordedFrame) -> float | None:
-    headings = [None if frame.pose is None else frame.pose.heading for frame in (one, other)]
-    if headings[0] is None or headings[1] is None:
+    headings = [None if (pose := _pose(frame)) is None else pose.heading for frame in (one, other)]
+    if headings[0] is None or headings[1] is None or one.segment != other.segment:
         return None
     return abs((headings[0] - headings[1] + 180) % 360 - 180)
 

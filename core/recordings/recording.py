@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.clocks import is_ahead, time_text
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory, UnsupportedFormat
@@ -22,6 +23,9 @@ from core.recordings.trajectory import JudgedTrajectory
 from core.recordings.trajectory_files import read_trajectory
 from core.recordings.video import SUFFIXES as VIDEOS
 from core.recordings.video import Video
+
+MOST_NAMED = 8
+"""Parts that one remark names."""
 
 LARGEST_GAP = 1.5
 """Seconds between two known poses between which a pose is interpolated; a satellite receiver gives one a second."""
@@ -258,11 +262,12 @@ def _place(recording: Recording, judged: JudgedTrajectory, largest_gap: float, b
         )
     recording.remarks += judged.remarks
     if elsewhere.any():
-        names = sorted({f"~{one}" for one in segments[elsewhere].tolist()} - {"~1"}, key=len)
+        having, lacking = (_parts(segments[some]) for some in (~elsewhere, elsewhere))
         recording.remarks.append(
-            f"{elsewhere.sum()} of {len(frames)} frames are of a part whose coordinates begin anew: they get no pose. "
-            f"Each part is a traverse of its own, whose name ends with {', '.join(names) or '~2'}; an alignment "
-            "finds which of its frames show places of another one."
+            f"{elsewhere.sum()} of {len(frames)} frames are of a part whose coordinates are others: they get no pose. "
+            f"Each part is a traverse of its own, and the name of a later one ends with its number. Poses are those of "
+            f"{having}; there are none of {lacking}, whose frames are compared by its own coordinates until they are "
+            "enrolled. An alignment finds which of them show places of another part."
         )
     if lost.any():
         recording.lost, recording.lost_by = int(lost.sum()), judged.remarks
@@ -272,10 +277,21 @@ def _place(recording: Recording, judged: JudgedTrajectory, largest_gap: float, b
             f"{missing} of {len(frames)} frames get no pose: they lie before the first or after the last known pose, "
             f"or in a gap of more than {largest_gap:g} s."
         )
+    local = judged.local.at(times, largest_gap) if elsewhere.any() else [None] * len(frames)
     recording.frames = [
-        replace(frame, pose=pose, segment=segment)
-        for frame, pose, segment in zip(frames, found, segments.tolist(), strict=True)
+        replace(frame, pose=pose, segment=segment, local=within if other else None)
+        for frame, pose, segment, within, other in zip(
+            frames, found, segments.tolist(), local, elsewhere.tolist(), strict=True
+        )
     ]
+
+
+def _parts(segments: NDArray[np.int64]) -> str:
+    """Some parts of a recording in their order, as the names of their traverses end, the first few of many."""
+    numbers = np.unique(segments).tolist()
+    names = ["the first one" if number == 1 else f"~{number}" for number in numbers[:MOST_NAMED]]
+    more = len(numbers) - len(names)
+    return ", ".join(names) + (f" and {more} more" if more else "")
 
 
 def _judge_poses(recording: Recording, most_speed: float) -> None:

@@ -145,12 +145,14 @@ class JudgedTrajectory:
     """What of a trajectory can be believed.
 
     trajectory: the samples in one frame of coordinates; there may be none.
+    local: the samples in all frames of coordinates, each in its own.
     told: int64 [m], the times of all samples, also those that are left out, in order.
     begins: int64 [k], the times at which coordinates begin anew.
     remarks: sentences about what is left out.
     """
 
     trajectory: Trajectory
+    local: Trajectory
     told: NDArray[np.int64]
     begins: NDArray[np.int64]
     remarks: list[str]
@@ -188,15 +190,21 @@ class JudgedTrajectory:
         held = order[found.kept[order]]
         segments = found.segment[held]
         begins = times[held[1:]][np.diff(segments) != 0]
-        if held.size:
+        oriented = np.where(found.turned[:, None], quaternions, math.nan)
+
+        def through(samples: NDArray[np.int64]) -> Trajectory:
+            if not samples.size:
+                return Trajectory(times[:0], places[:0], oriented[:0], geographic)
+            return Trajectory.of_samples(
+                times[samples], places[samples], oriented[samples], geographic, found.part[samples]
+            )
+
+        local = through(held)
+        if begins.size:
             sizes = np.bincount(segments)
             largest = int(np.argmax(sizes))
             held = held[segments == (largest if sizes[largest] >= BY_FAR * sizes[segments[0]] else segments[0])]
-        oriented = np.where(found.turned[:, None], quaternions, math.nan)
-        trajectory = Trajectory(times[:0], places[:0], oriented[:0], geographic)
-        if held.size:
-            trajectory = Trajectory.of_samples(times[held], places[held], oriented[held], geographic, found.part[held])
-        return cls(trajectory, np.unique(times), begins, found.remarks)
+        return cls(through(held) if begins.size else local, local, np.unique(times), begins, found.remarks)
 
     def covers(self, nanoseconds: ArrayLike, largest_gap: float) -> NDArray[np.bool_]:
         """Whether there would be poses at some times, bool, were all samples believed."""

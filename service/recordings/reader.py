@@ -105,6 +105,7 @@ class DescribedFrame(BaseModel):
     pose: Pose | None
     nanoseconds: int
     segment: int
+    local: Pose | None
 
 
 class DescribedBag(BaseModel):
@@ -166,6 +167,7 @@ class Reader:
                 utc(one.nanoseconds),
                 one.nanoseconds,
                 segment=one.segment,
+                local=one.local,
             )
             for number, one in enumerate(told.frames)
         ]
@@ -307,6 +309,7 @@ def _main() -> None:
                     pose=one.pose,
                     nanoseconds=one.nanoseconds or 0,
                     segment=one.segment,
+                    local=one.local,
                 )
                 for one in recording.frames
             ],

@@ -16,6 +16,7 @@ from PIL import ExifTags, Image
 
 from core.errors import InvalidTrajectory
 from core.recordings import Poses, Recording, open_recording
+from core.recordings.keyframes import Left, Spacing, keyframes
 from core.recordings.paths import check_lost_poses, traverse_of, way_of
 from core.recordings.plausibility import Source, judge
 from core.recordings.trajectory import JudgedTrajectory
@@ -220,6 +221,30 @@ def test_frames_behind_a_restart_are_a_traverse_of_their_own(tmp_path: Path) -> 
         check_lost_poses(recording)
 
 
+@pytest.mark.parametrize("source", SOURCES)
+def test_keyframes_of_each_part_are_chosen_by_its_own_odometry(source: str, tmp_path: Path) -> None:
+    path, poses = SOURCES[source](walked(restart), tmp_path)
+    with open_recording(path, poses=poses) as recording:
+        left = Left()
+        chosen = list(keyframes(recording.frames, Spacing(metres=4), left=left))
+        taken = [(one.nanoseconds - START) // SECOND for one in chosen if one.nanoseconds is not None]
+    assert set(np.diff([one for one in taken if one < 10])) == {4}
+    assert set(np.diff([one for one in taken if one >= 10])) == {4} and left.unjudged <= 2
+    assert [one.pose is None for one in chosen] == [one >= 10 for one in taken], (
+        "no pose of other coordinates is stored"
+    )
+
+
+def test_the_remark_says_which_parts_have_poses_in_their_order(tmp_path: Path) -> None:
+    samples = walked(clean)
+    for sample in samples:
+        sample.x += 90 * (sample.number // 17)
+    path, poses = bag(samples, tmp_path)
+    with open_recording(path, poses=poses) as recording:
+        told = recording.remarks[-1]
+    assert "Poses are those of the first one; there are none of ~2, ~3, ~4, ~5, ~6, ~7, ~8, ~9 and 3 more" in told
+
+
 def test_the_long_part_behind_an_early_restart_has_the_poses(tmp_path: Path) -> None:
     samples = walked(clean)
     for sample in samples[:25]:
@@ -228,6 +253,7 @@ def test_the_long_part_behind_an_early_restart_has_the_poses(tmp_path: Path) -> 
     with open_recording(path, poses=poses) as recording:
         assert [one.segment for one in recording.frames] == [1] * 3 + [2] * 17
         assert [one.pose is not None for one in recording.frames] == [False] * 3 + [True] * 17
+        assert "Poses are those of ~2; there are none of the first one" in recording.remarks[-1]
 
 
 def test_more_than_a_tenth_of_lost_poses_is_refused(tmp_path: Path) -> None:

@@ -16,7 +16,16 @@ from core.errors import InvalidRecording, UnknownTopic
 from core.recordings import Recording
 from service.recordings import reader as reading
 from service.recordings.reader import Order, Reader
-from tests.core.recordings.bags import walk, write_mcap, write_rosbag2
+from tests.core.recordings.bags import (
+    ODOMETRY,
+    SECOND,
+    START,
+    compressed,
+    moved,
+    walk,
+    write_mcap,
+    write_rosbag2,
+)
 
 MOST = 1 << 20
 
@@ -58,6 +67,15 @@ def test_frames_come_as_they_are_in_the_bag_and_no_further_than_is_wanted(tmp_pa
         assert all(data.startswith(b"\xff\xd8\xff") for data in whole) and recording.frames[2].load() == whole[2]
     with read_apart(order(bag, most=100)) as recording:
         assert recording.frames[1].load() == whole[1][:100]
+
+
+def test_frames_of_a_later_part_come_with_its_own_odometry(tmp_path: Path) -> None:
+    seen = [compressed(START + n * SECOND, b"%d" % n) for n in range(4)]
+    told = [moved(START + n * SECOND // 10, n - 20.0 * (n >= 20), 0.0) for n in range(40)]
+    bag = write_mcap(tmp_path / "anew.mcap", [*seen, *told])
+    with read_apart(order(bag).model_copy(update={"pose_topic": ODOMETRY})) as recording:
+        assert [one.pose and one.pose.x for one in recording.frames] == [0, 10, None, None]
+        assert [one.local and one.local.x for one in recording.frames] == [None, None, 0, 10]
 
 
 @pytest.mark.thorough
