@@ -1,13 +1,13 @@
 """A folder of pictures: those that its ``places.csv`` lists, in that order, or all, in natural order.
 
-Poses are those of the list; without one, those in the names of the files (:mod:`core.recordings.pose_names`) if all
-have that form; else those of the EXIF data.
+Poses are those of the list; without one, those in the names of the files (:mod:`core.recordings.pose_names`) if more
+than half have that form; else those of the EXIF data.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -27,6 +27,9 @@ from core.recordings.pose_names import NamedPose, named_pose
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 COLUMNS = ("file", "id", *POSE, "timestamp")
+MOST_NAMED = 3
+"""Files whose names say no pose that one remark names."""
+
 JPEG, LONGEST_HEAD = b"\xff\xd8\xff", 128 << 10
 """The first bytes of a JPEG file, and how many are read for its EXIF data, of which there are 64 KiB at most."""
 
@@ -56,12 +59,27 @@ class _Found(NamedTuple):
     line: int | None = None
 
 
-def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> tuple[list[RecordedFrame], list[str]]:
+class FolderFrames(NamedTuple):
+    """The frames of a directory.
+
+    remarks: sentences about them that a user must know.
+    lost: how many names say no pose, although poses are those in the names.
+    lost_by: a sentence that names the first of these, which is a remark, too; there may be none.
+    """
+
+    frames: list[RecordedFrame]
+    remarks: list[str]
+    lost: int = 0
+    lost_by: Sequence[str] = ()
+
+
+def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> FolderFrames:
     """The frames of a directory, and remarks on them; a frame has its name as its id if no id can be made of it.
 
     Args:
         prefix: of the ids that are made from file names.
-        by_names: whether poses are those in the names, also if there is a list, or not all names have one.
+        by_names: whether poses are those in the names, also if there is a list, or few names have one; names of other
+            forms are not counted as lost then.
 
     Raises:
         InvalidTraverse: the directory has neither a list nor an image; the list is malformed or names a missing file;
@@ -69,6 +87,7 @@ def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> 
     """
     listed = directory / FILE_NAME
     remarks: list[str] = []
+    lost, lost_by = 0, ""
     if listed.is_file() and not by_names:
         found = list(_listed_frames(listed, prefix))
         if not found:
@@ -79,10 +98,13 @@ def folder_frames(directory: Path, prefix: str = "", by_names: bool = False) -> 
     else:
         images = find_images(directory)
         poses = _named_poses(images, by_names, remarks)
+        if any(poses):
+            lost, lost_by = _without_pose(images, by_names)
+            remarks += [lost_by] if lost_by else []
         frames = [_frame(path, prefix, pose) for path, pose in zip(images, poses, strict=True)]
         found = [_Found(path, _described(path, frame)) for path, frame in zip(images, frames, strict=True)]
     _check_ids(found)
-    return [one.frame for one in found], remarks
+    return FolderFrames([one.frame for one in found], remarks, lost, [lost_by] if lost else [])
 
 
 def _frame(path: Path, prefix: str, pose: NamedPose | None) -> RecordedFrame:
@@ -92,7 +114,7 @@ def _frame(path: Path, prefix: str, pose: NamedPose | None) -> RecordedFrame:
 
 
 def _named_poses(images: list[Path], wanted: bool, remarks: list[str]) -> list[NamedPose | None]:
-    """The poses in the names of some pictures; none of all if they are not wanted and a name has not their form.
+    """The poses in the names of some pictures; none of all if they are not wanted and half of the names have none.
 
     Raises:
         InvalidTraverse: they are wanted, and no name has one; or they are of several zones.
@@ -103,12 +125,15 @@ def _named_poses(images: list[Path], wanted: bool, remarks: list[str]) -> list[N
         raise InvalidTraverse(
             f"No file name of {images[0].parent} says a pose, as @east@north@…@heading@…@.jpg does: leave out --poses."
         )
-    if not wanted and (not posed or None in found):
+    few = 2 * found.count(None) >= len(images)
+    if not wanted and (not posed or few):
         if posed:
             remarks.append(
                 f"{len(posed)} of {len(images)} file names say a pose (@east@north@…), and the others do not: poses "
                 "are those of EXIF data; with --poses names they are those of the names."
             )
+        elif not few and (said := _without_pose(images, True)[1]):
+            remarks.append(f"{said} Poses are those of EXIF data.")
         return [None] * len(images)
     zones = sorted({one.zone for one in found if one is not None and one.zone})
     if len(zones) > 1:
@@ -122,6 +147,23 @@ def _named_poses(images: list[Path], wanted: bool, remarks: list[str]) -> list[N
         f"of {len(images)} frames have one, {headed} with a heading."
     )
     return [NamedPose(None) if one is None else one for one in found]
+
+
+def _without_pose(images: list[Path], wanted: bool) -> tuple[int, str]:
+    """How many names say no pose by mistake, and a sentence on the first ones that say none; "" if each has its form.
+
+    Args:
+        wanted: whether names of other forms are no mistake.
+    """
+    faults = []
+    lost = 0
+    for path in images:
+        found = named_pose(path.name)
+        if found is None or found.fault:
+            faults.append(f"{path.name} ({'another form' if found is None else found.fault})")
+            lost += found is not None or not wanted
+    named = ", ".join(faults[:MOST_NAMED]) + (", …" if len(faults) > MOST_NAMED else "")
+    return lost, f"{len(faults)} of {len(images)} file names say no pose that can be: {named}." if faults else ""
 
 
 def _check_ids(found: list[_Found]) -> None:

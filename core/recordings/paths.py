@@ -34,8 +34,8 @@ def check_lost_poses(recording: Recording, remarked: bool = False) -> None:
         reasons = ", for what is remarked above." if remarked else f": {' '.join(recording.lost_by)}"
         raise InvalidTrajectory(
             f"{recording.lost} of {count} frames lose their pose, more than a tenth{reasons} "
-            "Nothing is enrolled. --allow-lost-poses enrols such frames without a pose; --most-speed says how fast the "
-            "vehicle can be."
+            "Nothing is enrolled. --allow-lost-poses enrols such frames without a pose; where poses leap, --most-speed "
+            "says how fast the vehicle can be."
         )
 
 

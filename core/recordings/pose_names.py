@@ -17,6 +17,8 @@ from core.places import Pose
 FIELDS = 14
 """The fields of a whole name; a short one has but the first of them."""
 
+NUMBERS = ("east", "north", "latitude", "longitude", "heading")
+
 
 @dataclass(frozen=True)
 class NamedPose:
@@ -25,10 +27,12 @@ class NamedPose:
     pose: in metres, with the heading counter-clockwise from east; in degrees where the name has no metres; None where
         it has neither.
     zone: of UTM, with N or S for the half of the Earth; "" if it is not known, or does not matter.
+    fault: why what stands there is no pose, as the rest of a sentence; "" if nothing is wrong.
     """
 
     pose: Pose | None
     zone: str = ""
+    fault: str = ""
 
 
 def named_pose(name: str) -> NamedPose | None:
@@ -39,19 +43,24 @@ def named_pose(name: str) -> NamedPose | None:
     fields += [""] * (FIELDS - len(fields))
     east, north, number, letter, latitude, longitude, _, _, heading, *_ = (field.strip() for field in fields)
     try:
-        for field in (east, north, latitude, longitude, heading):
-            check_numeral(field or "0")
+        for what, field in zip(NUMBERS, (east, north, latitude, longitude, heading), strict=True):
+            try:
+                check_numeral(field or "0")
+            except ValueError as error:
+                return NamedPose(None, fault=f"{what} {error}")
         angle = float(heading) if heading else None
         if angle is not None and not -360 <= angle <= 360:
-            return None
+            return NamedPose(None, fault=f"heading {heading} is not within -360 to 360")
         if east and north:  # a heading beside metres is counter-clockwise from x, which is east
             turned = {} if angle is None else {"heading": (90 - angle) % 360}
             return NamedPose(Pose.model_validate({"x": east, "y": north, **turned}), _zone(number, letter))
         if latitude and longitude:
             turned = {} if angle is None else {"heading": angle}
             return NamedPose(Pose.model_validate({"latitude": latitude, "longitude": longitude, **turned}))
-    except (ValidationError, ValueError):
-        return None
+    except ValidationError as error:
+        (fault, *_) = error.errors()
+        place = ".".join(map(str, fault["loc"]))
+        return NamedPose(None, fault=f"{place}: {fault['msg'].removeprefix('Value error, ')}")
     return NamedPose(None)
 
 

@@ -208,8 +208,8 @@ def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
 
 
 def _open_folder(path: Path, prefix: str, by_names: bool) -> Recording:
-    frames, remarks = folder_frames(path, prefix, by_names)
-    return Recording(path.resolve().name, frames, remarks)
+    found = folder_frames(path, prefix, by_names)
+    return Recording(path.resolve().name, found.frames, found.remarks, lost=found.lost, lost_by=list(found.lost_by))
 
 
 def _open_video(path: Path) -> Recording:
@@ -266,11 +266,11 @@ def _place(recording: Recording, judged: JudgedTrajectory, largest_gap: float, b
         recording.remarks.append(
             f"{elsewhere.sum()} of {len(frames)} frames are of a part whose coordinates are others: they get no pose. "
             f"Each part is a traverse of its own, and the name of a later one ends with its number. Poses are those of "
-            f"{having}; there are none of {lacking}, whose frames are compared by its own coordinates until they are "
-            "enrolled. An alignment finds which of them show places of another part."
+            f"{having}; there are none of {lacking}, where keyframes are chosen by coordinates that are not stored. "
+            "An alignment finds which of its frames show places of another part."
         )
+    recording.lost, recording.lost_by = int(lost.sum()), judged.remarks if lost.any() else []
     if lost.any():
-        recording.lost, recording.lost_by = int(lost.sum()), judged.remarks
         recording.remarks.append(f"{lost.sum()} of {len(frames)} frames lose their pose by what is left out.")
     if missing:
         recording.remarks.append(
@@ -321,4 +321,4 @@ def _judge_poses(recording: Recording, most_speed: float) -> None:
             frames[at] = replace(frames[at], pose=None)
             recording.lost += 1
         recording.lost_by += judgement.remarks
-    recording.remarks += recording.lost_by
+        recording.remarks += judgement.remarks

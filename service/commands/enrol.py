@@ -152,11 +152,11 @@ def enrol(
     """Enrol the frames of a recording, in their order, as places of a map.
 
     A directory of images is taken in natural order. Poses come from places.csv in it
-    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the file names if all are
-    of the form @east@north@…@heading@…@.jpg, or else from the EXIF data of the images; ids are the file names without
-    their extension. The frames of a bag are taken in the order of their header
-    stamps, of which their ids are made; those of a video are numbered. Of both, frames that show what the one before
-    shows, as where the robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
+    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the file names if more
+    than half are of the form @east@north@…@heading@…@.jpg, or else from the EXIF data of the images; ids are the file
+    names without their extension. The frames of a bag are taken in the order of their header stamps, of which their
+    ids are made; those of a video are numbered. Of both, frames that show what the one before shows, as where the
+    robot stood, are left out. A frame that is neither JPEG nor PNG nor WebP is sent as PNG.
     The command can be interrupted and run again: a frame that is already enrolled is not sent again. Where the map has
     places of other frames under these ids, nothing is sent, unless they are to be replaced.
     """

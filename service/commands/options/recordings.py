@@ -64,7 +64,7 @@ PosesFrom = Annotated[
     typer.Option(
         "--poses",
         help="Of a folder: take poses from the file names (@east@north@…@heading@…@.jpg), as is done without being "
-        "told where all have that form and there is no places.csv.",
+        "told where more than half have that form and there is no places.csv.",
         rich_help_panel=PANEL,
     ),
 ]

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import InvalidRecording, InvalidTraverse
+from core.errors import InvalidRecording, InvalidTrajectory, InvalidTraverse
 from core.places import Pose
 from core.recordings import Poses, open_recording
+from core.recordings.paths import check_lost_poses
 from core.recordings.pose_names import named_pose
 from tests.service.scenes import jpeg
 
@@ -41,13 +42,72 @@ def test_a_name_says_where_its_picture_was_taken(name: str, pose: Pose | None, z
     assert found is not None and (found.pose, found.zone) == (pose, zone)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["a.jpg", "@.jpg", "@1@.jpg", "x@1@2@.jpg", "@a@2@.jpg", "@1_0@2@.jpg", "@nan@2@.jpg", "@1e10@2@.jpg",
-     NEAR.format("361"), NEAR.format("north")],
-)  # fmt: skip
+@pytest.mark.parametrize("name", ["a.jpg", "@.jpg", "@1@.jpg", "x@1@2@.jpg"])
 def test_other_names_say_nothing(name: str) -> None:
     assert named_pose(name) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("@a@2@.jpg", "east 'a' is not a number"),
+        ("@1_0@2@.jpg", "east '1_0' is not a number"),
+        ("@1@nan@.jpg", "north 'nan' is not a number"),
+        ("@1e10@2@.jpg", "x: "),
+        ("@@@10@S@91@2@@@@@@@@.jpg", "latitude: "),
+        (NEAR.format("361"), "heading 361 is not within -360 to 360"),
+        (NEAR.format("north"), "heading 'north' is not a number"),
+    ],
+)
+def test_a_name_whose_pose_cannot_be_says_why(name: str, fault: str) -> None:
+    found = named_pose(name)
+    assert found is not None and found.pose is None and found.fault.startswith(fault)
+
+
+@pytest.mark.parametrize(
+    ("count", "others", "lost", "told"),
+    [
+        (
+            7,
+            [NEAR.format("390")],
+            1,
+            f"1 of 8 file names say no pose that can be: {NEAR.format('390')} (heading 390 is ",
+        ),
+        (7, ["roof.jpg"], 1, "1 of 8 file names say no pose that can be: roof.jpg (another form)."),
+        (8, [NEAR.format("390"), "@a@2@.jpg", "s.jpg", "t.jpg"], 4, "s.jpg (another form), …"),
+        (15, ["roof.jpg"], 1, "roof.jpg (another form)"),
+    ],
+)
+def test_a_few_bad_names_cost_the_other_poses_nothing(
+    count: int, others: list[str], lost: int, told: str, tmp_path: Path
+) -> None:
+    good = [f"@54816{number}.30@4180910.43@10@S@.jpg" for number in range(count)]
+    with open_recording(folder(tmp_path / "street", *good, *others)) as recording:
+        assert {frame.name for frame in recording.frames if frame.pose is not None} == set(good)
+        assert recording.lost == lost and sum(told in one for one in recording.remarks) == 1, recording.remarks
+        if 10 * lost > count + len(others):
+            with pytest.raises(InvalidTrajectory, match=r"lose their pose.*file names say no pose.*--allow-lost-poses"):
+                check_lost_poses(recording)
+        else:
+            check_lost_poses(recording)
+
+
+def test_names_that_all_say_what_cannot_be_are_remarked(tmp_path: Path) -> None:
+    with open_recording(folder(tmp_path / "street", NEAR.format("390"), NEAR.format("400"))) as recording:
+        (told,) = recording.remarks
+    assert "heading 390" in told and told.endswith("Poses are those of EXIF data.") and recording.lost == 0
+
+
+def test_ordinary_names_of_which_one_has_the_form_say_nothing(tmp_path: Path) -> None:
+    with open_recording(folder(tmp_path / "plain", "@anna@home@.jpg", "b.jpg", "c.jpg")) as recording:
+        assert recording.remarks == [] and recording.lost == 0
+
+
+def test_a_trajectory_gives_poses_whatever_names_say(tmp_path: Path) -> None:
+    street = folder(tmp_path / "street", "@1@1@.jpg", "@2@1@.jpg", "roof.jpg")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    with open_recording(street, poses=Poses(file=tmp_path / "poses.txt")) as recording:
+        assert all(frame.pose is not None for frame in recording.frames) and recording.lost == 0
 
 
 def test_northings_keep_their_centimetres(tmp_path: Path) -> None:
@@ -88,7 +148,7 @@ def test_names_of_which_some_say_nothing_are_used_where_they_are_wanted(tmp_path
         assert "--poses names" in recording.remarks[0]
     with open_recording(street, poses=Poses(names=True)) as recording:
         assert [frame.pose is None for frame in recording.frames] == [False, True]
-        assert "1 of 2 frames have one" in recording.remarks[0]
+        assert "1 of 2 frames have one" in recording.remarks[0] and recording.lost == 0
 
 
 def test_zones_are_not_mixed_and_other_recordings_have_no_names(tmp_path: Path) -> None:
