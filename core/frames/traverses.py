@@ -16,11 +16,13 @@ Truth = list[NDArray[np.int64]]
 """For each query the indices of its true references, ascending; there may be none."""
 
 SUPPORTED_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
-OTHER_SUFFIXES = frozenset(
-    {".avif", ".bmp", ".dib", ".exr", ".gif", ".hdr", ".heic", ".jp2", ".jpe", ".pam", ".pbm", ".pfm", ".pgm", ".pic"}
-    | {".pnm", ".ppm", ".ras", ".sr", ".tif", ".tiff"}
+CONVERTED_SUFFIXES = frozenset(
+    {".avif", ".bmp", ".dib", ".gif", ".jp2", ".jpe", ".pam", ".pbm", ".pgm", ".pnm", ".ppm", ".ras", ".sr", ".tif"}
+    | {".tiff"}
 )
-"""Formats that become PNG on the way.
+"""Formats that become PNG on the way."""
+OTHER_SUFFIXES = CONVERTED_SUFFIXES | {".exr", ".hdr", ".heic", ".pfm", ".pic"}
+"""These, and formats that are refused by name.
 
 Images that cannot be decoded are listed, too: if they were skipped, every index after them would shift.
 """
@@ -72,7 +74,8 @@ def _entries(directory: Path) -> tuple[list[Path], list[Path]]:
 
 def _check_not_empty(images: list[Path], directory: Path) -> None:
     if not images:
-        raise InvalidTraverse(f"{directory} holds no image ({', '.join(sorted(SUPPORTED_SUFFIXES))}).")
+        read = ", ".join([*sorted(SUPPORTED_SUFFIXES), *sorted(CONVERTED_SUFFIXES)])
+        raise InvalidTraverse(f"{directory} holds no image ({read}).")
 
 
 def tolerance_truth(queries: int, references: int, tolerance: int) -> Truth:

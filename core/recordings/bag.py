@@ -53,6 +53,9 @@ LONGEST_TOPIC = 96
 MOST_NAMED = 3
 """Files that are no bag that one remark names."""
 
+MOST_LISTED = 20
+"""Topics that an error lists."""
+
 JUMP_SECONDS, JUMP_STEPS = 60.0, 100.0
 """A clock jumps ahead if it goes on by more than a minute and a hundred times the usual step."""
 
@@ -80,6 +83,12 @@ def bag_files(path: Path) -> list[Path]:
 def _kind_of(path: Path) -> str:
     """The suffix without that of the compression."""
     return Path(path.name.removesuffix(PACKED)).suffix.lower()
+
+
+def _listed(topics: dict[str, Topic]) -> str:
+    """Topics with their types and counts, the first ones of many."""
+    named = [f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in topics.items()]
+    return "; ".join(named[:MOST_LISTED]) + (f"; and {len(named) - MOST_LISTED} more" if named[MOST_LISTED:] else "")
 
 
 class Bag:
@@ -166,8 +175,9 @@ class Bag:
         """
         topics = self.topics
         fitting = {one: topic for one, topic in topics.items() if topic.kind in kinds}
-        listed = "; ".join(f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in fitting.items())
-        there = f"It has these topics of {what}: {listed}." if listed else f"It has no topic of {what}."
+        there = f"It has these topics of {what}: {_listed(fitting)}."
+        if not fitting:
+            there = f"It has these topics: {_listed(topics)}." if topics else "It has no topics at all."
         if videos := ", ".join(f"{one} ({topic.kind})" for one, topic in topics.items() if topic.kind in VIDEO_TYPES):
             there += (
                 f" Videos are not read, as {videos}: republish one as raw or compressed (ros2 run image_transport "
@@ -177,8 +187,12 @@ class Bag:
             filled = [one for one, topic in fitting.items() if topic.messages]
             if len(filled) == 1:
                 return self.choose(filled[0], kinds, what)
-            wish = "Name one with --topic. " if filled else ""
-            raise UnknownTopic(f"{self.path} has {len(filled)} topics of {what} with messages. {wish}{there}")
+            if filled:
+                there = f"Name one with --topic. {there}"
+            count = f"{len(filled)} topics of {what}" if filled else f"no topic of {what}"
+            raise UnknownTopic(f"{self.path} has {count}{' with messages' if fitting else ''}. {there}")
+        if not fitting:
+            there = f"It has no topic of {what}. {there}"
         if name not in topics:
             raise UnknownTopic(f"{self.path} has no topic {name!r}. {there}")
         topic = topics[name]

@@ -455,24 +455,26 @@ class _Words:
             elif not held.size:
                 leaps.append((0, min(1, len(order) - 1)))
             fate = "those headings are left out" if measure.what else "those poses are left out"
-            self.remarks.append(f"{self._leaping(what, order, measure, leaps)}: {fate} ({wrong.size} {unit}).")
+            self.remarks.append(
+                f"{self._leaping(what, order, measure, leaps, int(wrong[0]))}: {fate} ({wrong.size} {unit})."
+            )
         border = np.flatnonzero(np.diff(found.part[held]))
         if border.size:
             leaps = list(zip(held[border], held[border + 1], strict=True))
             on = "and goes on from there: nothing is interpolated across it"
             if not absolute:
                 on = "and goes on from there: it begins anew, in coordinates of its own"
-            self.remarks.append(f"{self._leaping(what, order, measure, leaps)} {on}.")
+            self.remarks.append(f"{self._leaping(what, order, measure, leaps, int(leaps[0][1]))} {on}.")
 
-    def _leaping(self, what: str, order: Integers, measure: _Measure, leaps: list[tuple[int, int]]) -> str:
-        """A sentence, without its end, on leaps between pairs of samples."""
+    def _leaping(self, what: str, order: Integers, measure: _Measure, leaps: list[tuple[int, int]], begin: int) -> str:
+        """A sentence, without its end, on leaps between pairs of samples, of which ``begin`` is the first one meant."""
         one, other = (np.array(side, np.int64) for side in zip(*leaps, strict=True))
         size = measure.apart(one, other)
         largest = int(np.argmax(size))
         seconds = float(measure.seconds[other[largest]] - measure.seconds[one[largest]])
         times = "once" if len(leaps) == 1 else f"{len(leaps)} times"
         by = "by" if len(leaps) == 1 else "by up to"
-        first = self._at(order[int(other.min())])
+        first = self._at(order[begin])
         return (
             f"{what} leaps {times}, {by} {_number(float(size[largest]))}{measure.unit} within "
             f"{seconds:.3g} s ({'' if len(leaps) == 1 else 'first '}{first})"

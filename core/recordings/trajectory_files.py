@@ -198,7 +198,10 @@ def _numbers(path: Path, number: int, cells: list[str]) -> list[float]:
     Raises:
         InvalidTrajectory: a value is no number at all.
     """
-    try:
-        return [float(cell) for cell in cells]
-    except ValueError as error:
-        raise InvalidTrajectory(f"{path.name}, line {number}: a value is not a finite number.") from error
+    found = []
+    for cell in cells:
+        try:
+            found.append(float(cell))
+        except ValueError as error:
+            raise InvalidTrajectory(f"{path.name}, line {number}: {cell[:80]!r} is not a number.") from error
+    return found

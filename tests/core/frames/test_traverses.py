@@ -49,7 +49,7 @@ def test_equal_numbers_are_ordered_by_spelling() -> None:
 
 
 def test_a_directory_must_exist_and_hold_an_image(tmp_path: Path) -> None:
-    with pytest.raises(InvalidTraverse, match="holds no image"):
+    with pytest.raises(InvalidTraverse, match=r"holds no image \(\.jpeg, .*\.webp, .*\.bmp, .*\.tiff\)"):
         find_images(tmp_path)
     with pytest.raises(InvalidTraverse, match="cannot be read as a directory"):
         find_images(tmp_path / "missing")

@@ -355,6 +355,14 @@ def test_an_excursion_of_a_slow_receiver_costs_its_own_samples_alone() -> None:
     assert np.flatnonzero(~found.kept).tolist() == list(range(60, 65)) and not found.part[found.kept].any()
 
 
+def test_a_leap_at_the_very_start_names_the_first_sample_that_is_left_out() -> None:
+    times, way = START + np.arange(200) * SECOND // RATE, np.arange(200)[:, None] / RATE * [1, 0, 0]
+    way[:3] += [900, 0, 0]
+    found = judge(times, way, None, Source("start"))
+    assert np.flatnonzero(~found.kept).tolist() == [0, 1, 2]
+    assert "leaps once, by 900 m within 0.1 s (at 1700000000.000 s): those poses are left out (3 " in found.remarks[0]
+
+
 def test_the_limit_of_speed_is_a_setting() -> None:
     """An aeroplane."""
     times, way = START + np.arange(100) * SECOND, 240.0 * np.arange(100)[:, None] * [1, 0, 0]

@@ -132,7 +132,7 @@ MATRIX = "1 0 0 0 0 1 0 0 0 0 1 0"
         ("# only a remark\n", "has no pose"),
         ("1 2 3\n", "line 1: 3 values are neither"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", "line 2: there are 7 values, not 8"),
-        ("0 0 0 0 0 0 0 1\n1 0 zero 0 0 0 0 1\n", "line 2: a value is not a finite number"),
+        ("0 0 0 0 0 0 0 1\n1 0 zero 0 0 0 0 1\n", "line 2: 'zero' is not a number"),
         ("0 0 0 nan 0 0 0 1\n", "line 1: a value is not a finite number"),
         ("now 0 0 0 0 0 0 1\n", "line 1: 'now' is not a time in seconds"),
         ("1e30 0 0 0 0 0 0 1\n", "line 1: '1e30' is not a time"),
