@@ -13,11 +13,15 @@ from service.malloc import configure_malloc
 def main() -> None:
     """Run the command line of this process; the entry point ``placerec``."""
     configure_malloc()
-    if sys.argv[1:2] == ["serve"]:
-        from service.commands.serve import alone as application
-    else:
-        from service.commands.application import application
-    application(prog_name="placerec")
+    try:
+        if sys.argv[1:2] == ["serve"]:
+            from service.commands.serve import alone as application
+        else:
+            from service.commands.application import application
+        application(prog_name="placerec")
+    except KeyboardInterrupt:  # before there is a command, which ends with its own words
+        sys.stderr.write("Interrupted.\n")
+        sys.exit(130)
 
 
 __all__ = ["main"]

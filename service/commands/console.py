@@ -51,6 +51,8 @@ class Failure(Exception):
 class Commands(TyperGroup):
     """A group of commands that ends foreseen errors with a message and exit status 1, without a traceback.
 
+    An interrupted one ends with a message, which may be that of the ``KeyboardInterrupt``, and exit status 130.
+
     A command is also refused, with exit status 2, by a name that it had once; the message has its present one.
     """
 
@@ -68,6 +70,9 @@ class Commands(TyperGroup):
         except (Failure, PlacerecError, Fault) as error:
             complain(str(error))
             raise typer.Exit(1) from error
+        except KeyboardInterrupt as error:
+            remark(str(error) or "Interrupted.")
+            raise typer.Exit(130) from error
 
 
 def printable(text: str) -> str:

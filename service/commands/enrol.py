@@ -272,11 +272,11 @@ async def _enrol(
 
             try:
                 await enrol_frames(service, map_id, frames, known, settings["encoder"], report_frame, wanted.replace)
-            except Failure as failure:
-                done = sum(report.changes.values())
-                raise Failure(
-                    f"{failure} {done} of {len(frames)} frames are enrolled; run the command again to continue."
-                ) from failure
+            except (Failure, asyncio.CancelledError) as error:
+                how_far = f"{sum(report.changes.values())} of {len(frames)} frames are enrolled; run the command again"
+                if isinstance(error, Failure):
+                    raise Failure(f"{error} {how_far} to continue.") from error
+                raise KeyboardInterrupt(f"Interrupted: {how_far} to go on.") from error
     return report, len(frames), list(dict.fromkeys(frame.sequence for frame in frames))
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import http.server
 import io
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +21,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from placerec_client.batches import FIRST_BATCH
+from service.commands.connection.batches import SendingOutcome
+from service.commands.enrol import Report
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
@@ -42,6 +46,30 @@ def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> Non
     (monday / "2.jpg").write_bytes(jpeg(7))
     replaced = placerec("enrol", monday, "--map", "lab", "--replace")
     assert "1 replaced, 3 unchanged" in replaced.stdout
+
+
+def test_an_interrupted_command_says_how_far_it_is(
+    placerec: Placerec, monday: Path, server: Server, map_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = Report.add
+
+    def interrupting(report: Report, outcome: SendingOutcome) -> None:
+        add(report, outcome)
+        if sum(report.changes.values()) == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Report, "add", interrupting)
+    words = "enrol", monday, "--map", map_id, "--url", server.client.base_url
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        for index in range(40):
+            (monday / f"more-{index:02}.jpg").write_bytes(jpeg(index))
+        stopped = placerec(*words, status=130)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    told = re.search(r"Interrupted: (\d+) of 44 frames are enrolled; run the command again to go on.", stopped.stderr)
+    assert told and 4 <= int(told[1]) < 44
+    assert server.client.get(f"/v1/maps/{map_id}").json()["places"] >= int(told[1])
 
 
 def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, server: Server, map_id: str) -> None:
