@@ -37,6 +37,11 @@ from service.settings import Settings
 
 __all__ = ["KIND", "RecordingOrder", "enrol_recording"]
 
+KEPT = (
+    "Some frames failed, so the uploaded bag is kept: it can be enrolled again, after the remedy that the failures "
+    "name, and is removed when all of its frames are in, or nothing was done with it for a day."
+)
+
 Metres = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
 Topic = Field(default=None, min_length=1, max_length=256)
 
@@ -111,6 +116,7 @@ def enrol_recording(
     Raises:
         InvalidRecording, UnknownTopic, InvalidTrajectory, MissingExtra: the bag cannot be used so, or too many frames
             lose their pose.
+        NothingEnrolled: every frame failed.
         InvalidIdentifier: the name of a later part of the traverse is too long.
         UnknownMap, UnknownCamera, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was stored
             before stays.
@@ -171,6 +177,8 @@ def enrol_recording(
         posed = sum(one.pose is not None for one in chosen)
         facts = {"sequence": sequence, "frames": len(recording.frames), "chosen": len(chosen), "posed": posed}
         traverses = list(dict.fromkeys(traverse_of(sequence, one) for one in chosen))
+    if result["failed"]["count"]:
+        remarks = [*remarks, KEPT]
     told = {**result, **facts, "sequences": traverses, "path": way_of(chosen), "remarks": remarks}
     return {**told, "aligned": align(engine, context, traverses)} if order.align else told
 

@@ -153,8 +153,8 @@ def enrol_recording(
 ) -> JobView:
     """Enrol the frames of a bag that has arrived, by a job, as `placerec enrol` does.
 
-    The bag is removed when the job has succeeded. If it fails, because the topics do not fit, for example, the bag
-    stays and can be enrolled in another way.
+    The bag is removed when the job has succeeded and no frame has failed. Otherwise, because the topics do not fit, for
+    example, it stays and can be enrolled in another way. A job of which no frame became a place has failed.
     """
     map_ = engine.maps.get(map_id)
     map_.cameras.mask(order.camera)
