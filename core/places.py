@@ -170,6 +170,12 @@ def pose_kinds(kinds: NDArray[np.int8]) -> set[PoseKind]:
     return {name for name, code in codes if (kinds == code).any()}
 
 
+def coordinates_of(poses: Iterable[Pose | None]) -> PoseKind | None:
+    """The kind of coordinates that some poses have; None if they are of both kinds, or there is none."""
+    kinds = {pose.kind() for pose in poses if pose is not None}
+    return kinds.pop() if len(kinds) == 1 else None
+
+
 def check_coordinates(known: Collection[PoseKind], kind: PoseKind, subject: str) -> None:
     """Check that coordinates are of the kind that the places of a map have.
 

@@ -18,7 +18,7 @@ import typer
 
 from core.errors import InvalidIdentifier
 from core.names import LONGEST
-from core.places import check_sequence
+from core.places import check_sequence, coordinates_of
 from placerec_client.errors import InvalidFrame
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames, load
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
@@ -356,6 +356,7 @@ async def _compare(
     """The frames' ids that the map already has, and the name under which to enrol them.
 
     Raises:
+        Refused: the frames' poses are of the kind that the map's are not, for example.
         Failure: places of other frames or other traverses have these ids, and are not to be replaced.
     """
     # Here because it takes a moment.
@@ -363,12 +364,13 @@ async def _compare(
 
     # A name that nobody chose is settled by the first frames that the map has, or else is one that is free.
     name, named, free = wanted.sequence, wanted.named or wanted.replace, wanted.sequence
+    more = {"camera": camera, "coordinates": coordinates_of(frame.taken.pose for frame in frames)}
 
     async def taken_of(items: Sequence[dict[str, str]], settle: bool) -> list[TakenPlace]:
         nonlocal name, named, free
         taken: list[TakenPlace] = []
         for start in range(0, len(items), MOST_COMPARED):
-            order = {"places": items[start : start + MOST_COMPARED], "sequence": name, "named": named, "camera": camera}
+            order = {"places": items[start : start + MOST_COMPARED], "sequence": name, "named": named, **more}
             answer = await service.request("POST", path_of("maps", map_id, "places") + ":compare", json=order)
             told = TraverseComparison.model_validate_json(answer.content)
             taken += told.taken

@@ -23,6 +23,7 @@ from tests.core.recordings.bags import (
     WRITERS,
     camera_info,
     compressed,
+    fix,
     image,
     moved,
     walk,
@@ -239,6 +240,23 @@ def test_a_bag_is_kept_while_frames_of_it_failed(taking: Server, tmp_path: Path)
         if again:
             assert enrolled(taking, "kept", name, **again)["result"]["changes"] == {"created": 3}
             assert taking.client.get(f"/v1/maps/kept/recordings/{name}").json()["bytes"] == 0
+
+
+def test_degrees_are_refused_by_a_map_in_metres_before_a_frame_is_read(
+    taking: Server, placerec: Placerec, tmp_path: Path
+) -> None:
+    taking.create_map("metres")
+    taking.enrol("metres", "first", jpeg(1), x=1, y=2, sequence="day")
+    said = [*(compressed(START + n * SECOND, jpeg(n)) for n in range(3)),
+            *(fix(START + n * SECOND, 49.0 + n * 1e-5, 8.0) for n in range(3))]  # fmt: skip
+    bag = write_mcap(tmp_path / "earth.mcap", said)
+    assert put(taking, "metres", "earth.mcap", 0, bag.read_bytes()).status_code == 200
+    for more in ({}, {"replace": True}):
+        problem = enrolled(taking, "metres", "earth.mcap", pose_topic="/fix", keep_standing=True, **more)["problem"]
+        assert problem["type"].endswith(":mixed-coordinates") and "a map has one kind" in problem["detail"]
+    told = placerec("enrol", bag, "--map", "metres", "--pose-topic", "/fix", "--url", taking.client.base_url, status=1)
+    assert "a map has one kind" in told.stderr and "more frames" not in told.stderr and "--sequence" not in told.stderr
+    assert list(places(taking, "metres")) == ["first"]
 
 
 def test_intrinsics_that_are_none_are_told_and_not_stored(taking: Server, tmp_path: Path) -> None:
