@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from core import names
 from core.errors import InvalidIdentifier, MixedCoordinates
+from core.numerals import LOST_PLUS
 
 MAP_IDS = names.file_names("a map", but="import")
 PLACE_IDS = names.words("a place", 128)
@@ -170,6 +171,12 @@ def pose_kinds(kinds: NDArray[np.int8]) -> set[PoseKind]:
     return {name for name, code in codes if (kinds == code).any()}
 
 
+def coordinates_of(poses: Iterable[Pose | None]) -> PoseKind | None:
+    """The kind of coordinates that some poses have; None if they are of both kinds, or there is none."""
+    kinds = {pose.kind() for pose in poses if pose is not None}
+    return kinds.pop() if len(kinds) == 1 else None
+
+
 def check_coordinates(known: Collection[PoseKind], kind: PoseKind, subject: str) -> None:
     """Check that coordinates are of the kind that the places of a map have.
 
@@ -205,12 +212,17 @@ def _utc(moment: datetime) -> datetime:
 
 def _written_out(moment: object) -> object:
     """Refuse a time that is a bare number, which could mean seconds as well as milliseconds."""
-    if isinstance(moment, datetime) or (isinstance(moment, str) and _DATE.match(moment)):
+    if isinstance(moment, datetime):
+        return moment
+    if isinstance(moment, str) and _DATE.match(moment):
+        if _SPACED_ZONE.search(moment):
+            raise ValueError(f"a space stands before the zone of the time, where + or - belongs: {LOST_PLUS}")
         return moment
     raise ValueError("a time is written as in RFC 3339, such as 2026-11-20T10:00:00Z")
 
 
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
+_SPACED_ZONE = re.compile(r":\d\d(\.\d+)? \d\d:?\d\d$")
 
 Timestamp = Annotated[datetime, BeforeValidator(_written_out), AfterValidator(_utc)]
 

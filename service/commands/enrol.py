@@ -10,6 +10,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,7 +19,7 @@ import typer
 
 from core.errors import InvalidIdentifier
 from core.names import LONGEST
-from core.places import check_sequence
+from core.places import check_sequence, coordinates_of
 from placerec_client.errors import InvalidFrame
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames, load
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
@@ -256,39 +257,50 @@ async def _enrol(
     report = Report()
     async with open_service(target) as service:
         given = {key: value for key, value in settings.items() if value is not None}
-        used = await _ready_map(service, map_id, camera, create, given)
-        mask = await _mask(service, map_id, camera, opened)
-        frames = await asyncio.to_thread(choose, used, mask)
-        known, name = await _compare(service, map_id, frames, wanted, camera)
-        if name != wanted.sequence:
-            remark(f"The map has a traverse {wanted.sequence!r} already; these frames are in {name!r}.")
-        frames = [replace(frame, sequence=traverse_of(name, frame.taken)) for frame in frames]
-        with progress() as bar:
-            task = bar.add_task(f"Enrolling into {map_id}", total=len(frames))
+        used, created = await _ready_map(service, map_id, camera, create, given)
+        under_way = False  # and what the service has of it is not known
+        try:
+            mask = await _mask(service, map_id, camera, opened)
+            frames = await asyncio.to_thread(choose, used, mask)
+            known, name = await _compare(service, map_id, frames, wanted, camera)
+            if name != wanted.sequence:
+                remark(f"The map has a traverse {wanted.sequence!r} already; these frames are in {name!r}.")
+            frames = [replace(frame, sequence=traverse_of(name, frame.taken)) for frame in frames]
+            with progress() as bar:
+                task, under_way = bar.add_task(f"Enrolling into {map_id}", total=len(frames)), True
 
-            def report_frame(outcome: SendingOutcome) -> None:
-                report.add(outcome)
-                bar.advance(task)
+                def report_frame(outcome: SendingOutcome) -> None:
+                    report.add(outcome)
+                    bar.advance(task)
 
-            try:
-                await enrol_frames(service, map_id, frames, known, settings["encoder"], report_frame, wanted.replace)
-            except (Failure, asyncio.CancelledError) as error:
-                how_far = f"{sum(report.changes.values())} of {len(frames)} frames are enrolled; run the command again"
-                if isinstance(error, Failure):
-                    raise Failure(f"{error} {how_far} to continue.") from error
-                raise KeyboardInterrupt(f"Interrupted: {how_far} to go on.") from error
+                try:
+                    await enrol_frames(
+                        service, map_id, frames, known, settings["encoder"], report_frame, wanted.replace
+                    )
+                except (Failure, asyncio.CancelledError) as error:
+                    how_far = (
+                        f"{sum(report.changes.values())} of {len(frames)} frames are enrolled; run the command again"
+                    )
+                    if isinstance(error, Failure):
+                        raise Failure(f"{error} {how_far} to continue.") from error
+                    raise KeyboardInterrupt(f"Interrupted: {how_far} to go on.") from error
+            under_way = False
+        finally:
+            if created and not report.changes and not under_way:
+                await _delete_empty(service, map_id)
     return report, len(frames), list(dict.fromkeys(frame.sequence for frame in frames))
 
 
 async def _ready_map(
     service: Service, map_id: str, camera: str | None, create: bool, settings: dict[str, str]
-) -> str | None:
-    """Check that the map exists, or create it; the identity of its encoder.
+) -> tuple[str | None, bool]:
+    """Check that the map exists, or create it; the identity of its encoder, and whether it was created.
 
     Raises:
         Failure: the map does not exist, and is not to be created.
         typer.BadParameter: it is to be created, and could not have the ``camera``.
     """
+    created = False
     try:
         found = await service.get(path_of("maps", map_id))
     except Refused as refused:
@@ -299,8 +311,17 @@ async def _ready_map(
         if camera is not None:
             raise typer.BadParameter(_without_camera(map_id, camera)) from refused
         found = (await service.request("POST", path_of("maps"), json={"id": map_id, **settings})).json()
+        created = True
     encoder = found.get("encoder")
-    return None if encoder is None else str(encoder)
+    return None if encoder is None else str(encoder), created
+
+
+async def _delete_empty(service: Service, map_id: str) -> None:
+    """Delete the map that the command has created, unless something is in it; a service that refuses keeps it."""
+    with suppress(Failure):
+        if (await service.get(path_of("maps", map_id)))["places"] == 0:
+            await service.request("DELETE", path_of("maps", map_id))
+            remark(f"The map {map_id}, which --create made, is deleted again: no frame became a place of it.")
 
 
 def _without_camera(map_id: str, camera: str) -> str:
@@ -356,6 +377,7 @@ async def _compare(
     """The frames' ids that the map already has, and the name under which to enrol them.
 
     Raises:
+        Refused: the frames' poses are of the kind that the map's are not, for example.
         Failure: places of other frames or other traverses have these ids, and are not to be replaced.
     """
     # Here because it takes a moment.
@@ -363,12 +385,13 @@ async def _compare(
 
     # A name that nobody chose is settled by the first frames that the map has, or else is one that is free.
     name, named, free = wanted.sequence, wanted.named or wanted.replace, wanted.sequence
+    more = {"camera": camera, "coordinates": coordinates_of(frame.taken.pose for frame in frames)}
 
     async def taken_of(items: Sequence[dict[str, str]], settle: bool) -> list[TakenPlace]:
         nonlocal name, named, free
         taken: list[TakenPlace] = []
         for start in range(0, len(items), MOST_COMPARED):
-            order = {"places": items[start : start + MOST_COMPARED], "sequence": name, "named": named, "camera": camera}
+            order = {"places": items[start : start + MOST_COMPARED], "sequence": name, "named": named, **more}
             answer = await service.request("POST", path_of("maps", map_id, "places") + ":compare", json=order)
             told = TraverseComparison.model_validate_json(answer.content)
             taken += told.taken

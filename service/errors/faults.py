@@ -90,6 +90,10 @@ class FrameNeeded(Fault):
     """The frame was named by its digest, but the place has another frame or does not exist."""
 
 
+class NothingEnrolled(InvalidRequest):
+    """None of the frames of a job became a place; ``errors`` has the first of them, each with its reason."""
+
+
 class PlacesTaken(Fault):
     """Places of other frames have the ids of these, and nobody said that they are to be replaced."""
 

@@ -171,6 +171,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.UnsupportedMediaType: Kind(415, "unsupported-media-type", "The content type is not supported here"),
     faults.BodyTooLarge: Kind(413, "body-too-large", "The body has too many bytes"),
     faults.FrameNeeded: Kind(409, "frame-needed", "The frame has to be sent"),
+    faults.NothingEnrolled: Kind(422, "nothing-enrolled", "No frame became a place"),
     faults.PlacesTaken: Kind(409, "places-taken", "Places of other frames have these ids"),
     faults.BatchOutOfOrder: Kind(409, "batch-out-of-order", "The batch before it is not stored"),
     faults.UnknownExplanation: Kind(404, "unknown-explanation", "The picture does not exist or is no longer stored"),

@@ -83,7 +83,7 @@ class Intake:
         self.size, self.complete, self.answered = 0, False, False
         self.holding = Holding(self._give_way)
         """The bytes of this body that are held in memory."""
-        self._digest_headers: tuple[str, ...] = ("Content-Digest",)
+        self._digest_headers: tuple[str, ...] = ("Content-Digest", "Repr-Digest")
         self._is_held, self._given_way = True, False
         self._receiving: asyncio.Timeout | None = None
         self._receive, self._memory = receive, memory
@@ -147,9 +147,9 @@ class Intake:
                 self._digests.expect(header, ",".join(self._headers.getlist(header)))
         return self._digests
 
-    def check_whole(self) -> None:
-        """Check ``Repr-Digest`` as well: the body is a whole file, and no piece of one."""
-        self._digest_headers = ("Content-Digest", "Repr-Digest")
+    def is_piece(self) -> None:
+        """Leave ``Repr-Digest`` unchecked: the body is a piece of a file, and that is the digest of the whole."""
+        self._digest_headers = ("Content-Digest",)
 
     async def _next(self, seconds: float | None) -> Message:
         """The next message of the server; raises TimeoutError, or MemoryFull as soon as the body has given way."""

@@ -75,6 +75,8 @@ RUNS: Final = "runs"
 ALIGNED: Final = "aligned:"
 """The source of a calibration that a map has made of an aligned traverse, whose name follows."""
 
+UNCHANGED = "Curve, threshold and margin are those that are in force already, so there is nothing to store."
+
 router = APIRouter(
     prefix="/v1/maps/{map}",
     tags=["calibration"],
@@ -169,8 +171,7 @@ async def calibrate_map(
     report, trials = await in_thread(measure, map_, encoder, order, encoded, advance, known, ran)
     await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
-        await in_thread(store, map_, storable(report), replaces, expected)
-        tell_map(engine, map_, "calibrated")
+        await in_thread(_store_report, engine, map_, report, replaces, expected)
     return report
 
 
@@ -304,18 +305,39 @@ def _report(
     """
     previous = calibration_of(map_, encoder)
     change = held_out_change(found, previous, drawn)
+    same = _in_force(found.calibration) == _in_force(previous)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
         method=order.method,
         target=order.target,
-        stored=not order.dry_run and (change is None or change.worse is None),
+        stored=not order.dry_run and not same and (change is None or change.worse is None),
         calibration=found.calibration,
         previous=previous,
         measurement=found.measurement,
         change=change,
-        warnings=warnings,
+        warnings=[*warnings, UNCHANGED] if same else warnings,
     )
+
+
+def _in_force(calibration: Calibration) -> Calibration:
+    """What judges answers of a calibration, whatever it rests on."""
+    return calibration.model_copy(update={"source": "", "frames": None})
+
+
+def _store_report(
+    engine: Engine, map_: Map, report: CalibrationReport, replaces: Calibration | None, expected: int | None
+) -> None:
+    """Store the calibration of a report, unless it is the one in force.
+
+    Raises:
+        CalibrationWorse: held-out answers speak against it.
+        RevisionMismatch, StorageFull, StorageFailure: as of :func:`store`.
+    """
+    found = storable(report)
+    if report.stored:
+        store(map_, found, replaces, expected)
+        tell_map(engine, map_, "calibrated")
 
 
 def _from_runs(map_: Map, encoder: Encoder, ran: Sequence[RunTrials], target: Target) -> FittedCalibration:
@@ -438,8 +460,8 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
     result = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=result)
-        store(map_, storable(report), None if replaces is None else Calibration.model_validate(replaces), expected)
-        tell_map(engine, map_, "calibrated")
+        before = None if replaces is None else Calibration.model_validate(replaces)
+        _store_report(engine, map_, report, before, expected)
     return result
 
 

@@ -397,7 +397,10 @@ class CalibrationReport(BaseModel):
     encoder: str
     method: Method
     target: Target
-    stored: bool = Field(description="Whether it was stored as the map's own calibration; false after a dry run.")
+    stored: bool = Field(
+        description="Whether it was stored as the map's own calibration; false after a dry run, and where it changes "
+        "nothing of the one in force."
+    )
     calibration: Calibration
     previous: Calibration = Field(description="The calibration that was in force before.")
     measurement: Measurement

@@ -187,7 +187,6 @@ async def import_map(
     if announced > settings.max_import_bytes:
         raise BodyTooLarge(f"The file is larger than the {settings.max_import_bytes} bytes that are allowed.")
     intake = intake_of(request)
-    intake.check_whole()
     intake.pass_on(settings.max_import_bytes, settings.import_timeout)
 
     def accept(manifest: Manifest) -> str:

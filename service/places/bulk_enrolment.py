@@ -16,7 +16,7 @@ from core.maps import Map
 from core.recordings.plausibility import MOST_SPEED
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
-from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
+from service.errors.faults import BodyTooLarge, InvalidRequest, NothingEnrolled, UnsupportedMediaType
 from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import FormPart
@@ -135,6 +135,7 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
         The result of the job.
 
     Raises:
+        NothingEnrolled: every frame failed.
         UnknownMap, MapQuarantined, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: the frames that
             were stored before stay.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
@@ -169,6 +170,18 @@ class _Outcome:
             item = {"position": position, "id": entry_id(entry), "status": problem["status"], "problem": problem}
             self.named.append(item)
 
+    def nothing_enrolled(self) -> NothingEnrolled:
+        """The error of a job all of whose frames failed."""
+        listed = [
+            {"location": item["id"] or f"places.{item['position']}", "message": item["problem"]["detail"]}
+            for item in self.named
+        ]
+        first = listed[0]
+        return NothingEnrolled(
+            f"None of the {self.failed} frames became a place; the first, {first['location']}: {first['message']}",
+            listed,
+        )
+
 
 class EnrolmentInCommits:
     """One attempt of a job that enrols many frames, some with each commit.
@@ -200,6 +213,7 @@ class EnrolmentInCommits:
         """Enrol what an attempt before this one has not; the result of the job.
 
         Raises:
+            NothingEnrolled: every frame failed.
             TooManyPlaces, EncoderNotInstalled, StorageFull, StorageFailure: what was stored before stays.
             JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
         """
@@ -212,6 +226,8 @@ class EnrolmentInCommits:
             if self._gives_way:
                 self.context.give_way()
         self.context.progress(outcome.done, total)
+        if outcome.failed and not outcome.changes:
+            raise outcome.nothing_enrolled()
         return {
             "map": self.map.record.id,
             "encoder": self.map.record.encoder,

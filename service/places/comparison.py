@@ -8,18 +8,22 @@ from collections.abc import Sequence as SequenceOf
 from itertools import chain, count, islice
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.frames.masks import Mask
+from core.frames.masks import Mask, with_range
 from core.maps import Map
 from core.names import LONGEST, composed
-from core.places import Camera, Place, Sequence
+from core.places import Camera, Place, PoseKind, Sequence, check_coordinates, pose_kinds
 from core.recognition.recognition import frame_digest
 
 MOST_COMPARED = 4000
 """Frames of one request: with ids of full length and digests they fit into a body of JSON."""
 
 NAMES_AT_ONCE = 50
+
+OTHERWISE = "by another camera, mask or range of values"
+"""What else may differ of a frame whose picture is the same."""
 
 COMPARISON_EXAMPLE: dict[str, Any] = {
     "sequence": "day-left",
@@ -59,6 +63,9 @@ class TraverseToCompare(BaseModel):
         "and so on, unless the map has these very frames under such a name already.",
     )
     camera: Camera | None = Field(default=None, description="The camera of the map that took the frames.")
+    coordinates: PoseKind | None = Field(
+        default=None, description="What the frames' poses are in: metric or geographic; null: they have none."
+    )
 
 
 class TakenPlace(BaseModel):
@@ -67,6 +74,11 @@ class TakenPlace(BaseModel):
     id: str
     sequence: str | None = Field(description="The traverse that it belongs to.")
     same: bool | None = Field(description="Whether it shows the very frame; null: no digest was sent, so it may.")
+    picture: bool | None = Field(
+        default=None,
+        description="Of a frame that is not the same: whether it is this picture by another camera, mask or range of "
+        "values; null: that is not known, as its camera may have had others.",
+    )
 
 
 class TraverseComparison(BaseModel):
@@ -104,15 +116,42 @@ def compare(
         begun = (one for place_id, one in names.items() if same[place_id] and _continues(one, sequence))
         name = next(begun, free)
     taken = [
-        TakenPlace(id=place_id, sequence=one, same=same[place_id])
-        for place_id, one in names.items()
-        if not same[place_id] or not (one == name or _continues(one, name))
+        TakenPlace(id=place.id, sequence=one, same=same[place.id], picture=_pictures(map_, place, frames[place.id]))
+        for place, one in ((place, names[place.id]) for place in there)
+        if not same[place.id] or not (one == name or _continues(one, name))
     ]
     return TraverseComparison(sequence=name, free=free, known=len(there) - len(taken), taken=taken)
 
 
+def expect_coordinates(map_: Map, kind: PoseKind | None) -> None:
+    """Check that a traverse has coordinates of the kind that the places of a map have; None: it has none.
+
+    Raises:
+        MixedCoordinates: they are of the other kind.
+        UnknownMap, MapQuarantined, StorageFailure.
+    """
+    if kind is not None:
+        snapshot = map_.snapshot()
+        where = snapshot.whereabouts_at(np.flatnonzero(snapshot.alive))
+        check_coordinates(pose_kinds(where.kind), kind, "The traverse")
+
+
 def _shows(map_: Map, place: Place, sha256: bytes | None, mask: Mask | None) -> bool | None:
     return None if sha256 is None else map_.digest(place.id) == frame_digest(sha256, mask)
+
+
+def _pictures(map_: Map, place: Place, sha256: bytes | None) -> bool | None:
+    """Whether a place was made of a file, under whichever mask; None if that is not known.
+
+    The digest that is stored tells it of a place without a camera, and of one whose camera is as it was.
+    """
+    if sha256 is None:
+        return None
+    known = None if place.camera is None else map_.cameras.known(place.camera)
+    masks = [None] if known is None else [None, with_range(known.mask, known.value_range)]
+    if any(_shows(map_, place, sha256, mask) for mask in masks):
+        return True
+    return False if place.camera is None else None
 
 
 def _continues(name: str | None, first: str | None) -> bool:
@@ -137,7 +176,10 @@ def taken_text(taken: SequenceOf[TakenPlace], frames: int) -> str:
     """A sentence on places that have the ids of ``frames`` frames."""
     names = list(dict.fromkeys(one.sequence for one in taken if one.sequence is not None))
     where = f" in the traverse {names[0]!r}" if len(names) == 1 else f" in {len(names)} traverses" if names else ""
-    others = sum(one.same is False for one in taken)
-    how = "these very pictures" if others == 0 else "other pictures"
-    which = f", {others} of them" if 0 < others < len(taken) else ","
+    others = [one.picture for one in taken if one.same is False]
+    how = "these very pictures"
+    if others:
+        how = f"these pictures, but {OTHERWISE}" if all(others) else "other pictures"
+        how += f", or these {OTHERWISE}" if None in others else ""
+    which = f", {len(others)} of them" if 0 < len(others) < len(taken) else ","
     return f"{len(taken)} of {frames} frames exist already{where}{which} with {how}."

@@ -52,7 +52,7 @@ from service.jobs.schemas import JobView
 from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
-from service.places.comparison import TraverseComparison, TraverseToCompare, compare
+from service.places.comparison import TraverseComparison, TraverseToCompare, compare, expect_coordinates
 from service.places.enrolment import FrameToEnrol, enrol
 from service.places.filters import MOST_DELETED, DeletedPlaces, Deletion, PlacePageQuery
 from service.places.parameters import BatchParameters, EnrolParameters, check_metadata, check_taken
@@ -289,15 +289,19 @@ def delete_places(map_id: MapId, order: Deletion, request: Request, engine: Engi
 @router.post(
     ":compare",
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.UnknownCamera),
+    responses=problem_documentation(
+        UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.UnknownCamera, errors.MixedCoordinates
+    ),
 )
 def compare_places(map_id: MapId, order: TraverseToCompare, engine: EngineDep) -> TraverseComparison:
     """Compare a traverse with the places of a map before its frames are sent; nothing is stored.
 
     First send the ids alone; then, of the places that are `taken`, the ids with the SHA-256 of the frames' bytes: a
-    traverse whose enrolment broke off is `known`, and only frames that differ stay `taken`.
+    traverse whose enrolment broke off is `known`, and only frames that differ stay `taken`. A map has one kind of
+    coordinates, and poses of the other kind are refused.
     """
     map_ = engine.maps.get(map_id)
+    expect_coordinates(map_, order.coordinates)
     mask = map_.cameras.mask(order.camera)
     frames = {one.id: None if one.sha256 is None else bytes.fromhex(one.sha256) for one in order.places}
     return compare(map_, frames, order.sequence, order.named, mask)

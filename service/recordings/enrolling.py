@@ -13,7 +13,7 @@ from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
 from core.maps import Map
-from core.places import Camera, PlaceFields, check_sequence
+from core.places import Camera, PlaceFields, check_sequence, coordinates_of
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
@@ -27,7 +27,7 @@ from service.http.multipart import FormPart
 from service.http.uploads import check_part
 from service.jobs.context import JobContext, JobGivesWay, yield_to_requests
 from service.places.bulk_enrolment import Align, EnrolmentInCommits
-from service.places.comparison import compare, taken_text
+from service.places.comparison import compare, expect_coordinates, taken_text
 from service.places.enrolment import FrameToEnrol
 from service.places.map_events import tell_map
 from service.recordings.reader import Order, as_fields
@@ -36,6 +36,11 @@ from service.recordings.uploads import KIND, Recordings
 from service.settings import Settings
 
 __all__ = ["KIND", "RecordingOrder", "enrol_recording"]
+
+KEPT = (
+    "Some frames failed, so the uploaded bag is kept: it can be enrolled again, after the remedy that the failures "
+    "name, and is removed when all of its frames are in, or nothing was done with it for a day."
+)
 
 Metres = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
 Topic = Field(default=None, min_length=1, max_length=256)
@@ -111,6 +116,8 @@ def enrol_recording(
     Raises:
         InvalidRecording, UnknownTopic, InvalidTrajectory, MissingExtra: the bag cannot be used so, or too many frames
             lose their pose.
+        MixedCoordinates: its poses are of the kind that the map's are not; nothing was stored.
+        NothingEnrolled: every frame failed.
         InvalidIdentifier: the name of a later part of the traverse is too long.
         UnknownMap, UnknownCamera, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was stored
             before stays.
@@ -138,6 +145,8 @@ def enrol_recording(
             check_sequence(traverse)
         if not order.allow_lost_poses:
             _check_lost_poses(recording)
+        if "chosen" not in context.notes:
+            expect_coordinates(map_, coordinates_of(one.pose for one in recording.frames))
         if "camera" not in context.notes:
             recording.check_format()
             context.remember(camera=_complete_camera(engine, map_, order.camera, recording))
@@ -171,6 +180,8 @@ def enrol_recording(
         posed = sum(one.pose is not None for one in chosen)
         facts = {"sequence": sequence, "frames": len(recording.frames), "chosen": len(chosen), "posed": posed}
         traverses = list(dict.fromkeys(traverse_of(sequence, one) for one in chosen))
+    if result["failed"]["count"]:
+        remarks = [*remarks, KEPT]
     told = {**result, **facts, "sequences": traverses, "path": way_of(chosen), "remarks": remarks}
     return {**told, "aligned": align(engine, context, traverses)} if order.align else told
 

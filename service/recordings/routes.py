@@ -115,7 +115,9 @@ async def upload_recording(
     goes_on = offset > 0 and recordings.is_from_caller(map_id, name)  # the audit trail has the first piece of many
     request.state.noted = {"map": map_id, "recording": name, "offset": offset} | ({"change": None} if goes_on else {})
     settings = engine.settings
-    intake_of(request).pass_on(settings.max_batch_bytes, settings.bulk_timeout)
+    intake = intake_of(request)
+    intake.is_piece()
+    intake.pass_on(settings.max_batch_bytes, settings.bulk_timeout)
     size = await recordings.receive(map_id, name, offset, request.stream())
     try:
         await engine.map(map_id)
@@ -153,8 +155,8 @@ def enrol_recording(
 ) -> JobView:
     """Enrol the frames of a bag that has arrived, by a job, as `placerec enrol` does.
 
-    The bag is removed when the job has succeeded. If it fails, because the topics do not fit, for example, the bag
-    stays and can be enrolled in another way.
+    The bag is removed when the job has succeeded and no frame has failed. Otherwise, because the topics do not fit, for
+    example, it stays and can be enrolled in another way. A job of which no frame became a place has failed.
     """
     map_ = engine.maps.get(map_id)
     map_.cameras.mask(order.camera)

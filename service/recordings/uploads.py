@@ -2,7 +2,7 @@
 
 recordings/<map>/<name>       what has arrived so far; the name ends as the kind of bag asks for
 
-A bag stays until a job has enrolled it, somebody deletes it, or nothing was done with it for a day.
+A bag stays until a job has enrolled all its frames, somebody deletes it, or nothing was done with it for a day.
 """
 
 from __future__ import annotations
@@ -256,8 +256,8 @@ class Recordings:
             self._remove(path)
 
     def job_ended(self, job: Job) -> None:
-        """Remove the bag of a job that has enrolled it; of another one it stays, to be tried again."""
-        if job.state == "succeeded":
+        """Remove the bag of a job that has enrolled all its frames; of another one it stays, to be tried again."""
+        if job.result is not None and not job.result["failed"]["count"]:
             self._remove(self.path(str(job.map_id), str(job.arguments["recording"])))
 
     def clean(self) -> None:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from core.recordings.keyframes import Describe
 
 PANEL = "Recordings"
+MOST_APART = 1e6
+"""Metres or seconds between keyframes, as in the order of a job."""
 
 Topic = Annotated[
     str | None,
@@ -83,17 +85,38 @@ MostSpeed = Annotated[
         metavar="V",
     ),
 ]
+
+
+def _above_zero(value: float | None) -> float | None:
+    """Return a measure between keyframes, if it is one, as in the order of a job.
+
+    Raises:
+        typer.BadParameter: it is 0, or no number.
+    """
+    if value is not None and not 0 < value <= MOST_APART:
+        raise typer.BadParameter(f"{value:g} is not more than 0 and at most {MOST_APART:g}.")
+    return value
+
+
 EveryMetres = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: take a frame after N metres.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(
+        callback=_above_zero, help="Keyframes: take a frame after N metres.", rich_help_panel=PANEL, metavar="N"
+    ),
 ]
 EveryDegrees = Annotated[
     float | None,
-    typer.Option(min=0, max=180, help="Keyframes: or after a turn by N degrees.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(
+        callback=_above_zero,
+        max=180,
+        help="Keyframes: or after a turn by N degrees.",
+        rich_help_panel=PANEL,
+        metavar="N",
+    ),
 ]
 EverySeconds = Annotated[
     float | None,
-    typer.Option(min=0, help="Keyframes: or after N seconds.", rich_help_panel=PANEL, metavar="N"),
+    typer.Option(callback=_above_zero, help="Keyframes: or after N seconds.", rich_help_panel=PANEL, metavar="N"),
 ]
 EveryChange = Annotated[
     float | None,

@@ -117,8 +117,9 @@ function Bag({ map, file, order, wrong, tell }) {
       if (ended.problem?.type.endsWith(":places-taken")) setState({ ...IDLE, state: "stopped", taken: { text: ended.problem.detail, free: await freeName(map, order.sequence || called) } });
       return;
     }
-    tell({ stored: ended.result.chosen });
-    say(`${counted(ended.result.chosen, "frame")} of ${file.name} ${ended.result.chosen === 1 ? "is" : "are"} enrolled.`);
+    const stored = ended.result.chosen - ended.result.failed.count;
+    tell({ stored });
+    say(`${counted(stored, "frame")} of ${file.name} ${stored === 1 ? "is" : "are"} enrolled.`);
   };
   const action = sent === null ? "Upload and enrol" : sent < file.size ? "Go on" : "Enrol again";
   return html`
@@ -126,7 +127,7 @@ function Bag({ map, file, order, wrong, tell }) {
       <div class="spread">
         <span><strong>${file.name}</strong> <span class="faint">${bytes(file.size)}</span></span>
         ${state === "running" && !job && html`<button type="button" onClick=${() => run.current.abort()}>Stop</button>`}
-        ${["waiting", "stopped"].includes(state) && !taken && html`<button type="button" class="primary" disabled=${wrong !== null} onClick=${() => start()}>${action}</button>`}
+        ${(["waiting", "stopped"].includes(state) || result?.failed.count > 0) && !taken && html`<button type="button" class="primary" disabled=${wrong !== null} onClick=${() => start()}>${action}</button>`}
       </div>
       ${sent !== null && !job && !taken && state !== "done" && html`<${Progress} done=${sent} total=${file.size} label=${`${file.name}: bytes uploaded`} /><p class="faint small" role="status">${bytes(sent)} of ${bytes(file.size)} uploaded</p>`}
       ${error && html`<${Trouble} error=${error} />`}

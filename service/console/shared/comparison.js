@@ -25,10 +25,12 @@ async function digestOfFrame(reader, frame) {
 
 /** The places that would be replaced, or would get into another traverse; how many are there already; a free name. */
 async function compared(map, frames, sequence, camera, signal) {
+  const kinds = new Set(frames.flatMap(({ fields }) => (fields.x !== undefined ? ["metric"] : fields.latitude !== undefined ? ["geographic"] : [])));
+  const coordinates = kinds.size === 1 ? [...kinds][0] : null;
   const ask = async (places) => {
     const told = { known: 0, taken: [], free: sequence };
     for (let at = 0; at < places.length; at += AT_ONCE) {
-      const order = { places: places.slice(at, at + AT_ONCE), sequence: sequence || null, camera: camera || null };
+      const order = { places: places.slice(at, at + AT_ONCE), sequence: sequence || null, camera: camera || null, coordinates };
       const { known, taken, free } = await post(`${mapPath(map, "places")}:compare`, order, { signal });
       Object.assign(told, { known: told.known + known, taken: [...told.taken, ...taken], free });
     }

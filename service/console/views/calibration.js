@@ -19,7 +19,7 @@ export default function Calibration({ map }) {
   const giveUp = () => setDialog(html`<${GiveUp} map=${map} tag=${state.data.tag} changed=${state.reload} close=${close} />`);
   const ended = (told) => {
     if (told.state === "succeeded") {
-      say(told.result?.stored ? "The calibration was stored." : "The dry run is done.");
+      say(told.result?.stored ? "The calibration was stored." : job.arguments.dry_run ? "The dry run is done." : "The calibration in force stays: nothing would change.");
       state.reload();
     }
   };
@@ -116,7 +116,7 @@ function Measured({ measured }) {
   const { measurement: found } = report;
   return html`
     <section class="panel">
-      <div class="spread"><h2>Measured</h2><span class="faint"><${Moment} at=${measured.at} />${!report.stored && ", a dry run"}</span></div>
+      <div class="spread"><h2>Measured</h2><span class="faint"><${Moment} at=${measured.at} />${!report.stored && ", not stored"}</span></div>
       <${Facts} rows=${[
         ["Asked", `${report.method}: ${integer(found.frames)} frames, ${integer(found.trials)} queries`],
         ["Right best matches", `${integer(found.right)} of ${integer(found.known)} known`],

@@ -81,8 +81,10 @@ function Press({ inputs, plan, sending, options, rename, drop }) {
 function Clash({ plan: { taken, frames, sequence, free }, rename, replace, drop }) {
   const names = [...new Set(taken.map((one) => one.sequence))];
   const where = names.length > 1 ? `in ${names.length} traverses` : names[0] === null ? "in no traverse" : html`in the traverse <strong>${names[0]}</strong>`;
-  const [others, unread] = [taken.filter((one) => one.same === false).length, taken.some((one) => one.same === null)];
-  const how = unread ? "; over plain HTTP the browser cannot tell whether with these pictures" : others === 0 ? ", with these pictures" : others < taken.length ? `, ${integer(others)} of them with other pictures` : ", with other pictures";
+  const [others, unread] = [taken.filter((one) => one.same === false), taken.some((one) => one.same === null)];
+  const otherwise = "by another camera, mask or range of values";
+  const differ = others.every((one) => one.picture) ? `these pictures, but ${otherwise}` : `other pictures${others.some((one) => one.picture === null) ? `, or these ${otherwise}` : ""}`;
+  const how = unread ? "; over plain HTTP the browser cannot tell whether with these pictures" : others.length === 0 ? ", with these pictures" : `, ${others.length < taken.length ? `${integer(others.length)} of them ` : ""}with ${differ}`;
   const made = frames.some((one) => !one.given); // of the traverse's name
   return html`
     <div class="notice stack" role="alert">

@@ -153,6 +153,26 @@ def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) 
     assert "1.jpg" not in done.stderr
 
 
+def test_a_map_that_is_created_for_nothing_is_deleted_again(placerec: Placerec, tmp_path: Path) -> None:
+    folder = tmp_path / "torn"
+    folder.mkdir()
+    (folder / "1.jpg").write_bytes(b"not an image")
+    words = ("enrol", folder, "--map", "for-nothing")
+    said = placerec(*words, "--create", status=1).stderr
+    assert "The map for-nothing, which --create made, is deleted again" in " ".join(said.split())
+    assert "There is no map 'for-nothing'" in placerec(*words, status=1).stderr
+    placerec("maps", "create", "for-nothing")
+    assert "deleted again" not in placerec(*words, "--create", status=1).stderr, "it was there before"
+    assert "for-nothing" in placerec("maps", "list").stdout
+
+
+@pytest.mark.parametrize("option", ["--every-metres", "--every-degrees", "--every-seconds"])
+def test_keyframes_need_a_distance_above_zero(placerec: Placerec, monday: Path, option: str) -> None:
+    for value in ("0", "-1"):
+        refused = placerec("enrol", monday, "--map", "lab", "--create", option, value, status=2).stderr
+        assert "more than 0" in " ".join(refused.split()), (option, value)
+
+
 @pytest.mark.thorough
 def test_a_name_that_makes_no_id_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
     odd = monday / "ä ö.jpg"

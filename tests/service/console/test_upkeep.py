@@ -41,7 +41,7 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
 
     calibrate("Try it")
     page.get_by_role("img", name=re.compile("Reliability diagram")).wait_for()
-    page.get_by_text("a dry run", exact=False).first.wait_for()
+    page.get_by_text("not stored", exact=False).first.wait_for()
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
     calibrate("Calibrate")
     page.get_by_text("sequence:tuesday").wait_for()

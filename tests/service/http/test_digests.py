@@ -50,6 +50,7 @@ def test_what_is_malformed_is_refused(value: str) -> None:
     [
         ("Content-Digest", stated(b"another frame"), 422, "digest-mismatch"),
         ("Content-Digest", stated(b"another frame", "sha-512"), 422, "digest-mismatch"),
+        ("Repr-Digest", stated(b"another frame"), 422, "digest-mismatch"),
         ("Content-Digest", "sha-256=abc", 422, "invalid-request"),
         ("Content-Encoding", "gzip", 415, "unsupported-media-type"),
         ("Content-Encoding", "identity, br", 415, "unsupported-media-type"),
@@ -93,7 +94,7 @@ def test_of_a_piece_of_a_bag_that_has_another_digest_nothing_stays(server: Serve
     octets = {"Content-Type": "application/octet-stream"}
 
     def piece(offset: int, data: bytes, said: bytes) -> int:
-        headers = octets | {"Content-Digest": stated(said)}
+        headers = octets | {"Content-Digest": stated(said), "Repr-Digest": stated(first + second)}  # of the whole file
         return server.client.put(path, params={"offset": offset}, content=data, headers=headers).status_code
 
     assert piece(0, first, second) == 422 and server.client.get(path).json()["bytes"] == 0

@@ -7,8 +7,10 @@ import re
 from typing import Any
 
 import pytest
+from pydantic import TypeAdapter, ValidationError
 
-from core.numerals import check_numeral
+from core.numerals import Decimal, Whole, check_numeral
+from core.places import Timestamp
 from tests.clients.python.models import DOCUMENT
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -37,6 +39,27 @@ def test_plain_numerals() -> None:
         with pytest.raises(ValueError, match="is not a number"):
             check_numeral(text)
     assert check_numeral(5) == 5 and check_numeral(None) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "told", "untold"),
+    [
+        (Whole, "1_0", "such as 5 or -1", "2e3"),
+        (Decimal, "1_0", "-1.5 or 2e3", "%2B"),
+        (Decimal, "1e 5", "written %2B", None),
+        (Timestamp, "2026-11-20T10:00:00 02:00", "written %2B", None),
+        (Timestamp, "2026-11-20T10:00:00.5 0200", "written %2B", None),
+        (Timestamp, "2026-11-20x 02:00", "", "%2B"),
+    ],
+)
+def test_what_is_said_leads_to_what_is_taken(kind: Any, value: str, told: str, untold: str | None) -> None:
+    with pytest.raises(ValidationError) as refused:
+        TypeAdapter(kind).validate_python(value)
+    assert told in str(refused.value) and (untold is None or untold not in str(refused.value))
+
+
+def test_a_time_with_a_space_before_the_hour_is_taken() -> None:
+    assert TypeAdapter(Timestamp).validate_python("2026-11-20 10:00").hour == 10
 
 
 def test_every_operation_refuses_other_numbers(server: Server, map_id: str) -> None:

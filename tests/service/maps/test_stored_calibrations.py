@@ -136,6 +136,21 @@ def test_labels_of_one_kind_are_said_to_be(client: TestClient) -> None:
     assert client.get(f"{HALL}/health").json()["calibration_doubt"] is None
 
 
+def test_one_that_changes_nothing_is_not_stored(client: TestClient) -> None:
+    """It would pin the map to these numbers, and name a source that it does not rest on."""
+    keep(client, ONE_SIDED)
+    first = calibrate(client).json()
+    assert first["stored"]
+    pinned = first["calibration"] | {"source": "manual", "frames": 7}
+    patch(client, {"restore": pinned}).raise_for_status()
+    before = client.get(HALL).json()
+    again = calibrate(client).json()
+    assert not again["stored"] and any("nothing to store" in one for one in again["warnings"])
+    assert again["calibration"]["threshold"] == pinned["threshold"]
+    after = client.get(HALL).json()
+    assert (after["calibration"], after["revision"]) == (pinned, before["revision"])
+
+
 @pytest.mark.parametrize(("strangers", "doubted"), [(0, True), (2, True), (3, False), (8, True)])
 def test_one_that_was_stored_before_is_judged_by_the_labels(client: TestClient, strangers: int, doubted: bool) -> None:
     """No measurement of it is left, as after a restore."""

@@ -84,6 +84,15 @@ def test_a_form_becomes_a_job_and_bad_frames_fail_alone(server: Server) -> None:
     assert again["result"]["changes"] == {"unchanged": 2}, "the same again changes nothing"
 
 
+def test_a_job_of_which_no_frame_became_a_place_has_failed(server: Server, map_id: str) -> None:
+    entries = [{"id": "a", "file": "bad"}, {"id": "b", "file": "none"}, {"id": "c", "sha256": "0" * 64}]
+    job = finished(server, sent(server, map_id, **form({"bad": b"no picture"}, entries)).json())
+    assert job["state"] == "failed" and job["result"] is None
+    assert job["problem"]["type"].endswith(":nothing-enrolled")
+    assert "None of the 3 frames became a place; the first, a: " in job["problem"]["detail"]
+    assert [one["location"] for one in job["problem"]["errors"]] == ["a", "b", "c"]
+
+
 def test_malformed_forms_are_refused_and_leave_nothing(server: Server) -> None:
     server.create_map("refusing", encoder=COARSE)
     one = {"one": jpeg(1)}

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from service.places.comparison import TakenPlace, taken_text
 from tests.service.places.test_batches import send
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -67,6 +68,52 @@ def test_a_frame_under_another_mask_is_another_frame(server: Server, map_id: str
     assert server.client.post(path, json=order | {"camera": "front"}).json()["known"] == 1
     assert server.client.post(path, json=order).json()["known"] == 0
     assert_problem(server.client.post(path, json=order | {"camera": "rear"}), 404, "unknown-camera")
+
+
+@pytest.mark.parametrize(
+    ("enrolled", "compared_by", "number", "picture", "text"),
+    [
+        pytest.param(None, "ranged", 1, True, "with these pictures, but by another", id="a camera now"),
+        pytest.param("masked", None, 1, True, "with these pictures, but by another", id="no camera now"),
+        pytest.param("masked", "ranged", 1, True, "with these pictures, but by another", id="another camera"),
+        pytest.param(None, "ranged", 2, False, "with other pictures.", id="another picture"),
+        pytest.param("masked", None, 2, None, "with other pictures, or these by another", id="another mask then"),
+    ],
+)
+def test_the_same_picture_by_another_camera_is_told_from_another_picture(
+    server: Server, map_id: str, enrolled: str | None, compared_by: str | None, number: int, picture: bool | None,
+    text: str,
+) -> None:  # fmt: skip
+    cameras = {"masked": {"mask": {"polygons": [[[0, 0], [0.2, 0], [0, 0.2]]]}}, "ranged": {"value_range": [0, 1020]}}
+    for name, camera in cameras.items():
+        assert server.client.put(f"/v1/maps/{map_id}/cameras/{name}", json=camera).is_success
+    server.enrol(map_id, "a", jpeg(1), sequence="day", **({} if enrolled is None else {"camera": enrolled}))
+    order = {"places": [{"id": "a", "sha256": digest(number)}], "sequence": "day", "camera": compared_by}
+    (one,) = server.client.post(f"/v1/maps/{map_id}/places:compare", json=order).json()["taken"]
+    assert (one["same"], one["picture"]) == (False, picture)
+    assert text in taken_text([TakenPlace.model_validate(one)], 1)
+
+
+@pytest.mark.parametrize(
+    ("there", "coordinates", "refused"),
+    [
+        ({"x": 1, "y": 2}, "geographic", True),
+        ({"x": 1, "y": 2}, "metric", False),
+        ({"latitude": 49, "longitude": 8}, "metric", True),
+        ({"latitude": 49, "longitude": 8}, None, False),
+        ({}, "geographic", False),
+    ],
+)
+def test_poses_of_the_other_kind_are_refused_before_anything_is_sent(
+    server: Server, map_id: str, there: dict[str, float], coordinates: str | None, refused: bool
+) -> None:
+    server.enrol(map_id, "a", jpeg(1), **there)
+    order = {"places": [{"id": "b"}], "sequence": "day", "coordinates": coordinates}
+    answer = server.client.post(f"/v1/maps/{map_id}/places:compare", json=order)
+    if refused:
+        assert_problem(answer, 409, "mixed-coordinates")
+    else:
+        assert answer.status_code == 200, answer.text
 
 
 def test_nothing_is_replaced_unless_it_is_to_be(server: Server, map_id: str) -> None:

@@ -23,6 +23,7 @@ from tests.core.recordings.bags import (
     WRITERS,
     camera_info,
     compressed,
+    fix,
     image,
     moved,
     walk,
@@ -210,6 +211,52 @@ def test_a_camera_without_a_range_gets_that_of_a_bag_of_ten_bits(
 
     refused = placerec(*words, "--sequence", "again", "--id-prefix", "n-", status=1).stderr
     assert "name a camera of the map" in refused and refused.count("and 3 more frames: The frame has no region") == 1
+
+
+def test_a_bag_is_kept_while_frames_of_it_failed(taking: Server, tmp_path: Path) -> None:
+    """What the failures name as the way out needs the bag."""
+    greys = [cv2.cvtColor(scene(number), cv2.COLOR_BGR2GRAY) for number in range(3)]
+    ten = [(grey.astype(np.uint16) * 4).tobytes() for grey in greys]
+    dark = [image(START + n * SECOND, 320, 240, "mono16", data, 640) for n, data in enumerate(ten)]
+    torn = compressed(START + 9 * SECOND, b"no picture at all")
+    bags = {"none.mcap": dark, "some.mcap": [*(compressed(START + n * SECOND, jpeg(n)) for n in range(3)), torn]}
+    taking.create_map("kept")
+    for name, said in bags.items():
+        data = write_mcap(tmp_path / name, said).read_bytes()
+        assert put(taking, "kept", name, 0, data).status_code == 200
+        job = enrolled(taking, "kept", name, keep_standing=True)
+        if name == "none.mcap":
+            problem = job["problem"]
+            assert job["state"] == "failed" and problem["type"].endswith(":nothing-enrolled")
+            assert "None of the 3 frames became a place" in problem["detail"] and len(problem["errors"]) == 3
+            assert problem["errors"][0]["message"] in problem["detail"]
+            assert taking.client.put("/v1/maps/kept/cameras/deep", json={}).status_code == 201
+            again = {"camera": "deep"}
+        else:
+            assert job["state"] == "succeeded" and job["result"]["failed"]["count"] == 1
+            assert "the uploaded bag is kept" in job["result"]["remarks"][-1]
+            again = {}
+        assert taking.client.get(f"/v1/maps/kept/recordings/{name}").json()["bytes"] == len(data)
+        if again:
+            assert enrolled(taking, "kept", name, **again)["result"]["changes"] == {"created": 3}
+            assert taking.client.get(f"/v1/maps/kept/recordings/{name}").json()["bytes"] == 0
+
+
+def test_degrees_are_refused_by_a_map_in_metres_before_a_frame_is_read(
+    taking: Server, placerec: Placerec, tmp_path: Path
+) -> None:
+    taking.create_map("metres")
+    taking.enrol("metres", "first", jpeg(1), x=1, y=2, sequence="day")
+    said = [*(compressed(START + n * SECOND, jpeg(n)) for n in range(3)),
+            *(fix(START + n * SECOND, 49.0 + n * 1e-5, 8.0) for n in range(3))]  # fmt: skip
+    bag = write_mcap(tmp_path / "earth.mcap", said)
+    assert put(taking, "metres", "earth.mcap", 0, bag.read_bytes()).status_code == 200
+    for more in ({}, {"replace": True}):
+        problem = enrolled(taking, "metres", "earth.mcap", pose_topic="/fix", keep_standing=True, **more)["problem"]
+        assert problem["type"].endswith(":mixed-coordinates") and "a map has one kind" in problem["detail"]
+    told = placerec("enrol", bag, "--map", "metres", "--pose-topic", "/fix", "--url", taking.client.base_url, status=1)
+    assert "a map has one kind" in told.stderr and "more frames" not in told.stderr and "--sequence" not in told.stderr
+    assert list(places(taking, "metres")) == ["first"]
 
 
 def test_intrinsics_that_are_none_are_told_and_not_stored(taking: Server, tmp_path: Path) -> None:
