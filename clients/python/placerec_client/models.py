@@ -1905,6 +1905,7 @@ class TakenPlace(Model):
     id: str
     sequence: str | None = None
     same: bool | None = None
+    picture: bool | None = None
 
 
 class TraverseComparison(Model):

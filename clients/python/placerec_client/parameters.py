@@ -1195,6 +1195,9 @@ class TraverseToCompare(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frames."""
 
+    coordinates: Literal["metric", "geographic"] | None
+    """What the frames' poses are in: metric or geographic; null: they have none."""
+
 
 class Label(TypedDict):
     """The true place of one frame of a form."""

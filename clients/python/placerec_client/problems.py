@@ -345,6 +345,10 @@ class NotAnImage(Problem):
     """422 ``not-an-image``: The frame is not an image."""
 
 
+class NothingEnrolled(Problem):
+    """422 ``nothing-enrolled``: No frame became a place."""
+
+
 class NothingToMeasure(Problem):
     """422 ``nothing-to-measure``: The map has no frames to measure the recall with."""
 
@@ -610,6 +614,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "invalid-traverse": InvalidTraverse,
     "no-regions": NoRegions,
     "not-an-image": NotAnImage,
+    "nothing-enrolled": NothingEnrolled,
     "nothing-to-measure": NothingToMeasure,
     "plan-too-large": PlanTooLarge,
     "too-few-frames": TooFewFrames,
