@@ -305,7 +305,7 @@ def _report(
     """
     previous = calibration_of(map_, encoder)
     change = held_out_change(found, previous, drawn)
-    same = _in_force(found.calibration) == _in_force(previous)
+    same = _figures(found.calibration) == _figures(previous)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -320,9 +320,10 @@ def _report(
     )
 
 
-def _in_force(calibration: Calibration) -> Calibration:
-    """What judges answers of a calibration, whatever it rests on."""
-    return calibration.model_copy(update={"source": "", "frames": None})
+def _figures(calibration: Calibration) -> Any:
+    """What judges answers of a calibration, whatever it rests on; JSON without the last digits, which fitting moves."""
+    told = calibration.model_dump_json(exclude={"source", "frames"})
+    return json.loads(told, parse_float=lambda digits: f"{float(digits):.9g}")
 
 
 def _store_report(
