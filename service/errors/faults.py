@@ -40,13 +40,15 @@ class ImplausiblePose(Fault):
 
 
 class UnsupportedMediaType(Fault):
-    """The resource does not support the content type, or the bytes are of another type."""
+    """The resource does not support the content type or coding, or the bytes are of another type.
 
+    Args:
+        headers: of the answer.
+    """
 
-class UnsupportedCoding(UnsupportedMediaType):
-    """The body is sent in a content coding, such as gzip."""
-
-    headers: ClassVar = {"Accept-Encoding": "identity"}
+    def __init__(self, detail: str, headers: dict[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.headers = headers
 
 
 class BodyTooLarge(Fault):

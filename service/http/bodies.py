@@ -21,7 +21,7 @@ from service.errors.faults import (
     InvalidRequest,
     MalformedBody,
     MemoryFull,
-    UnsupportedCoding,
+    UnsupportedMediaType,
 )
 from service.fairness import Holding, SharedRoom
 from service.http.digests import StatedDigests
@@ -100,7 +100,7 @@ class Intake:
             MemoryFull: the uploads under way leave no room for the body, or not any more.
             DeadlineExceeded: the body did not arrive in time.
             ClientGone: the connection was closed before the end of the body, and nothing was answered yet.
-            UnsupportedCoding: the body is compressed.
+            UnsupportedMediaType: the body is compressed.
             InvalidRequest: its digest is malformed.
             DigestMismatch: the whole body has another digest; this comes in place of its last bytes.
         """
@@ -139,8 +139,9 @@ class Intake:
         if self._digests is None:
             codings = self._headers.get("content-encoding", "")
             if coding := next((one for one in codings.split(",") if one.strip().lower() not in ("", "identity")), None):
-                raise UnsupportedCoding(
-                    f"Content-Encoding: {coding.strip()[:40]!r} is not taken here; send the body as it is."
+                raise UnsupportedMediaType(
+                    f"Content-Encoding: {coding.strip()[:40]!r} is not taken here; send the body as it is.",
+                    {"Accept-Encoding": "identity"},
                 )
             self._digests = StatedDigests()
             for header in self._digest_headers:

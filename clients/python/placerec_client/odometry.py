@@ -55,7 +55,7 @@ class Odometry:
         return {
             "odometry_x": self.x,
             "odometry_y": self.y,
-            "odometry_heading": self.heading,
+            "odometry_heading": float(self.heading) % 360,
             "odometry_covariance": self.covariance,
             "odometry_origin": self.origin,
         }

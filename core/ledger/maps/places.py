@@ -387,7 +387,9 @@ NO_PLACE = -1
 
 _NUMBERED = select(_P.x.is_not(None)).where(_P.map == bindparam("map"), _IS_PLACE, _P.number != bindparam("but"))
 _NEWEST_FIRST = _NUMBERED.order_by(_P.number.desc()).limit(1)
-_NEWEST_POSE = Statement(_NEWEST_FIRST.where(_P.x.is_not(None) | _P.latitude.is_not(None)))
+_HAS_POSE = _P.x.is_not(None) | _P.latitude.is_not(None)
+_NEWEST_POSE = Statement(_NEWEST_FIRST.where(_HAS_POSE))
+_POSE_AT = Statement(_NUMBERED.where(_HAS_POSE, _P.number == bindparam("number")))
 _POSE_OF: dict[PoseKind, Statement] = {
     "metric": Statement(_NEWEST_FIRST.where(_P.x.is_not(None))),
     "geographic": Statement(_NEWEST_FIRST.where(_P.latitude.is_not(None))),
@@ -443,15 +445,18 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
     return Statement(query.where(_P.number > bindparam("after")).order_by(_P.number).limit(bindparam("most")))
 
 
-def kinds_of_poses(connection: MapConnection, kind: PoseKind, but: int = NO_PLACE) -> set[PoseKind]:
-    """The kind of the pose that a place got last, and also ``kind`` if any place has a pose of it; none without poses.
+def kinds_of_poses(
+    connection: MapConnection, kind: PoseKind, but: int = NO_PLACE, posed: int = NO_PLACE
+) -> set[PoseKind]:
+    """The kind of the pose of one place, and also ``kind`` if any place has a pose of it; none without poses.
 
     It is quick where the first is ``kind``, as in any map of one kind.
 
     Args:
         but: the number of a place that does not count.
+        posed: the number of a place that may have a pose, and is looked at first; else it is the newest that has one.
     """
-    newest = connection.one(_NEWEST_POSE, but=but)
+    newest = connection.one(_POSE_AT, but=but, number=posed) or connection.one(_NEWEST_POSE, but=but)
     if newest is None:
         return set()
     found: set[PoseKind] = {"metric" if newest[0] else "geographic"}

@@ -32,6 +32,7 @@ class MapState:
     numbers: the number of the next place.
     revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
         and made again is told from the first one.
+    posed: the number of a place that got a pose while the map was open, and may have it still; 0: none is known.
     recent: whether it was written to in the last ``RECENT_SECONDS`` by the clock of the database.
     collection: Milvus's id of the collection that has them; 0 as long as there are none.
     """
@@ -46,6 +47,7 @@ class MapState:
     collection: int = 0
     looks: int = 0
     recent: bool = True
+    posed: int = 0
 
     @property
     def searched(self) -> int:

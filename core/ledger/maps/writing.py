@@ -197,9 +197,11 @@ class Write(ABC):
         kind = pose.kind()
         if stored is not None and stored.place.pose is not None and stored.place.pose.kind() == kind:
             return
-        known = places.kinds_of_poses(self.connection, kind, places.NO_PLACE if stored is None else stored.number)
+        but = places.NO_PLACE if stored is None else stored.number
+        known = places.kinds_of_poses(self.connection, kind, but, self.state.posed)
         check_coordinates(known, kind, f"The pose of place {place_id!r}")
         self._kinds = {*known, kind}
+        self.state = replace(self.state, posed=self.state.numbers if stored is None else stored.number)
 
     def _expect_room_for_look(self, place_id: str, digest: bytes) -> StoredPlace:
         """The place that a new look is of.

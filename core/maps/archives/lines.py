@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from core.errors import InvalidArchive
+from core.errors import InvalidArchive, InvalidIdentifier
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.frames.value_ranges import ValueRange
@@ -35,7 +35,10 @@ Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 def _as_written(name: str) -> str:
     """The name of a sequence as the file has it, which may be from before texts had one form: it has two such apart."""
-    check_sequence(name)
+    try:
+        check_sequence(name)
+    except InvalidIdentifier as error:
+        raise ValueError(str(error)) from error
     return name
 
 

@@ -98,6 +98,7 @@ def argument(parameter: inspect.Parameter, folder: Path) -> Any:
         r"(Iterable|Sequence)\[NewPlace\]": [NewPlace("p", frame)],
         r"str \| os\.PathLike\[str\]": folder / "map.tar",
         r"parameters\.\w+": {},
+        r"Sequence\[parameters\.FrameToCompare\]": [{"id": "p"}],
         r"Literal\['(\w+)'.*": "map",
     }
     return next(value for kind, value in kinds.items() if re.fullmatch(kind, str(parameter.annotation)))

@@ -7,12 +7,13 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.frames.images import Limits, decode
+from core.frames.images import decode
 from core.frames.preprocessing import Pixels
 from service.errors.faults import TooManyListeners
 from service.events import events as module
@@ -200,9 +201,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """The sizes of the frames of which pictures are made."""
     sizes: list[int] = []
 
-    def counting(data: bytes, limits: Limits) -> Pixels:
+    def counting(data: bytes, *options: Any) -> Pixels:
         sizes.append(len(data))
-        return decode(data, limits)
+        return decode(data, *options)
 
     monkeypatch.setattr(module, "decode", counting)
     yield sizes
@@ -233,9 +234,9 @@ async def test_pictures_are_made_only_for_listeners_who_want_them(drawn: list[in
 async def test_frames_whose_pictures_are_being_made_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = threading.Event()
 
-    def held(data: bytes, limits: Limits) -> Pixels:
+    def held(data: bytes, *options: Any) -> Pixels:
         gate.wait(60)
-        return decode(data, limits)
+        return decode(data, *options)
 
     monkeypatch.setattr(module, "decode", held)
     events, frame = Events(), jpeg(1)

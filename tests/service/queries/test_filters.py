@@ -95,7 +95,6 @@ def numbers(*which: int) -> set[str]:
         ({"where": {"floor": 1.0, "light": "day"}}, (1,)),
         ({"where": {"floor": True}}, ()),
         ({"where": {"floor": 0}, "sequences": "monday", "x": 20, "y": 0, "radius": 11}, (2,)),
-        ({"bbox": "0,0,1,1"}, ()),
         ({"sequence": "tuesday, late", "exclude_frames": 3}, (0, 1, 2, 3, 4)),
         ({"sequence": "never", "exclude_frames": 3}, range(PLACES)),
         ({"sequence": "tuesday, late", "timestamp": "2026-11-20T10:07:30Z", "exclude_seconds": 91}, (0, 1, 2, 3, 4, 5)),
