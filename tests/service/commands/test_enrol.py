@@ -203,11 +203,12 @@ def test_a_camera_that_is_not_there_is_refused_before_a_map_is_made(
     placerec: Placerec, monday: Path, server: Server, map_id: str
 ) -> None:
     there = ("--camera", "front", "--url", server.client.base_url)
-    refused = placerec("enrol", monday, "--map", "fresh", "--create", *there, status=2).stderr
+    new = f"{map_id}-new"
+    refused = placerec("enrol", monday, "--map", new, "--create", *there, status=2).stderr
     said = " ".join(refused.replace("│", " ").split())
-    assert "There is no map 'fresh', and a map that --create makes has no camera yet." in said
-    assert "'placerec maps create fresh', then 'placerec maps cameras put fresh front'" in said
-    assert server.client.get("/v1/maps/fresh").status_code == 404
+    assert f"There is no map '{new}', and a map that --create makes has no camera yet." in said
+    assert f"'placerec maps create {new}', then 'placerec maps cameras put {new} front'" in said
+    assert server.client.get(f"/v1/maps/{new}").status_code == 404
 
     for words in ((), ("--create",)):
         missing = placerec("enrol", monday, "--map", map_id, *words, *there, status=1).stderr
