@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from core.numerals import check_numeral
+from core.numerals import check_numeral, check_whole_numeral
 from core.places import Camera
 from core.recognition.question import Verify
 from service.errors.faults import InvalidRequest
@@ -57,7 +57,10 @@ class Parameters(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _plain_number(cls, value: Any, info: ValidationInfo) -> Any:
-        return check_numeral(value) if isinstance(value, str) and info.field_name in _numbers_of(cls) else value
+        kinds = _numbers_of(cls).get(info.field_name or "")
+        if not kinds or not isinstance(value, str):
+            return value
+        return check_whole_numeral(value) if kinds == {int} else check_numeral(value)
 
     def joined(self, fields: Mapping[str, str]) -> Self:
         """These parameters, from the query string, together with the fields of a form.
@@ -75,14 +78,16 @@ class Parameters(BaseModel):
 
 
 @cache
-def _numbers_of(model: type[BaseModel]) -> frozenset[str]:
-    """The names of the fields that are numbers."""
-    return frozenset(name for name, field in model.model_fields.items() if _is_number(field.annotation))
+def _numbers_of(model: type[BaseModel]) -> dict[str, set[type]]:
+    """Which kinds of numbers each field takes, ``int`` and ``float``; none where it takes texts."""
+    return {name: _numbers_in(field.annotation) for name, field in model.model_fields.items()}
 
 
-def _is_number(annotation: Any) -> bool:
+def _numbers_in(annotation: Any) -> set[type]:
+    if annotation in (int, float):
+        return {annotation}
     parts = get_args(annotation)
-    return annotation in (int, float) or (str not in parts and any(map(_is_number, parts)))
+    return set() if str in parts else set().union(*map(_numbers_in, parts))
 
 
 class PageParameters(Parameters):

@@ -456,10 +456,11 @@ def kinds_of_poses(
         but: the number of a place that does not count.
         posed: the number of a place that may have a pose, and is looked at first; else it is the newest that has one.
     """
-    newest = connection.one(_POSE_AT, but=but, number=posed) or connection.one(_NEWEST_POSE, but=but)
-    if newest is None:
+    known = connection.one(_POSE_AT, but=but, number=posed) if posed > 0 else None
+    known = known or connection.one(_NEWEST_POSE, but=but)
+    if known is None:
         return set()
-    found: set[PoseKind] = {"metric" if newest[0] else "geographic"}
+    found: set[PoseKind] = {"metric" if known[0] else "geographic"}
     if kind not in found and connection.one(_POSE_OF[kind], but=but) is not None:
         found.add(kind)
     return found
