@@ -120,13 +120,13 @@ class Names:
         return {**handler(schema), **lengths, "pattern": f"^{self.pattern}$"}
 
 
-def texts(what: str) -> Names:
-    """Names that are texts, of 1 to ``LONGEST`` characters."""
+def texts(what: str, most: int = LONGEST) -> Names:
+    """Names that are texts, of 1 to ``most`` characters."""
     rule = (
-        f"has 1 to {LONGEST} characters, no slash or backslash, no characters that cannot be seen, "
+        f"has 1 to {most} characters, no slash or backslash, no characters that cannot be seen, "
         "no space at its beginning, and is not '.' or '..', however they are written"
     )
-    return Names(what, TEXT, rule, LONGEST)
+    return Names(what, TEXT, rule, most)
 
 
 def words(what: str, most: int, more: str = "~") -> Names:

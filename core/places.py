@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable
+import zlib
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,7 @@ from core.numerals import LOST_PLUS
 MAP_IDS = names.file_names("a map", but="import")
 PLACE_IDS = names.words("a place", 128)
 SEQUENCES, CAMERAS = names.texts("a sequence"), names.words("a camera", 64)
+LEVELS = names.texts("a level", 32)
 MAP_ID, PLACE_ID = MAP_IDS.pattern, PLACE_IDS.pattern
 LOOK = r"[0-9a-f]{16}"
 """The pattern of a look's name: the first digits of its frame's SHA-256, so that a frame gives a place one look."""
@@ -30,6 +32,9 @@ NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
 
 NO_SEQUENCE = -1
 """The code of the places that belong to no sequence; each of them has an ordinal that no other has."""
+
+NO_LEVEL = -1
+"""The code of the level of places of which it is not known."""
 
 SAME_VIEW = 3
 """Frames at one position of a sequence, which show one view, are the same place up to this many times the radius.
@@ -239,8 +244,60 @@ Sequence = Annotated[str, SEQUENCES]
 Camera = Annotated[str, CAMERAS]
 
 
+def _level_text(value: Any) -> Any:
+    """The text of a level; a whole number becomes its digits."""
+    whole = isinstance(value, int | float) and not isinstance(value, bool) and value == value // 1
+    return str(int(value)) if whole else value
+
+
+Level = Annotated[str, LEVELS, BeforeValidator(_level_text, json_schema_input_type=str | int)]
+
+LEVEL_KEYS = ("level", "floor", "storey", "story")
+"""The keys of metadata under which the level of a place is looked for that states none."""
+
+
+def level_in(metadata: Mapping[str, Any]) -> str | None:
+    """The level that metadata states under the first of ``LEVEL_KEYS``, if that can name one; else None."""
+    stated = next((_level_text(metadata[key]) for key in LEVEL_KEYS if key in metadata), None)
+    try:
+        return LEVELS.check(stated) if isinstance(stated, str) else None
+    except InvalidIdentifier:
+        return None
+
+
+def level_code(level: str | None) -> int:
+    """The code of a level in :class:`Whereabouts`, the same in all maps: 31 bits of its CRC-32; NO_LEVEL for None.
+
+    Of a hundred levels two have one code with a probability of 2e-6; these two would then be compared by their heights.
+    """
+    return NO_LEVEL if level is None else zlib.crc32(level.encode()) >> 1
+
+
+class PoseAccuracy(BaseModel):
+    """Standard deviations of a pose, as whoever states it knows them.
+
+    metres: of each coordinate along the ground.
+    degrees: of the heading; None: not stated.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    metres: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, description="Of each coordinate.")]
+    degrees: Annotated[
+        float | None, Field(gt=0, le=360, allow_inf_nan=False, description="Of the heading; null: not stated.")
+    ] = None
+
+
+def accuracy_of(metres: float | None, degrees: float | None) -> PoseAccuracy | None:
+    """An accuracy of its stored numbers, which are valid; None if no metres are stored."""
+    return None if metres is None else PoseAccuracy.model_construct(metres=metres, degrees=degrees)
+
+
 class PlaceFields(BaseModel):
-    """A caller's statements about a frame; each may be left out."""
+    """A caller's statements about a frame; each may be left out.
+
+    A place that states no level has the one that its metadata states (:func:`level_in`).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -248,7 +305,15 @@ class PlaceFields(BaseModel):
     timestamp: Timestamp | None = None
     sequence: Sequence | None = None
     camera: Camera | None = Field(default=None, description="Whose mask was applied to the frame.")
+    level: Level | None = Field(default=None, description="The storey on which it is.")
+    pose_accuracy: PoseAccuracy | None = Field(default=None, description="How exact its pose is; null: not stated.")
     metadata: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _level_of_metadata(self) -> Self:
+        if self.level is None and (stated := level_in(self.metadata)) is not None:
+            object.__setattr__(self, "level", stated)
+        return self
 
 
 class Place(PlaceFields):
@@ -324,9 +389,12 @@ class Whereabouts:
         alignment found; the place's own where nothing is known.
     least: float32 [n], the score of two stages from which a match with the frame is believed; -inf for all but frames
         that a map learnt from runs.
+    level: int32 [n], the codes of their storeys (:func:`level_code`); NO_LEVEL where it is not known.
+    height: float64 [n], metres, the z of the pose; NaN where it is not known.
+    accuracy: float32 [n], metres, the stated deviation of the pose (:class:`PoseAccuracy`); NaN where none is.
 
-    Heading and timestamp may be left out if none is known, track and station if all are the places' own, least if any
-    score will do.
+    Heading, timestamp, level, height and accuracy may be left out if none is known, track and station if all are the
+    places' own, least if any score will do.
     """
 
     kind: NDArray[np.int8]
@@ -338,14 +406,14 @@ class Whereabouts:
     track: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     station: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     least: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    level: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    height: NDArray[np.float64] = field(default_factory=lambda: np.empty(0, np.float64))
+    accuracy: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
 
     def __post_init__(self) -> None:
-        if len(self.heading) < len(self.kind):
-            object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
-        if len(self.timestamp) < len(self.kind):
-            object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
-        if len(self.least) < len(self.kind):
-            object.__setattr__(self, "least", np.full(len(self.kind), -np.inf, np.float32))
+        for name, nothing in _NOT_KNOWN.items():
+            if len(column := getattr(self, name)) < len(self.kind):
+                object.__setattr__(self, name, np.full(len(self.kind), nothing, column.dtype))
         if len(self.track) < len(self.kind):
             object.__setattr__(self, "track", self.sequence.copy())
             object.__setattr__(self, "station", self.ordinal.copy())
@@ -374,8 +442,10 @@ class Whereabouts:
         """The same, but for the poses of some places (integers or a mask), which then have none."""
         chosen = np.asarray(places)
         kind, position, heading = self.kind.copy(), self.position.copy(), self.heading.copy()
-        kind[chosen], position[chosen], heading[chosen] = NO_POSE, 0.0, np.nan
-        return replace(self, kind=kind, position=position, heading=heading)
+        height, accuracy = self.height.copy(), self.accuracy.copy()
+        kind[chosen], position[chosen] = NO_POSE, 0.0
+        heading[chosen] = height[chosen] = accuracy[chosen] = np.nan
+        return replace(self, kind=kind, position=position, heading=heading, height=height, accuracy=accuracy)
 
     @classmethod
     def joined(cls, parts: Iterable[Whereabouts]) -> Whereabouts:
@@ -451,3 +521,6 @@ def _repeated(sequence: NDArray[np.int32], ordinal: NDArray[np.int64]) -> NDArra
 
 
 _SEQUENCE = 40  # bits of a position
+_NOT_KNOWN = {
+    "heading": np.nan, "timestamp": NO_TIME, "least": -np.inf, "level": NO_LEVEL, "height": np.nan, "accuracy": np.nan
+}  # fmt: skip

@@ -82,7 +82,7 @@ def _text_of(wanted: PlaceFilter) -> str | None:
     ids = None if wanted.ids is None else json.dumps(wanted.ids)
     metadata = json.dumps(dict(wanted.metadata)) if wanted.metadata else None
     after, before = (moment and moment_text(moment) for moment in (wanted.after, wanted.before))
-    given = [ids, wanted.camera, after, before, metadata]
+    given = [ids, wanted.camera, wanted.level, after, before, metadata]
     return None if given == [None] * len(given) else json.dumps(given)
 
 

@@ -15,7 +15,7 @@ class PlaceFilter:
     """Conditions on a place; all of those that are given have to hold.
 
     ids: it has one of these ids.
-    sequence, camera: it belongs to this traverse; this camera took its frame.
+    sequence, camera, level: it belongs to this traverse; this camera took its frame; it is on this storey.
     after, before: it has a timestamp of this time or later; or earlier.
     metadata: its metadata has these values at the top level.  Numbers are compared as numbers (1 equals 1.0), and true
         is not 1.
@@ -24,6 +24,7 @@ class PlaceFilter:
     ids: tuple[str, ...] | None = None
     sequence: str | None = None
     camera: str | None = None
+    level: str | None = None
     after: datetime | None = None
     before: datetime | None = None
     metadata: Mapping[str, Scalar] = field(default_factory=dict)

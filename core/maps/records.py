@@ -15,7 +15,7 @@ from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
 from core.names import texts
-from core.places import PlaceFields, Pose, Timestamp, place_and_look
+from core.places import PlaceFields, Pose, Timestamp, level_in, place_and_look
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -427,6 +427,8 @@ def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFiel
     if "camera" in changes:
         raise InvalidField("The camera of a place cannot be changed: send its frame again.")
     document = fields.model_dump(include=set(PlaceFields.model_fields), exclude={"pose"})
+    if fields.level == level_in(fields.metadata):  # it follows the metadata, as long as nothing else is stated
+        document["level"] = None
     if fields.pose is not None:
         document["pose"] = fields.pose.model_dump(exclude_none=True)
     stored = {} if "sequence" in changes else {"sequence": document.pop("sequence")}  # which may be a name of old

@@ -56,7 +56,9 @@ def field_columns(fields: PlaceFields) -> dict[str, Any]:
     # SQLite stores -0.0 as 0.0, which the checksum of a row would distinguish.
     columns: dict[str, Any] = {name: None if value is None else value + 0.0 for name, value in pose.items()}
     columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
-    columns["camera"] = fields.camera
+    columns["camera"], columns["level"] = fields.camera, fields.level
+    columns["accuracy_metres"] = getattr(fields.pose_accuracy, "metres", None)
+    columns["accuracy_degrees"] = getattr(fields.pose_accuracy, "degrees", None)
     columns["metadata"] = metadata_text(fields.metadata)
     return columns
 

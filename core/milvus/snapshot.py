@@ -21,7 +21,7 @@ from core.maps.selection import Conditions, Selection
 from core.maps.store import Ranking, Rows, merged
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.expressions import all_of, any_row, bounds_of, with_tokens
-from core.places import NO_POSE, Neighborhood, Whereabouts, place_and_look
+from core.places import NO_LEVEL, NO_POSE, Neighborhood, Whereabouts, place_and_look
 from core.postgres import rows as stored_rows
 from core.postgres.forms import Form
 
@@ -194,7 +194,8 @@ class MilvusScope:
 
         expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
         where = whereabouts_of([there])
-        if neighborhood is not None and where.kind[0] != NO_POSE:  # within the cube in the ball of its neighbours
+        # Within the cube in the ball of its neighbours, if no level, which Milvus does not know, may part them.
+        if neighborhood is not None and where.kind[0] != NO_POSE and where.level[0] == NO_LEVEL:
             side = neighborhood.radius / 2
             inside = [
                 f"{axis} >= {at - side!r} and {axis} <= {at + side!r}"

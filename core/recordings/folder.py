@@ -12,21 +12,22 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from core.errors import InvalidImage, InvalidRecording, InvalidTraverse
 from core.frames.containers import read_header, read_structure
 from core.frames.traverses import find_images
 from core.names import composed
 from core.numerals import check_numeral
-from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
+from core.places import LEVEL_KEYS, Level, PlaceFields, Pose, PoseAccuracy, Timestamp, check_place_id, microseconds
 from core.recordings.frame import RecordedFrame, make_id
 from core.recordings.pictures import sendable
 from core.recordings.pose_names import NamedPose, named_pose
 
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
-COLUMNS = ("file", "id", *POSE, "timestamp")
+ACCURACY = ("accuracy_metres", "accuracy_degrees")
+COLUMNS = ("file", "id", *POSE, "timestamp", *ACCURACY, *LEVEL_KEYS)
 MOST_NAMED = 3
 """Files whose names say no pose that one remark names."""
 
@@ -49,6 +50,9 @@ class _Row(BaseModel):
     latitude: _Cell | None = None
     longitude: _Cell | None = None
     timestamp: Timestamp | None = None
+    level: Level | None = Field(default=None, validation_alias=AliasChoices(*LEVEL_KEYS))
+    accuracy_metres: _Cell | None = None
+    accuracy_degrees: _Cell | None = None
 
 
 class _Found(NamedTuple):
@@ -247,7 +251,8 @@ def _listed_frames(path: Path, prefix: str) -> Iterator[_Found]:
 
 def _check_columns(path: Path, columns: list[str]) -> None:
     unknown = [name for name in columns if name not in COLUMNS]
-    if unknown or "file" not in columns or len(set(columns)) < len(columns):
+    named = ["level" if name in LEVEL_KEYS else name for name in columns]
+    if unknown or "file" not in columns or len(set(named)) < len(columns):
         wrong = f"an unknown column {unknown[0]!r}" if unknown else "columns missing or given twice"
         raise InvalidTraverse(
             f"{path} has {wrong}. Its first line must name 'file' and may name {', '.join(COLUMNS[1:])}."
@@ -272,7 +277,17 @@ def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> 
     try:
         row = _Row.model_validate(given)
         pose = {name: value for name in POSE if (value := getattr(row, name)) is not None}
-        fields = PlaceFields(pose=Pose.model_validate(pose) if pose else None, timestamp=row.timestamp)
+        exact = {name: value for name in ACCURACY if (value := getattr(row, name)) is not None}
+        fields = PlaceFields(
+            pose=Pose.model_validate(pose) if pose else None,
+            timestamp=row.timestamp,
+            level=row.level,
+            pose_accuracy=PoseAccuracy.model_validate(
+                {name.removeprefix("accuracy_"): value for name, value in exact.items()}
+            )
+            if exact
+            else None,
+        )
     except ValidationError as error:
         fault = error.errors()[0]
         location = "".join(f"{part}: " for part in fault["loc"])
@@ -280,4 +295,8 @@ def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> 
     chosen = check_place_id(given["id"]) if "id" in given else _id(image, prefix)
     taken = None if fields.timestamp is None else 1000 * microseconds(fields.timestamp)
     load = partial(read_picture, image)
-    return _Found(image, RecordedFrame(chosen, image.name, load, fields.pose, fields.timestamp, taken), line)
+    frame = RecordedFrame(
+        chosen, image.name, load, fields.pose, fields.timestamp, taken, level=fields.level,
+        pose_accuracy=fields.pose_accuracy,
+    )  # fmt: skip
+    return _Found(image, frame, line)

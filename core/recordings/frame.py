@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from core.errors import InvalidRecording
 from core.frames.exif import read_pose_and_time
 from core.names import composed
-from core.places import Pose, microseconds
+from core.places import Pose, PoseAccuracy, microseconds
 
 NANOSECONDS = 1_000_000_000
 
@@ -29,6 +29,7 @@ class RecordedFrame:
     embedded: whether the timestamp, and the pose unless there is one, are those of the EXIF data of its bytes, which
         ``described`` reads.
     segment: from 1: a part of its recording, which is a traverse of its own, for its coordinates are.
+    level, pose_accuracy: the storey on which it was taken, and how exact its pose is, as a list of the folder says.
     local: where it was taken in the coordinates of its segment alone, if it has no pose for that; frames of one segment
         are compared by it, and it is stored nowhere.
     """
@@ -42,6 +43,8 @@ class RecordedFrame:
     embedded: bool = False
     segment: int = 1
     local: Pose | None = None
+    level: str | None = None
+    pose_accuracy: PoseAccuracy | None = None
 
     def described(self, data: bytes | None = None, with_zeros: bool = False) -> RecordedFrame:
         """The frame with the pose and the time in its bytes, if that is where they are.

@@ -19,7 +19,7 @@ from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.ledger.maps.writing import Descriptors, Write
 from core.maps.records import Enrolment
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, microseconds
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, level_code, microseconds
 from core.storage.database.segments import record_appended, segment_entries
 from core.storage.files import segment_files
 from core.storage.files.segment_files import Layout
@@ -45,6 +45,9 @@ def _location(stored: StoredPlace) -> Location:
         stored.track,
         stored.station,
         -inf if stored.least is None else stored.least,
+        level_code(stored.place.level),
+        nan if pose is None or pose.z is None else pose.z,
+        getattr(stored.place.pose_accuracy, "metres", nan),
     )
 
 

@@ -19,7 +19,7 @@ import typer
 
 from core.errors import InvalidIdentifier
 from core.names import LONGEST
-from core.places import check_sequence, coordinates_of
+from core.places import accuracy_of, check_sequence, coordinates_of
 from placerec_client.errors import InvalidFrame
 from service.commands.connection.batches import FrameToSend, SendingOutcome, enrol_frames, load
 from service.commands.connection.client import CommandTarget, DataDir, Refused, Service, Url, open_service, path_of, run
@@ -114,6 +114,17 @@ def enrol(
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
+    level: Annotated[
+        str | None, typer.Option(help="Storey on which the frames were taken that places.csv gives none.")
+    ] = None,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres: standard deviation of the coordinates of poses whose accuracy places.csv does not give.",
+            min=0,
+            max=1e6,
+        ),
+    ] = None,
     align: Annotated[
         bool, typer.Option("--align", help="Then find which frames show places that the map had already.")
     ] = False,
@@ -153,7 +164,8 @@ def enrol(
     """Enrol the frames of a recording, in their order, as places of a map.
 
     A directory of images is taken in natural order. Poses come from places.csv in it
-    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the file names if more
+    (file,id,x,y,z,heading,latitude,longitude,timestamp,level,accuracy_metres,accuracy_degrees; only file is required;
+    floor, storey or story for level), or else from the file names if more
     than half are of the form @east@north@…@heading@…@.jpg, or else from the EXIF data of the images; ids are the file
     names without their extension. The frames of a bag are taken in the order of their header stamps, of which their
     ids are made; those of a video are numbered. Of both, frames that show what the one before shows, as where the
@@ -193,6 +205,10 @@ def enrol(
             chosen = chosen if keep_standing else without_stops(opened, chosen, mask)
             if (way := way_of(chosen)) is not None:
                 remark(f"{way[0].upper()}{way[1:]}.")
+            exact = accuracy_of(accuracy or None, None)
+            chosen = [
+                replace(one, level=one.level or level, pose_accuracy=one.pose_accuracy or exact) for one in chosen
+            ]
             return [FrameToSend(taken, wanted.sequence, camera) for taken in chosen]
 
         report, frames, traverses = run(

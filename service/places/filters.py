@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.ledger.maps.places import LONGEST_TEXT
 from core.maps.place_filter import PlaceFilter, Scalar
-from core.places import Camera, Timestamp
+from core.places import Camera, Level, Timestamp
 from service.errors.faults import InvalidRequest
 from service.http.bodies import read_json
 from service.http.schemas import PageParameters
@@ -62,6 +62,7 @@ class PlacePageParameters(PageParameters):
 
     sequence: str | None = Field(default=None, max_length=128, description="Only the places of this traverse.")
     camera: str | None = Field(default=None, max_length=128, description="Only places that this camera took.")
+    level: Level | None = Field(default=None, description="Only places on this storey.")
     after: Timestamp | None = Field(default=None, description="Only places with this timestamp or a later one.")
     before: Timestamp | None = Field(default=None, description="Only places with this timestamp or an earlier one.")
     where: str | None = Field(
@@ -80,7 +81,7 @@ class PlacePageParameters(PageParameters):
         metadata = {} if self.where is None else checked_metadata(parsed_json(self.where, "where"))
         if self.after is not None and self.before is not None and self.after > self.before:
             raise InvalidRequest("after: the time is later than that of before.")
-        return PlaceFilter(None, self.sequence, self.camera, self.after, self.before, metadata)
+        return PlaceFilter(None, self.sequence, self.camera, self.level, self.after, self.before, metadata)
 
 
 PlacePageQuery = Annotated[PlacePageParameters, Query()]
@@ -95,6 +96,7 @@ class PlaceConditions(BaseModel):
 
     sequence: str | None = Field(default=None, max_length=128, description="It belongs to this traverse.")
     camera: Camera | None = Field(default=None, description="This camera took its frame.")
+    level: Level | None = Field(default=None, description="It is on this storey.")
     after: Timestamp | None = Field(default=None, description="It has this timestamp or a later one.")
     before: Timestamp | None = Field(default=None, description="It has this timestamp or an earlier one.")
     where: dict[str, Any] | None = Field(
@@ -110,7 +112,7 @@ class PlaceConditions(BaseModel):
         if self.after is not None and self.before is not None and self.after > self.before:
             raise InvalidRequest("filter: after is later than before.")
         metadata = {} if self.where is None else checked_metadata(self.where)
-        made = PlaceFilter(None, self.sequence, self.camera, self.after, self.before, metadata)
+        made = PlaceFilter(None, self.sequence, self.camera, self.level, self.after, self.before, metadata)
         if not made:
             raise InvalidRequest("filter: give at least one condition; to delete all places, delete the map.")
         return made

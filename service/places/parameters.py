@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from core.clocks import future
 from core.names import words
-from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
+from core.places import Coordinate, Level, PlaceFields, Pose, Sequence, Timestamp, accuracy_of
 from service.errors.faults import InvalidRequest
 from service.http.bodies import json_size
 from service.http.schemas import CameraName, EncoderAssertion, Parameters, validated
@@ -66,7 +66,7 @@ class PoseParameters(Parameters):
 
 
 class PlaceDescription(PoseParameters):
-    """Pose, time and traverse of a frame, flat."""
+    """Pose, time, traverse and storey of a frame, flat."""
 
     timestamp: Timestamp | None = Field(
         default=None,
@@ -77,6 +77,26 @@ class PlaceDescription(PoseParameters):
         default=None, description="The traverse that the frame belongs to.", examples=["monday"]
     )
     camera: CameraName = None
+    level: Level | None = Field(default=None, description="The storey on which the frame was taken.", examples=["2"])
+
+
+class NewPlace(PlaceDescription):
+    """The fields of a place, flat, but for its metadata."""
+
+    accuracy_metres: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Standard deviation of each coordinate.",
+    )
+    accuracy_degrees: float | None = Field(
+        default=None,
+        gt=0,
+        le=360,
+        allow_inf_nan=False,
+        description="Standard deviation of its heading; with accuracy_metres.",
+    )
 
     def fields(self, metadata: dict[str, Any], settings: Settings) -> PlaceFields:
         """The fields of a place with this description.
@@ -87,24 +107,28 @@ class PlaceDescription(PoseParameters):
         """
         check_metadata(metadata, settings)
         check_taken(self.timestamp)
+        if self.accuracy_degrees is not None and self.accuracy_metres is None:
+            raise InvalidRequest("accuracy_degrees: it needs accuracy_metres.")
         pose = self.given_pose()
         return PlaceFields(
             pose=validated(Pose, pose) if pose else None,
             timestamp=self.timestamp,
             sequence=self.sequence,
             camera=self.camera,
+            level=self.level,
+            pose_accuracy=accuracy_of(self.accuracy_metres, self.accuracy_degrees),
             metadata=metadata,
         )
 
 
-class EnrolParameters(PlaceDescription):
+class EnrolParameters(NewPlace):
     """Beside one frame to enrol."""
 
     metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"camera": "front"}'])
     encoder: EncoderAssertion = None
 
     def place_fields(self, settings: Settings) -> PlaceFields:
-        """The fields of the place; it raises what ``PlaceDescription.fields`` raises."""
+        """The fields of the place; it raises what ``NewPlace.fields`` raises."""
         metadata = {} if self.metadata is None else parse_metadata(self.metadata)
         return self.fields(metadata, settings)
 
@@ -161,7 +185,7 @@ class BatchParameters(Parameters):
         return self
 
 
-class BatchItem(PlaceDescription):
+class BatchItem(NewPlace):
     """One place of a batch: its frame is in a part of the form, or is the one that the place already has."""
 
     id: str = Field(description="Id of the place.", examples=["p7"])

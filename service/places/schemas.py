@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
 from core.maps import Change, Keep, SequenceSummary
-from core.places import Place, Pose, Sequence, Timestamp
+from core.places import Level, Place, Pose, PoseAccuracy, Sequence, Timestamp
 from service.errors.problems import Problem
 from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 
@@ -18,6 +18,8 @@ PLACE_EXAMPLE: dict[str, Any] = {
     "timestamp": "2026-11-20T10:00:00Z",
     "sequence": "monday",
     "camera": None,
+    "level": "2",
+    "pose_accuracy": {"metres": 0.2, "degrees": None},
     "metadata": {"camera": "front"},
     "regions": 600,
     "picture": "thumbnail",
@@ -40,6 +42,10 @@ class PlaceView(BaseModel):
     timestamp: Timestamp | None = Field(description="When the frame was taken.")
     sequence: str | None = Field(description="The traverse that it belongs to.")
     camera: str | None = Field(description="The camera whose mask was applied to the frame.")
+    level: str | None = Field(default=None, description="The storey on which it is; null: not known.")
+    pose_accuracy: PoseAccuracy | None = Field(
+        default=None, description="Standard deviations of its pose; null: not stated."
+    )
     metadata: dict[str, Any]
     regions: int = Field(description="Regions of interest found in the frame.")
     picture: Keep = Field(description="The picture that is stored of the frame.")
@@ -113,6 +119,8 @@ class PlaceChanges(BaseModel):
     pose: PoseChanges | None = None
     timestamp: Timestamp | None = None
     sequence: Sequence | None = None
+    level: Level | None = Field(default=None, description="Null: the one that the metadata states, if any.")
+    pose_accuracy: PoseAccuracy | None = None
     metadata: dict[str, Any] | None = None
 
 

@@ -17,7 +17,7 @@ from core.recognition.question import Question
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.filters import MOST_NAMES, checked_metadata, parsed_json
-from service.places.parameters import PlaceDescription
+from service.places.parameters import NewPlace, PlaceDescription
 from service.poses.geoposes import AnswerFormat
 
 Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
@@ -253,7 +253,7 @@ class SingleQueryParameters(QueryParameters):
     format: AnswerFormat = None
 
 
-class ClosureParameters(FilterParameters):
+class ClosureParameters(FilterParameters, NewPlace):
     """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
 
     id: str = Field(description="Id of the place that is created if the frame is unknown.", examples=["p9"])

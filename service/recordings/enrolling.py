@@ -13,7 +13,7 @@ from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
 from core.maps import Map
-from core.places import Camera, PlaceFields, check_sequence, coordinates_of
+from core.places import Camera, Level, PlaceFields, PoseAccuracy, check_sequence, coordinates_of
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
 from core.recordings.keyframes import Left, Spacing, keyframes, moving
@@ -62,6 +62,8 @@ class RecordingOrder(BaseModel):
     )
     id_prefix: str = Field(default="", max_length=64, description="Before the ids, which are made of topic and stamp.")
     camera: Camera | None = Field(default=None, description="Of the map; its mask is applied.")
+    level: Level | None = Field(default=None, description="The storey on which its frames were taken.")
+    pose_accuracy: PoseAccuracy | None = Field(default=None, description="How exact its poses are.")
     topic: str | None = Topic
     pose_topic: str | None = Topic
     fixed_frame: str | None = Topic
@@ -171,7 +173,7 @@ def enrol_recording(
             turns.begin_step()
             try:
                 traverse = traverse_of(sequence, chosen[position])
-                return _to_enrol(chosen[position], traverse, order.camera, mask, engine.settings)
+                return _to_enrol(chosen[position], traverse, order, mask, engine.settings)
             finally:
                 turns.end_step()
 
@@ -328,7 +330,7 @@ def _compare(
 
 
 def _to_enrol(
-    frame: RecordedFrame, sequence: str, camera: str | None, mask: Mask | None, settings: Settings
+    frame: RecordedFrame, sequence: str, order: RecordingOrder, mask: Mask | None, settings: Settings
 ) -> FrameToEnrol:
     """A frame as it is enrolled.
 
@@ -341,5 +343,8 @@ def _to_enrol(
         raise InvalidImage(str(error)) from error
     oversized = len(data) > settings.max_image_bytes
     check_part(FormPart(frame.name, None, None, b"" if oversized else data, oversized), settings)
-    fields = PlaceFields(pose=frame.pose, timestamp=frame.timestamp, sequence=sequence, camera=camera)
+    fields = PlaceFields(
+        pose=frame.pose, timestamp=frame.timestamp, sequence=sequence, camera=order.camera, level=order.level,
+        pose_accuracy=order.pose_accuracy,
+    )  # fmt: skip
     return FrameToEnrol(frame.id, fields, data, mask)

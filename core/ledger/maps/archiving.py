@@ -193,6 +193,8 @@ def _archived(
             "seen": stored.seen,
             "run": stored.run,
             "least": stored.least,
+            "level": place.level,
+            "pose_accuracy": None if place.pose_accuracy is None else place.pose_accuracy.model_dump(),
         }
     )
     size = 0 if picture is None else picture[0]

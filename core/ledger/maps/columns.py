@@ -13,16 +13,16 @@ from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import PLACES
 from core.ledger.statements import Statement
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts, level_code
 
 _P = PLACES.c
 _AT_ONCE = 65_536
-_NUMBERS = 13
+_NUMBERS = 14
 _COLUMNS = (
     select(
         _P.row, _P.checksum, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
         func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), _P.least,
-        func.substr(_P.timestamp, 1, 26),
+        _P.accuracy_metres, func.substr(_P.timestamp, 1, 26), _P.level,
     ).where(_P.map == bindparam("map"))
 )  # fmt: skip
 _ALL = Statement(_COLUMNS)
@@ -70,10 +70,13 @@ def read_columns(connection: MapConnection, rows: int, after: int | None = None)
         ValueError: a pose is invalid.
     """
     numbers, moments = [np.empty((0, _NUMBERS))], [np.empty(0, "datetime64[us]")]
+    levels: list[str | None] = []
     pages = connection.pages(_ALL, _AT_ONCE) if after is None else [connection.execute(_CHANGED, after=after)]
     for page in pages:
         numbers.append(np.array([values[:_NUMBERS] for values in page], np.float64).reshape(-1, _NUMBERS))
         moments.append(np.array([values[_NUMBERS] for values in page], dtype="datetime64[us]"))
+        levels += [values[_NUMBERS + 1] for values in page]
+    codes = {level: level_code(level) for level in set(levels)}
     found = np.concatenate(numbers)
     row = found[:, 0].astype(np.int64)
     if len(row) and row.max() >= rows:
@@ -91,6 +94,9 @@ def read_columns(connection: MapConnection, rows: int, after: int | None = None)
         found[:, 10].astype(np.int32),
         found[:, 11].astype(np.int64),
         np.where(np.isnan(found[:, 12]), -np.inf, found[:, 12]).astype(np.float32),
+        np.array([codes[level] for level in levels], np.int32),
+        found[:, 6],
+        found[:, 13].astype(np.float32),
     )
     return Columns(row, found[:, 1].astype(np.uint32), whereabouts)
 

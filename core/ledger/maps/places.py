@@ -36,6 +36,8 @@ from core.places import (
     Pose,
     PoseKind,
     Whereabouts,
+    accuracy_of,
+    level_code,
     microseconds,
     place_and_look,
 )
@@ -242,6 +244,8 @@ def _from_columns(columns: Mapping[str, Any], sequence: str | None) -> StoredPla
             timestamp=None if columns["timestamp"] is None else datetime.fromisoformat(columns["timestamp"]),
             sequence=sequence,
             camera=columns["camera"],
+            level=columns["level"],
+            pose_accuracy=accuracy_of(columns["accuracy_metres"], columns["accuracy_degrees"]),
             metadata=json.loads(columns["metadata"]),
             created_at=datetime.fromisoformat(columns["created_at"]),
             updated_at=datetime.fromisoformat(columns["updated_at"]),
@@ -400,7 +404,7 @@ Conditions = tuple[tuple[str, ...], int]
 
 
 def _conditions(wanted: PlaceFilter) -> Conditions:
-    names = ("ids", "sequence", "camera", "after", "before")
+    names = ("ids", "sequence", "camera", "level", "after", "before")
     return tuple(name for name in names if getattr(wanted, name) is not None), len(wanted.metadata)
 
 
@@ -410,6 +414,7 @@ def _values(wanted: PlaceFilter) -> dict[str, Any]:
         "sequence_name": wanted.sequence,
         "spellings": None if wanted.sequence is None else spellings(wanted.sequence),
         "camera_name": wanted.camera,
+        "level_name": wanted.level,
         "from_moment": wanted.after and moment_text(wanted.after),
         "to_moment": wanted.before and moment_text(wanted.before),
         **{f"token_{at}": token for at, token in enumerate(wanted_tokens(wanted.metadata))},
@@ -431,6 +436,7 @@ def _listing(conditions: Conditions, ids_alone: bool) -> Statement:
         "ids": among(_P.id, "ids"),
         "sequence": _P.sequence == code.scalar_subquery(),
         "camera": _P.camera == bindparam("camera_name"),
+        "level": _P.level == bindparam("level_name"),
         "after": _P.timestamp >= bindparam("from_moment"),
         "before": _P.timestamp <= bindparam("to_moment"),
     }
@@ -540,7 +546,9 @@ def with_fields(stored: StoredPlace, fields: PlaceFields, now: datetime) -> Stor
 
 def as_look(stored: StoredPlace, place: StoredPlace) -> StoredPlace:
     """A look with all that it shares with its place."""
-    of, shared = place.place, ("pose", "pose_of", "timestamp", "sequence", "metadata", "looks")
+    of, shared = place.place, (
+        "pose", "pose_accuracy", "pose_of", "level", "timestamp", "sequence", "metadata", "looks",
+    )  # fmt: skip
     return replace(
         with_place(stored, **{name: getattr(of, name) for name in shared}),
         sequence=place.sequence, ordinal=place.ordinal, track=place.track, station=place.station, look_of=place.number,
@@ -592,6 +600,9 @@ def whereabouts_of(stored: Sequence[StoredPlace]) -> Whereabouts:
         np.array([one.sequence if one.track is None else one.track for one in stored], np.int32),
         np.array([one.ordinal if one.station is None else one.station for one in stored], np.int64),
         np.array([-np.inf if one.least is None else one.least for one in stored], np.float32),
+        np.array([level_code(one.place.level) for one in stored], np.int32),
+        np.array([nan if pose is None or pose.z is None else pose.z for pose in poses], np.float64),
+        np.array([getattr(one.place.pose_accuracy, "metres", nan) for one in stored], np.float32),
     )
 
 

@@ -80,6 +80,8 @@ PLACES = _table(
     _column("sequence", integer()),
     _column("ordinal", integer()),
     _column("camera", text(), optional=True),
+    _column("level", text(), optional=True),
+    *(_column(name, real(), optional=True) for name in ("accuracy_metres", "accuracy_degrees")),
     _column("track", integer(), optional=True),
     _column("station", integer(), optional=True),
     _column("pose_of", text(), optional=True),

@@ -16,7 +16,7 @@ from core.judgement.verdict import Verdict
 from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
 from core.names import LONGEST, TEXT, composed
-from core.places import LOOK, PLACE_ID, Camera, PlaceFields, Pose, Timestamp, check_sequence
+from core.places import LOOK, PLACE_ID, Camera, Level, PlaceFields, Pose, PoseAccuracy, Timestamp, check_sequence
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to accept more."""
@@ -182,6 +182,8 @@ class PlaceLine(_Line):
     seen: Timestamp | None = None
     run: Annotated[str, Field(max_length=LONGEST, pattern=f"^{TEXT}$")] | None = None
     least: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    level: Level | None = None
+    pose_accuracy: PoseAccuracy | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -200,6 +202,8 @@ class PlaceLine(_Line):
             timestamp=self.timestamp,
             sequence=self.sequence,
             camera=self.camera,
+            level=self.level,
+            pose_accuracy=self.pose_accuracy,
             metadata=self.metadata,
         )
 
@@ -208,6 +212,7 @@ Kind = TypeVar("Kind", bound=_Line)
 
 _WITHIN: dict[str, type[BaseModel]] = {
     "pose": Pose,
+    "pose_accuracy": PoseAccuracy,
     "picture": Picture,
     "mask": Mask,
     "intrinsics": Intrinsics,

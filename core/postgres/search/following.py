@@ -275,9 +275,7 @@ def _both(
 def _locations(where: Whereabouts) -> Iterator[Location]:
     columns = (
         where.kind, where.position, where.sequence, where.ordinal, where.heading, where.timestamp, where.track,
-        where.station, where.least,
+        where.station, where.least, where.level, where.height, where.accuracy,
     )  # fmt: skip
-    for kind, position, sequence, ordinal, heading, timestamp, track, station, least in zip(
-        *(column.tolist() for column in columns), strict=True
-    ):
-        yield Location(kind, tuple(position), sequence, ordinal, heading, timestamp, track, station, least)
+    for kind, position, *others in zip(*(column.tolist() for column in columns), strict=True):
+        yield Location(kind, tuple(position), *others)

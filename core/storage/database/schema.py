@@ -40,7 +40,7 @@ _MORE = [
         for (table, index), numbers in _STATISTICS.items()
     ),
 ]
-TABLES = Tables("map", 12, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
+TABLES = Tables("map", 13, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
 SCHEMA = Schema(APPLICATION_ID, TABLES.version, TABLES.create("sqlite"))
 
 

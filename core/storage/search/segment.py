@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index.flat import Vectors, flat_index, products, vectors
-from core.places import NO_TIME, Whereabouts
+from core.places import NO_LEVEL, NO_TIME, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 
 _SMALLEST_TAIL = 8
@@ -31,6 +31,9 @@ class Location:
     track: int | None = None
     station: int | None = None
     least: float = -inf
+    level: int = NO_LEVEL
+    height: float = nan
+    accuracy: float = nan
 
 
 def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
@@ -45,6 +48,9 @@ def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
         np.array([one.sequence if one.track is None else one.track for one in locations], dtype=np.int32),
         np.array([one.ordinal if one.station is None else one.station for one in locations], dtype=np.int64),
         np.array([location.least for location in locations], dtype=np.float32),
+        np.array([location.level for location in locations], dtype=np.int32),
+        np.array([location.height for location in locations], dtype=np.float64),
+        np.array([location.accuracy for location in locations], dtype=np.float32),
     )
 
 

@@ -50,8 +50,11 @@ class FrameToSend:
         given = {name: repr(value) for name, value in pose if value is not None}
         if described.timestamp is not None:
             given["timestamp"] = described.timestamp.isoformat()
-        if self.camera is not None:
-            given["camera"] = self.camera
+        exact = () if described.pose_accuracy is None else described.pose_accuracy
+        given |= {f"accuracy_{name}": repr(value) for name, value in exact if value is not None}
+        given |= {
+            name: value for name, value in (("camera", self.camera), ("level", described.level)) if value is not None
+        }
         return {**given, "sequence": self.sequence}
 
 

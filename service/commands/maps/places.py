@@ -30,6 +30,7 @@ Erase = Annotated[
     bool, typer.Option("--erase", help="Also overwrite what they leave in files, and discard frames for review.")
 ]
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
+CLEARED = ("pose", "pose_accuracy", "timestamp", "sequence", "level", "metadata")
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
 
 
@@ -37,12 +38,13 @@ COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
 def list_places(
     map_id: MapId,
     sequence: Annotated[str | None, typer.Option(help="Only the places of this traverse.")] = None,
+    level: Annotated[str | None, typer.Option(help="Only the places on this storey.")] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """List a map's places in the order of their enrolment."""
-    params = {"sequence": sequence} if sequence is not None else None
+    params = {name: value for name, value in (("sequence", sequence), ("level", level)) if value is not None} or None
     found = list_items(CommandTarget(url, data_dir), path_of("maps", map_id, "places"), params)
     if as_json:
         show_json(found)
@@ -73,10 +75,11 @@ def edit_place(
     heading: Annotated[float | None, typer.Option(help="Degrees.")] = None,
     timestamp: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
     sequence: Annotated[str | None, typer.Option(help="Name of the traverse.")] = None,
+    level: Annotated[str | None, typer.Option(help="The storey on which it is.")] = None,
     metadata: Annotated[str | None, typer.Option(metavar="JSON", help="Merged into the metadata of the place.")] = None,
     clear: Annotated[
         list[str] | None,
-        typer.Option(help="Clear this field first: pose, timestamp, sequence or metadata; may be repeated."),
+        typer.Option(help=f"Clear this field first: {', '.join(CLEARED)}; may be repeated."),
     ] = None,
     url: Url = None,
     data_dir: DataDir = None,
@@ -84,10 +87,10 @@ def edit_place(
 ) -> None:
     """Change fields of a place; the others stay as they are."""
     cleared = dict.fromkeys(clear or [])
-    if unknown := set(cleared) - {"pose", "timestamp", "sequence", "metadata"}:
+    if unknown := set(cleared) - set(CLEARED):
         raise typer.BadParameter(f"--clear: unknown field {', '.join(sorted(unknown))}")
     pose = dict(zip(COORDINATES, (x, y, z, latitude, longitude, heading), strict=True))
-    given: dict[str, Any] = {"timestamp": timestamp, "sequence": sequence}
+    given: dict[str, Any] = {"timestamp": timestamp, "sequence": sequence, "level": level}
     given = {name: value for name, value in given.items() if value is not None}
     if any(value is not None for value in pose.values()):
         # With --clear pose the new pose may be in another frame of reference.
@@ -215,6 +218,7 @@ def _show_place(place: dict[str, Any], as_json: bool) -> None:
     _, sequence, pose, timestamp, regions = _cells(place)
     shown.add_row("sequence", sequence)
     shown.add_row("camera", place["camera"] or "–")
+    shown.add_row("level", place["level"] or "–")
     for name, value in {"pose": pose, "timestamp": timestamp, "regions": regions}.items():
         shown.add_row(name, value)
     for name in ("metadata", "picture", "created_at", "updated_at"):

@@ -26,7 +26,7 @@ from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, 
 from core.maps.archives.reading import Archive, check
 from core.maps.records import Outline
 from core.maps.selection import Conditions, RecentFrames
-from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, look_address, microseconds
+from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, level_code, look_address, microseconds
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
 from tests.durability.contents import sha
 from tests.durability.model import GONE, MapModel, PlaceModel, Refused, changed, differences
@@ -44,17 +44,20 @@ times = st.sampled_from([f"2026-11-{day:02}T10:00:00Z" for day in (1, 2, 3)])
 metres = st.integers(0, 30)
 poses = st.one_of(
     st.builds(lambda x, y, heading: {"x": x, "y": y, "heading": heading}, metres, metres, st.none() | st.just(90)),
+    st.builds(lambda x, z: {"x": x, "y": 10, "z": z}, metres, st.sampled_from([-4.0, 0.0])),
     st.builds(lambda latitude: {"latitude": latitude / 1e5, "longitude": 7.5}, metres),
 )
 fields = st.fixed_dictionaries(
     {}, optional={"pose": poses, "sequence": sequences, "timestamp": times, "metadata": metadata,
-                  "camera": st.sampled_from(["front", "rear"])}
+                  "camera": st.sampled_from(["front", "rear"]), "level": st.sampled_from(["B", "Ü", -1]),
+                  "pose_accuracy": st.sampled_from([{"metres": 0.5}, {"metres": 2.0, "degrees": 3.0}])}
 )  # fmt: skip
 items = st.fixed_dictionaries({"id": ids, "picture": pictures, "fields": fields, "keypoints": st.booleans()})
 patches = st.one_of(
     st.fixed_dictionaries({"sequence": sequences}),
     st.fixed_dictionaries({"metadata": st.none() | metadata}),
     st.just({"pose": None}),
+    st.just({"level": None, "pose_accuracy": None}),
 )
 conditions = st.builds(
     Conditions,
@@ -233,13 +236,17 @@ class StoreContract(RuleBasedStateMachine):
     def forget_sequence(self, name: str) -> None:
         self.agree(lambda model: model.forget_sequence(name), lambda lab: lab.forget_sequence(name))
 
-    @rule(camera=st.sampled_from(["front", "rear"]), where=st.dictionaries(st.just("floor"), scalars, max_size=1))
-    def forget_all(self, camera: str, where: dict[str, Any]) -> None:
-        wanted = PlaceFilter(camera=camera, metadata=where)
+    @rule(
+        camera=st.sampled_from(["front", "rear"]), where=st.dictionaries(st.just("floor"), scalars, max_size=1),
+        level=st.sampled_from([None, "B", "1"]),
+    )  # fmt: skip
+    def forget_all(self, camera: str, where: dict[str, Any], level: str | None) -> None:
+        wanted = PlaceFilter(camera=camera, level=level, metadata=where)
 
         def forgotten(model: MapModel) -> list[str]:
             found = [name for name, place in model.places.items()
-                     if place.fields.get("camera") == camera and _has(place, where)]  # fmt: skip
+                     if place.fields.get("camera") == camera and _has(place, where)
+                     and level in (None, PlaceFields.model_validate(place.fields).level)]  # fmt: skip
             if len(found) > 2:
                 raise Refused("TooManyToDelete")
             for name in found:
@@ -544,6 +551,9 @@ def _places(lab: Map) -> list[dict[str, Any]]:
         assert np.array_equal(where.position[at], np.zeros(3) if pose is None else pose.position())
         heading = None if pose is None else pose.heading
         assert np.isnan(where.heading[at]) if heading is None else where.heading[at] == np.float32(heading)
+        exact = np.nan if place.pose_accuracy is None else place.pose_accuracy.metres
+        assert np.array_equal(where.accuracy[at], exact, equal_nan=True) and where.level[at] == level_code(place.level)
+        assert np.array_equal(where.height[at], np.nan if pose is None or pose.z is None else pose.z, equal_nan=True)
     return [
         {
             **place.model_dump(mode="json"),

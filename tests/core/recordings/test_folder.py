@@ -13,7 +13,7 @@ import pytest
 from core.errors import EmptyImage, InvalidImage, InvalidRecording, InvalidTraverse, NotAnImage, UnsupportedFormat
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels
-from core.places import Pose
+from core.places import Pose, PoseAccuracy
 from core.recordings import Poses, open_recording
 from core.recordings.pictures import sendable
 from tests.service.scenes import encoded, jpeg, scene
@@ -95,6 +95,27 @@ def test_a_list_gives_order_ids_poses_and_times(tmp_path: Path) -> None:
         assert door.pose is not None and (door.pose.x, door.pose.y) == (1, 2) and plain.pose is None
         assert door.nanoseconds == 1_767_225_600_500_000_000
         assert "1 images of" in recording.remarks[0]
+
+
+@pytest.mark.parametrize("key", ["level", "floor", "storey", "story"])
+def test_a_list_gives_levels_and_how_exact_poses_are(tmp_path: Path, key: str) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.jpg").write_bytes(jpeg(1, 64, 48))
+    rows = f"file,x,y,{key},accuracy_metres,accuracy_degrees\na.jpg,1,2,-1,0.5,2\nb.jpg,1,2,,,\n"
+    (tmp_path / "places.csv").write_text(rows)
+    with open_recording(tmp_path) as recording:
+        cellar, plain = recording.frames
+    assert (cellar.level, cellar.pose_accuracy) == ("-1", PoseAccuracy(metres=0.5, degrees=2.0))
+    assert (plain.level, plain.pose_accuracy) == (None, None)
+    for wrong, why in (
+        (rows.replace(",-1,", ",a/b,"), "line 2: .*cannot name a level"),
+        (rows.replace(",0.5,", ",0,"), "line 2: metres"),
+        (rows.replace("0.5,2", ",2"), "line 2: metres"),
+        (rows.replace("accuracy_metres", "level" if key != "level" else "floor"), "given twice"),
+    ):
+        (tmp_path / "places.csv").write_text(wrong)
+        with pytest.raises(InvalidTraverse, match=why):
+            open_recording(tmp_path)
 
 
 Form = Literal["NFC", "NFD"]

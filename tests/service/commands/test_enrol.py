@@ -100,6 +100,18 @@ def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, se
     assert server.client.get(f"/v1/maps/{map_id}/places/2").json()["pose"] is None
 
 
+def test_a_level_and_an_accuracy_for_all_frames_that_have_none(
+    placerec: Placerec, monday: Path, server: Server, map_id: str
+) -> None:
+    (monday / "places.csv").write_text("file,x,y,floor,accuracy_metres\n9.jpg,1,2,-1,0.5\n1.jpg,1,2,,\n")
+    given = ("--level", "EG", "--accuracy", 2, "--url", server.client.base_url)
+    placerec("enrol", monday, "--map", map_id, *given)
+    found = {name: (place["level"], place["pose_accuracy"]["metres"]) for name, place in server.places(map_id).items()}
+    assert found == {"9": ("-1", 0.5), "1": ("EG", 2.0)}
+    listed = placerec("maps", "places", "list", map_id, "--level", "EG", *given[4:]).stdout
+    assert "9" not in listed and "1" in listed
+
+
 def test_places_of_the_other_kind_fail_alone_and_say_why(
     placerec: Placerec, monday: Path, server: Server, map_id: str
 ) -> None:

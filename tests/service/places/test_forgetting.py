@@ -51,6 +51,8 @@ CONDITIONS: list[tuple[dict[str, Any], list[str]]] = [
     ({"where": {"wet": 1}}, []),
     ({"where": {"floor": None}}, []),
     ({"sequence": "friday"}, []),
+    ({"level": "1"}, ["p3", "p4", "p5"]),
+    ({"level": 0, "sequence": "monday"}, ["p1"]),
 ]
 
 

@@ -181,6 +181,38 @@ def test_listing_and_its_pages(server: Server, map_id: str) -> None:
     assert client.get(path, params={"sequence": "none such"}).json()["items"] == []
 
 
+def test_a_level_and_the_accuracy_of_a_pose(server: Server, map_id: str) -> None:
+    exact = {"metres": 0.5, "degrees": 2.0}
+    made = server.enrol(map_id, "p", jpeg(1), x=1, y=2, level=2, accuracy_metres=0.5, accuracy_degrees=2).json()
+    assert (made["level"], made["pose_accuracy"]) == ("2", exact)
+    path, places = f"/v1/maps/{map_id}/places/p", f"/v1/maps/{map_id}/places"
+    batch = [{"id": "q", "file": "q", "level": -1, "accuracy_metres": 3}, {"id": "r", "file": "r", "level": "EG"}]
+    form = {"places": (None, json.dumps(batch)), **{name: (name, jpeg(2)) for name in "qr"}}
+    sent = server.client.post(f"{places}", files=form).json()["items"]
+    assert [item["place"]["level"] for item in sent] == ["-1", "EG"]
+    assert sent[0]["place"]["pose_accuracy"] == {"metres": 3.0, "degrees": None}
+    assert [one["id"] for one in server.client.get(places, params={"level": "EG"}).json()["items"]] == ["r"]
+    edited = server.client.patch(path, json={"level": 3, "pose_accuracy": {"metres": 1}}).json()
+    assert (edited["level"], edited["pose_accuracy"]) == ("3", {"metres": 1.0, "degrees": 2.0})
+    cleared = server.client.patch(path, json={"level": None, "pose_accuracy": None}).json()
+    assert (cleared["level"], cleared["pose_accuracy"]) == (None, None)
+    for wrong in ({"level": "a/b"}, {"level": "x" * 33}, {"accuracy_metres": 0}, {"accuracy_degrees": 2}):
+        assert_problem(server.enrol(map_id, "s", jpeg(3), **wrong), 422, "invalid-request")
+    for change in ({"level": 1.5}, {"level": True}, {"pose_accuracy": {"degrees": 2}}):
+        assert_problem(server.client.patch(path, json=change), 422, "invalid-request")
+
+
+def test_a_place_without_a_level_has_that_of_its_metadata(server: Server, map_id: str) -> None:
+    path = f"/v1/maps/{map_id}/places/p"
+    assert server.enrol(map_id, "p", jpeg(1), metadata={"floor": 2}).json()["level"] == "2"
+    assert server.client.patch(path, json={"metadata": {"floor": 3}}).json()["level"] == "3", "it follows"
+    assert server.client.patch(path, json={"level": "roof"}).json()["level"] == "roof"
+    assert server.client.patch(path, json={"metadata": {"floor": 4}}).json()["level"] == "roof"
+    assert server.client.patch(path, json={"level": None}).json()["level"] == "4"
+    for metadata in ({"floor": [1]}, {"storey": True}, {"level": "x" * 40}, {"height": 3}):
+        assert server.enrol(map_id, "q", jpeg(2), metadata=metadata).json()["level"] is None
+
+
 def test_editing_is_a_merge_patch(server: Server, map_id: str) -> None:
     path = f"/v1/maps/{map_id}/places/p"
     server.enrol(map_id, "p", jpeg(1), x=1, y=2, sequence="a", metadata={"a": 1, "b": {"c": 2, "d": 3}})

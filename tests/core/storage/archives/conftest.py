@@ -7,11 +7,13 @@ import pytest
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.maps import Correspondence, Enrolment, MapSettings
-from core.places import PlaceFields, Pose
+from core.places import PlaceFields, Pose, PoseAccuracy
 from core.storage import Atlas, Map
 from tests.core.maps.mixed import both_kinds
 from tests.core.storage.archives.files import exported
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+
+ACCURACY = PoseAccuracy(metres=0.5, degrees=2.0)
 
 
 def filled(lab: Map) -> Map:
@@ -19,7 +21,13 @@ def filled(lab: Map) -> Map:
     moment = datetime(2026, 11, 20, 10, tzinfo=UTC)
     lab.enrol([frame(f"p{i}", x=i / 3, sequence="monday", metadata={"i": i, "ä": [None, 1.5]}) for i in range(7)])
     lab.edit({"keep": "image"})
-    lab.enrol([frame("q0", timestamp=moment), frame("q1", camera="front"), frame("gone", sequence="gone")])
+    lab.enrol(
+        [
+            frame("q0", timestamp=moment, level=2, pose_accuracy=ACCURACY),
+            frame("q1", camera="front"),
+            frame("gone", sequence="gone"),
+        ]
+    )
     roof = frame("roof")
     where = PlaceFields(pose=Pose(latitude=48.8, longitude=2.3, heading=10), sequence="Ünter den Linden")
     with both_kinds():

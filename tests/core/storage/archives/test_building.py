@@ -349,6 +349,7 @@ def test_lines_are_what_a_person_can_read(content: bytes) -> None:
     assert (lines["q0"]["track"], lines["q0"]["station"], lines["q0"]["pose_of"]) == ("monday", 2, "p2")
     assert shown["pose"] == {"latitude": 48.8, "longitude": 2.3, "heading": 10.0}
     assert shown["sequence"] == "Ünter den Linden"
+    assert (lines["q0"]["level"], lines["q0"]["pose_accuracy"]) == ("2", {"metres": 0.5, "degrees": 2.0})
 
 
 def test_a_file_of_old_gives_its_texts_their_one_form(
@@ -373,6 +374,26 @@ def test_a_file_of_old_gives_its_texts_their_one_form(
     first, second = (set(made.place(f"p{number}").metadata) for number in range(2))
     atlas.close()
     assert first == {"i", "ä"} and second == {"i", "ä", normalize("NFD", "ä")}
+
+
+def test_a_file_of_old_has_no_levels_but_those_of_its_metadata(content: bytes, tmp_path: Path) -> None:
+    def edit(_manifest: dict[str, Any], parts: Parts) -> None:
+        lines = [json.loads(line) for line in parts[PLACES].splitlines()]
+        assert [line["level"] for line in lines if line["level"] is not None] == ["2"]
+        for line in lines:
+            del line["level"], line["pose_accuracy"]
+            line["metadata"] |= {"floor": 3} if line["id"] == "p1" else {}
+        parts[PLACES] = b"".join(json.dumps(line).encode() + b"\n" for line in lines)
+
+    path = tmp_path / "old.tar"
+    path.write_bytes(changed(content, edit))
+    atlas = Atlas(tmp_path / "data")
+    made = imported(atlas, path, "old")
+    assert made.verify().ok
+    places = made.places(None, 99)[0]
+    atlas.close()
+    assert {place.id: place.level for place in places if place.level} == {"p1": "3"}
+    assert all(place.pose_accuracy is None for place in places)
 
 
 def test_a_flipped_bit_anywhere_makes_no_map(content: bytes, library: Atlas, tmp_path: Path) -> None:

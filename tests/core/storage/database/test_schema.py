@@ -25,7 +25,7 @@ def version(connection: sqlite3.Connection) -> int:
 
 def test_an_empty_file_gets_the_tables(connection: sqlite3.Connection) -> None:
     prepare(connection, create=True)
-    assert version(connection) == SCHEMA.version == 12
+    assert version(connection) == SCHEMA.version == 13
     check_schema(connection)
     prepare(connection)
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
@@ -62,7 +62,7 @@ def test_an_older_file_is_refused_and_not_touched(connection: sqlite3.Connection
     with pytest.raises(DataDirectoryTooOld) as error:
         prepare(connection, "maps/lab/map.sqlite")
     assert str(error.value) == (
-        f"maps/lab/map.sqlite was written before the first release of placerec (schema {older}, this one knows 12) and "
+        f"maps/lab/map.sqlite was written before the first release of placerec (schema {older}, this one knows 13) and "
         "is left as it is: enrol again in a new data directory, or go on with the version that wrote it."
     )
     assert (version(connection), list(connection.iterdump())) == (older, before)
