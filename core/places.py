@@ -42,6 +42,10 @@ SAME_VIEW = 3
 A frame is put there only if its pose is no farther from that of the first frame there.  It is more than 1 because the
 poses of one stop may be coarse."""
 
+SAME_STOREY = 1.5
+"""Metres up or down within which two places may be on one storey, where no levels say it.  Storeys are 2.5 m apart or
+more, and barometers and odometry drift by less than half of that within a walk; nothing else was it chosen on."""
+
 NO_FIX = 1e-6
 """Degrees: what a receiver without a fix writes is latitude 0 and longitude 0, to so much."""
 
@@ -124,7 +128,7 @@ class Pose(BaseModel):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84).
 
     ``z`` is in metres: in the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude.
-    There it is a statement that is handed on; distances on the Earth are those along the ground.
+    It tells storeys apart; distances are those along the ground.
     ``heading`` is in degrees: counter-clockwise from +x beside x and y, clockwise from north beside
     latitude and longitude.  It is normalized to [0, 360).
     """
@@ -362,14 +366,16 @@ class Look(BaseModel):
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """Two frames show the same place within ``radius`` metres or, without poses, within ``frames`` of a sequence."""
+    """Two frames show the same place within ``radius`` metres along the ground and ``height`` metres up or down or,
+    without poses, within ``frames`` of a sequence; never on two levels."""
 
     radius: float
     frames: int
+    height: float = SAME_STOREY
 
     def times(self, factor: float) -> Neighborhood:
-        """The neighbourhood with its distances multiplied by ``factor``."""
-        return Neighborhood(self.radius * factor, int(self.frames * factor))
+        """The neighbourhood with its distances multiplied by ``factor``; a storey stays as high as it is."""
+        return replace(self, radius=self.radius * factor, frames=int(self.frames * factor))
 
 
 @dataclass(frozen=True)
@@ -453,9 +459,33 @@ class Whereabouts:
         columns = [vars(part) for part in (cls.along_sequence([]), *parts)]
         return cls(**{name: np.concatenate([part[name] for part in columns]) for name in columns[0]})
 
+    @property
+    def ground(self) -> NDArray[np.float64]:
+        """The positions whose differences are distances along the ground, float64 [n, 3]: of metric poses without z."""
+        flat = self.position.copy()
+        flat[self.kind == METRIC, 2] = 0
+        return flat
+
+    def on_other_levels(self, one: ArrayLike, other: ArrayLike, height: float) -> NDArray[np.bool_]:
+        """Whether places are on different storeys, as far as that is known: by their levels or, unless both have one,
+        by their heights.
+
+        Args:
+            one, other: integers that broadcast against each other.
+            height: metres within which two places may be on one storey.
+        """
+        ours, theirs = self.level[one], self.level[other]
+        apart = np.abs(self.height[one] - self.height[other]) > height
+        return np.where((ours != NO_LEVEL) & (theirs != NO_LEVEL), ours != theirs, apart)
+
+    def on_level_of(self, row: int, height: float) -> Whereabouts:
+        """The same, but places that are known to be on another storey than ``row`` have no poses; height as above."""
+        return self.without_poses(self.on_other_levels(np.arange(len(self)), row, height)) if len(self) else self
+
     def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
         """Which of the places are the same place as ``row``, itself included; bool [n].
 
+        Places on different storeys never are (:meth:`on_other_levels`).
         Two poses of one kind are compared by distance; other places must be of one sequence and few positions apart, or
         at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own,
         with its looks.
@@ -467,12 +497,14 @@ class Whereabouts:
             near |= (sequence == sequence[row]) & (np.abs(ordinal - ordinal[row]) <= frames)
         kind = self.kind[row]
         if kind != NO_POSE:
-            x, y, z = (self.position - self.position[row]).T
+            ground = self.ground
+            x, y, z = (ground - ground[row]).T
             distance = np.sqrt(x * x + y * y + z * z)
             reach = np.full(len(self), neighborhood.radius)
             if self.sequence[row] != NO_SEQUENCE:
                 reach[(self.sequence == self.sequence[row]) & (self.ordinal == self.ordinal[row])] *= SAME_VIEW
             near = np.where(self.kind == kind, distance <= reach, near)
+        near &= ~self.on_other_levels(np.arange(len(self)), row, neighborhood.height)
         near[row] = True
         return near
 

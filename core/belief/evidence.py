@@ -16,7 +16,7 @@ as well, which ``estimate`` holds against the belief.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,12 +70,15 @@ class Evidence:
     gains: float32 [k], over 0: the log likelihood ratio of those places to the background.
     unknown: the log likelihood ratio of not being in the map to the background.
     sighting: None if the frame is not recognized by itself.
+    storeys: int64 [m], rows of places on different storeys that the frame may as well show, so that it says where on
+        its storey the robot is, and nothing of which storey that is; empty if there is no doubt.
     """
 
     rows: NDArray[np.int64]
     gains: NDArray[np.float32]
     unknown: float
     sighting: Sighting | None = None
+    storeys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def tempered(self, weight: float) -> Evidence:
         """The evidence with every log likelihood ratio multiplied by ``weight``."""
@@ -99,6 +102,8 @@ def evidence_of(answer: Answer, neighborhood: Neighborhood) -> Evidence:
         None if ranked.geometry is None else ranked.geometry.evidence,
         [place for group in answer.judgement.rivals if group.same_place for place in group.positions],
     )
+    if answer.judgement.twins:
+        seen = replace(seen, storeys=ranked.rows[[0, *answer.judgement.twins]])
     return sighted(seen, ranked.rows, answer.judgement)
 
 

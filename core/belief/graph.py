@@ -8,6 +8,7 @@ of several traverses that were aligned with each other are at one station of a t
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from core.belief.evidence import Evidence
 from core.kernels.belief import same_place
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_LEVEL, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 
 NEAREST = 24
 """A place is joined to at most this many of the nearest places."""
@@ -135,9 +136,12 @@ class PlaceGraph:
             self.targets[self.starts[place] : self.starts[place + 1]],
             where.kind,
             where.position,
+            where.height,
+            where.level,
             where.ordinal,
             self.neighborhood.radius,
             self.neighborhood.frames if where.sequence[place] != NO_SEQUENCE else 0,
+            self.neighborhood.height,
         )
         if not len(self.stations) or where.track[place] == NO_SEQUENCE:
             return found
@@ -147,6 +151,7 @@ class PlaceGraph:
         beside = order[np.searchsorted(keys, low) : np.searchsorted(keys, high, side="right")]
         # Two poses of one kind are compared by their distance alone.
         apart = (where.kind[beside] == where.kind[place]) & (where.kind[place] != NO_POSE)
+        apart |= where.on_other_levels(beside, place, self.neighborhood.height) & (beside != place)
         return np.union1d(found, beside[~apart])
 
 
@@ -181,7 +186,7 @@ def place_graph(
     order = np.lexsort((where.ordinal, where.sequence))
     living, where = living[order], where.take(order)
     index = np.full(rows, -1, np.int32)
-    first_of_view = _first_of_views(where, neighborhood.radius)
+    first_of_view = _first_of_views(where, neighborhood)
     index[living] = (np.cumsum(first_of_view) - 1).astype(np.int32)
     living, where = living[first_of_view], where.take(first_of_view)
     bounds = np.flatnonzero(np.diff(where.sequence)) + 1
@@ -193,12 +198,12 @@ def place_graph(
     follows = np.zeros(len(living), np.bool_)  # whether the next entry is the next frame, with a pose of the same kind
     if len(living) > 1:
         follows[:-1] = (first[1:] == first[:-1]) & posed[1:] & (where.kind[1:] == where.kind[:-1])
-    steps = np.linalg.norm(where.position[1:] - where.position[:-1], axis=1)[follows[:-1]]
+    steps = np.linalg.norm(np.diff(where.ground, axis=0), axis=1)[follows[:-1]]
     moved = steps[steps > 0]
     spacing = float(np.median(moved)) if len(moved) else 0.0
     reach = max(neighborhood.radius, SPACINGS * spacing)
     heading = _headings(where, coordinates, shrink, follows)
-    starts, targets = _edges(where, first, last, reach)
+    starts, targets = _edges(where, first, last, reach, neighborhood.height)
     return PlaceGraph(
         rows=living,
         index=index,
@@ -218,10 +223,11 @@ def place_graph(
     )
 
 
-def _first_of_views(where: Whereabouts, radius: float) -> NDArray[np.bool_]:
+def _first_of_views(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.bool_]:
     """Which of the places, in the order of the graph, are not of one view with the place before them; bool [n].
 
-    Consecutive frames at one position are, unless poses put them farther apart than the radius from the first of them.
+    Consecutive frames at one position are, unless poses put them farther apart than the radius from the first of them,
+    or on another storey.
     """
     together = np.zeros(len(where), np.bool_)
     together[1:] = (
@@ -234,9 +240,11 @@ def _first_of_views(where: Whereabouts, radius: float) -> NDArray[np.bool_]:
     )
     first = np.maximum.accumulate(np.where(together, 0, np.arange(len(where))))
     beyond = 0  # the last place that is too far from the first of its view, and so begins another one
-    for place in np.flatnonzero(together & (where.kind != NO_POSE)).tolist():
-        apart = where.position[place] - where.position[max(int(first[place]), beyond)]
-        if np.linalg.norm(apart) > radius:
+    ground = where.ground
+    for place in np.flatnonzero(together).tolist():
+        start = max(int(first[place]), beyond)
+        far = where.kind[place] != NO_POSE and np.linalg.norm(ground[place] - ground[start]) > neighborhood.radius
+        if far or where.on_other_levels(place, start, neighborhood.height):
             together[place], beyond = False, place
     return ~together
 
@@ -280,9 +288,13 @@ def _headings(
 
 
 def _edges(
-    where: Whereabouts, first: NDArray[np.int32], last: NDArray[np.int32], reach: float
+    where: Whereabouts, first: NDArray[np.int32], last: NDArray[np.int32], reach: float, height: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The edges: each place is joined to itself, then to those beside it in its sequence and to the nearest."""
+    """The edges: each place is joined to itself, then to those beside it in its sequence and to the nearest.
+
+    The nearest are of its own storey: only a traverse leads from one to another.  Their number is that among the places
+    of its level and those of none.
+    """
     from scipy.spatial import cKDTree  # here, because it takes long to import
 
     n = len(where)
@@ -295,16 +307,18 @@ def _edges(
         target = source + offset
         fits = (where.kind[source] != NO_POSE) & (where.kind[source] == where.kind[target])
         pairs.append((source[fits], target[fits]))
-    for kind in (METRIC, GEOGRAPHIC):
-        members = np.flatnonzero(where.kind == kind)
-        if len(members) > 1 and reach > 0:
+    for kind, level in itertools.product((METRIC, GEOGRAPHIC), np.unique(where.level)):
+        own = np.flatnonzero((where.kind == kind) & (where.level == level))
+        members = np.flatnonzero((where.kind == kind) & (np.isin(where.level, (level, NO_LEVEL)) | (level == NO_LEVEL)))
+        if len(own) and len(members) > 1 and reach > 0:
             count = min(len(members), 1 + (NEAREST if n <= FULLY_JOINED else NEAREST_OF_MANY))
-            positions = where.position[members]
-            distances, found = cKDTree(positions).query(positions, k=count, distance_upper_bound=reach)
+            tree = cKDTree(where.position[members])
+            distances, found = tree.query(where.position[own], k=count, distance_upper_bound=reach)
             near = np.isfinite(distances)
-            source = np.repeat(members, near.sum(axis=1))
+            source = np.repeat(own, near.sum(axis=1))
             target = members[found[near]]
-            pairs.append((source[source != target], target[source != target]))
+            joined = (source != target) & ~where.on_other_levels(source, target, height)
+            pairs.append((source[joined], target[joined]))
     sources = np.concatenate([none, *(source for source, _ in pairs)])
     targets = np.concatenate([none, *(target for _, target in pairs)])
     keys = np.unique(sources * max(n, 1) + targets)
@@ -312,8 +326,8 @@ def _edges(
     posed = np.flatnonzero(where.kind != NO_POSE)
     counts = np.bincount(sources, minlength=n) + np.bincount(posed, minlength=n)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    joined = np.empty(int(starts[-1]), np.int32)
-    joined[starts[posed]] = posed
+    edges = np.empty(int(starts[-1]), np.int32)
+    edges[starts[posed]] = posed
     before = np.concatenate([[0], np.cumsum(np.bincount(sources, minlength=n))])
-    joined[starts[sources] + 1 + np.arange(len(sources)) - before[sources]] = targets
-    return starts, joined
+    edges[starts[sources] + 1 + np.arange(len(sources)) - before[sources]] = targets
+    return starts, edges

@@ -14,9 +14,10 @@ from core.belief.motion import Odometry
 from core.belief.odometry import OdometryPose
 from core.belief.run import RunState
 from core.belief.speeds import SPEEDS
+from core.belief.storeys import Storey
 from core.belief.view import HEIGHT, WIDTH, View
 
-FORMAT = 3
+FORMAT = 4
 
 WHOLE = 255
 """Shares of speeds are stored in units of one over this number, which is finer than they are known."""
@@ -47,6 +48,7 @@ def to_bytes(state: RunState) -> bytes:
         "pending_reach": state.pending_reach,
         "pose": None if pose is None else [pose.x, pose.y, pose.heading, pose.covariance, pose.origin],
         "sighting": None if sighting is None else [sighting.row, sighting.probability],
+        "storey": [state.storey.level, state.storey.height],
     }
     text = json.dumps(head, separators=(",", ":")).encode()
     arrays = [state.rows.astype("<i8"), state.masses.astype("<f4")]
@@ -102,6 +104,7 @@ def from_bytes(data: bytes) -> RunState:
             _pose(head["pose"]),
             shares,
             None if head["sighting"] is None else Sighting(*head["sighting"]),
+            Storey(*head["storey"]),
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error

@@ -39,6 +39,7 @@ from core.belief.motion import (
 )
 from core.belief.odometry import FASTEST, OdometryPose, motion_between
 from core.belief.speeds import PRIOR, SPEEDS, TRACKED, UNKNOWN, Speeds, mixture, news, plausible
+from core.belief.storeys import UNSTATED, Storey, after_lift, later, undecided, weighed
 from core.belief.view import HEIGHT, WIDTH, View, novelty
 
 Sight = Literal["covered", "constant"]
@@ -89,6 +90,7 @@ class RunState:
     pending_reach: metres that the robot may have moved in the constant frames.
     pose: as of the :class:`Run`.
     sighting: of the last frame that counted; None if it was not recognized by itself.
+    storey: as of the :class:`Run`.
     """
 
     rows: NDArray[np.int64]
@@ -105,6 +107,7 @@ class RunState:
     pose: OdometryPose | None = None
     shares: NDArray[np.float32] = field(default_factory=lambda: UNKNOWN.shares)
     sighting: Sighting | None = None
+    storey: Storey = UNSTATED
 
 
 def _apart(speed: ArrayLike) -> NDArray[np.float64]:
@@ -133,6 +136,7 @@ class Run:
     blind: how many frames since the last one that gave evidence of a place, or of none in the map.
     constant: how many frames since the last one that counted showed the same as it.
     pose: where odometry said that the robot was at the last frame; None if that had no such pose.
+    storey: what was stated last of the robot's storey.
     """
 
     def __init__(self, options: RunOptions, graph: PlaceGraph) -> None:
@@ -143,6 +147,7 @@ class Run:
         self.sight: Sight | None = None
         self.blind = self.constant = 0
         self.pose: OdometryPose | None = None
+        self.storey = UNSTATED
         self._view: View | None = None
         self._sighting: Sighting | None = None
         self._guided = False
@@ -184,7 +189,10 @@ class Run:
         fastest = FASTEST if speed_limit is None else 2 * speed_limit
         return motion_between(self.pose, pose, None if seconds is None else fastest * seconds + self.graph.spacing)
 
-    def advance(self, seen: Evidence, step: Step, view: View | None = None, pose: OdometryPose | None = None) -> None:
+    def advance(
+        self, seen: Evidence, step: Step, view: View | None = None, pose: OdometryPose | None = None,
+        storey: Storey = UNSTATED,
+    ) -> None:  # fmt: skip
         """Update the belief with one frame.
 
         A frame that shows hardly anything is no evidence.  One that shows the same as the last one that counted is no
@@ -196,7 +204,12 @@ class Run:
             step: the motion since the frame before; ignored for the first frame.
             view: the view of the frame; None: not known, and taken to be new.
             pose: where odometry says that the robot is, from which the motion to the next frame is computed.
+            storey: what the robot states of its storey.
         """
+        before, (self.storey, climb) = self.storey, later(self.storey, storey, self.graph.neighborhood.height)
+        if climb is not None and self.frames:
+            self.belief = after_lift(self.belief, self.graph, before, self.storey, climb)
+            self._smoother.clear()
         change = None if view is None or self._view is None else view.change(self._view)
         new = 1.0 if change is None else novelty(change)
         fitting = fits(self.belief, seen, self.graph) or self._confirms(seen.sighting)
@@ -252,6 +265,8 @@ class Run:
             self.belief = observed_by_speed(ahead, seen, self.graph, new)
         else:
             self.belief = observed(ahead, seen, self.graph)
+        if len(seen.storeys):
+            self.belief = undecided(ahead, self.belief, self.graph, seen.storeys)
         if self.options.lag:
             if not step.known:
                 self._smoother.clear()
@@ -331,7 +346,8 @@ class Run:
 
     def _now(self) -> Belief:
         """The present belief; the belief to see the map fades while the view is covered or shows nothing."""
-        return replace(self.belief, unknown=1 - (1 - self.belief.unknown) * FADING**self.blind)
+        shown = weighed(self.belief, self.graph, self.storey)
+        return replace(shown, unknown=1 - (1 - shown.unknown) * FADING**self.blind)
 
     def state(self) -> RunState:
         """The state from which the run can be continued."""
@@ -354,6 +370,7 @@ class Run:
             self.pose,
             self.belief.speeds.at(best),
             self._sighting,
+            self.storey,
         )
 
     @classmethod
@@ -364,6 +381,7 @@ class Run:
         run._pending = Pending(state.odometry, state.reach)
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
         run._pending_reach, run.pose, run._sighting = state.pending_reach, state.pose, state.sighting
+        run.storey = state.storey
         if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))
             given = np.full(len(graph), max(rest / len(graph), 1e-12), np.float32)

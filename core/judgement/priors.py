@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.verdict import Calibration
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_TIME, Pose, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_LEVEL, NO_TIME, Pose, Whereabouts
 
 Flags = NDArray[np.bool_]
 Values = NDArray[np.float64]
@@ -162,6 +162,22 @@ class InSequences:
 
     def fit(self, places: Whereabouts) -> Values:
         return self.holds(places).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class OnLevels:
+    """On one of these storeys, given by their codes (:func:`core.places.level_code`).
+
+    Places without a level do not satisfy it, but fit: a statement of a storey says nothing about them.
+    """
+
+    codes: tuple[int, ...]
+
+    def holds(self, places: Whereabouts) -> Flags:
+        return np.isin(places.level, self.codes)
+
+    def fit(self, places: Whereabouts) -> Values:
+        return (self.holds(places) | (places.level == NO_LEVEL)).astype(np.float64)
 
 
 @dataclass(frozen=True)

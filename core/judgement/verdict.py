@@ -58,6 +58,10 @@ than 0.05."""
 MOST_RIVALS = 8
 """The largest number of rivals, the best ones, that are examined, each with its neighbours."""
 
+CLEAR_STOREY = 2 / 3
+"""A match is recognized if it is twice as probable as any place on another storey that the query may as well show, as
+in a session.  Without a prior none is, and one with a trust of 0.5 is enough; it was chosen on nothing else."""
+
 MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
 
@@ -142,6 +146,7 @@ class Judgement:
     imagined: the share of the background that was imagined, from 0 to 1.
     rivals: the places that make the query ambiguous; empty for other verdicts.
     evidence: of verification for the best match, -ln of the number of false alarms; None if it was not verified.
+    twins: positions of places on other storeys that the query may as well show, best first.
     """
 
     verdict: Verdict
@@ -153,6 +158,7 @@ class Judgement:
     imagined: float = 0.0
     rivals: tuple[Rivals, ...] = ()
     evidence: float | None = None
+    twins: tuple[int, ...] = ()
 
     @property
     def lead(self) -> float:
@@ -273,6 +279,7 @@ def judge(
     examined: int | NDArray[np.bool_] = 0,
     likeness: Likeness | None = None,
     geometry: Geometry | None = None,
+    prior: Values | None = None,
 ) -> Judgement:
     """Judge one query.
 
@@ -284,14 +291,16 @@ def judge(
         neighborhood: which places are the same place and so no rivals of each other.
         examined: which of the places the encoder's second stage has examined, bool [n], or how many of the first;
             0: it has no second stage.
-        likeness: compares the best match with its rivals; it is called at most once, and only where rivals matter.
+        likeness: compares the best match with its rivals; it is called at most twice, and only where rivals matter.
             None: which rivals show the same place is not known, and they explain nothing.
         geometry: the results of verification for the n places, in the same order; None: none was verified.
+        prior: float64 [n], the log weights of the places; None: there is no prior.
 
     Returns:
         ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
         ``ambiguous`` where they do, and for a lead over the best rival under the margin; else ``recognized``.  A best
-        match stands out by its decision value, or by the probability of three stages if it was verified.
+        match stands out by its decision value, or by the probability of three stages if it was verified.  Where a place
+        on another storey may as well be shown, it is ``ambiguous`` whatever the lead.
     """
     if len(scores) == 0:
         return Judgement("unknown", None, None, None, None)
@@ -307,13 +316,17 @@ def judge(
     if not stands_out(decision, lead, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
-    elif lead < calibration.margin:
+    twins = ranking.twins(likeness)
+    left = ranking.share_beside(twins, prior)
+    if verdict == "recognized" and (lead < calibration.margin or left < CLEAR_STOREY):
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
     stated = probability_of(decision, lead, calibration, behind.imagined, evidence)
-    probability = None if stated is None else float(stated)
-    return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence)
+    probability = None if stated is None else min(float(stated), left)
+    return Judgement(
+        verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence, tuple(twins.tolist())
+    )
 
 
 @dataclass(frozen=True)
@@ -392,6 +405,25 @@ class _Ranking:
         few = np.zeros(len(self.scores), np.bool_)
         few[self.compared[:MOST_RIVALS]] = True
         return few
+
+    def twins(self, likeness: Likeness | None) -> Positions:
+        """The places on other storeys that the query may as well show, best first; int64 [k].
+
+        A twin scores nearly as well, or is more like the best match than the query is: what tells the two apart is not
+        what the query shows then, whatever the lead.
+        """
+        heads = self.heads()
+        heads = heads[self.whereabouts.on_other_levels(heads, 0, self.neighborhood.height)]
+        alike = self.leads(heads) < self.calibration.margin
+        if len(heads) and likeness is not None:
+            alike |= likeness(heads) >= self.scores[0]
+        return heads[alike]
+
+    def share_beside(self, twins: Positions, prior: Values | None) -> float:
+        """The probability that is left to the best match by its likeliest twin; only a prior tells it from them."""
+        odds = np.zeros(len(twins)) if prior is None else prior[twins] - prior[0]
+        odds[self.leads(twins) < self.calibration.margin] = 0.0
+        return 1 / (1 + float(np.exp(odds).max(initial=0.0)))
 
     def explaining_rivals(self, likeness: Likeness | None) -> tuple[Rivals, ...]:
         """The rivals without which the best match would stand out; empty if it would not."""

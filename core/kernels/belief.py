@@ -16,7 +16,7 @@ from typing import Any, cast
 import numba
 import numpy as np
 
-from core.places import NO_POSE
+from core.places import METRIC, NO_LEVEL, NO_POSE
 
 MISFIT = 12.0
 """A place with at least this misfit to a motion (five standard deviations) is no successor."""
@@ -202,7 +202,9 @@ def along_by_speed(p, known, shares, prior, first, last, starts, offsets, weight
 
 
 @_compiled
-def same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
+def same_place(  # type: ignore[no-untyped-def]
+    place, first, last, joined, kind, position, height, level, ordinal, radius, frames, storey
+):
     """The same places by ``Whereabouts.near`` among those joined and those beside it in its sequence; ascending."""
     low, high = max(first, place - frames), min(last, place + frames + 1)
     found = np.empty(len(joined) + high - low, np.int64)
@@ -212,10 +214,18 @@ def same_place(place, first, last, joined, kind, position, ordinal, radius, fram
         other = low + number - len(joined) if beside else joined[number]
         if other == place and not beside:
             continue
+        if other != place:
+            if level[other] != NO_LEVEL and level[place] != NO_LEVEL:
+                if level[other] != level[place]:
+                    continue
+            elif abs(height[other] - height[place]) > storey:
+                continue
         if kind[other] == kind[place] and kind[place] != NO_POSE:
             if beside and other != place and np.any(joined == other):
                 continue
-            distance = np.sqrt(np.sum((position[other] - position[place]) ** 2))
+            apart = position[other] - position[place]
+            up = 0.0 if kind[place] == METRIC else apart[2]
+            distance = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + up**2)
             same = distance <= radius or other == place
         else:
             same = beside and abs(ordinal[other] - ordinal[place]) <= frames

@@ -15,7 +15,7 @@ from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
 from core.names import texts
-from core.places import PlaceFields, Pose, Timestamp, level_in, place_and_look
+from core.places import SAME_STOREY, PlaceFields, Pose, Timestamp, level_in, place_and_look
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -155,7 +155,15 @@ class MapSettings(BaseModel):
         default=5.0,
         ge=0,
         allow_inf_nan=False,
-        description="Places within this distance in metres are the same place.",
+        description="Places within this distance in metres along the ground are the same place.",
+    )
+    same_place_height: float = Field(
+        strict=True,
+        default=SAME_STOREY,
+        ge=0,
+        allow_inf_nan=False,
+        description="Places whose heights differ by more metres are on different storeys, and never the same place; "
+        "where both have a level, that says it instead.",
     )
     same_place_frames: Annotated[int, Field(strict=True, ge=0, le=2**31)] = Field(
         default=3, description="Without poses: places this many frames apart in their sequence are the same place."

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from core.judgement.priors import Constraint, Disc, GeographicBox
+from core.judgement.priors import Constraint, Disc, GeographicBox, OnLevels
 from core.maps.place_filter import Scalar
-from core.places import PoseKind, check_coordinates
+from core.places import PoseKind, check_coordinates, level_code
 
 TRUST = 0.9
 """The probability that a prior is right, if the caller states none."""
@@ -64,6 +64,11 @@ class Selection:
 
     def __bool__(self) -> bool:
         return bool(self.filters or self.prior or self.recent or self.excluded)
+
+    def at_level(self, level: str) -> Selection:
+        """The same with the statement that the query shows a place on a storey, as a prior."""
+        on = OnLevels((level_code(level),))
+        return replace(self, prior=replace(self.prior, geometry=(*self.prior.geometry, on)))
 
     def check_coordinates(self, known: Callable[[PoseKind], Collection[PoseKind]]) -> None:
         """Check that areas are given in coordinates that the places of a map have.

@@ -299,6 +299,7 @@ def judgement_of(map_: Map, encoder: Encoder, candidates: Candidates) -> Judgeme
         candidates.examined,
         lambda positions: likeness(map_, encoder, candidates, positions),
         candidates.geometry,
+        candidates.weights,
     )
 
 
@@ -370,7 +371,8 @@ def _put_together(
     if judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE:
         views, note = relative_views(map_, candidates, stage, query.verifier)
         shared = sightings(map_, candidates, stage, query.verifier)
-    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views, sightings=shared)
+    level = candidates.whereabouts.on_level_of(0, neighborhood.height)
+    pose = estimate_pose(level, log_odds, neighborhood.radius, views=views, sightings=shared)
     if note is None and pose is not None and pose.source != "intrinsics":
         note = _why_without_intrinsics(map_, query.question.camera, places[0], stage)
     rivals = rival_places(map_, candidates, judgement)

@@ -76,7 +76,8 @@ def locate_rig(
     ]
     candidates = _candidates_of_rig(fused, finals, decision_slope(calibration))
     weights = None if ranked[0].weights is None else np.exp(fused.weights[retained]).tolist()
-    pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
+    level = fused.whereabouts.on_level_of(0, neighborhood.height)
+    pose = estimate_pose(level, fused.log_odds, neighborhood.radius)
     rivals = rival_places(map_, candidates, judgement)
     if len(retained) < len(places):
         candidates = candidates.take(np.append(retained, np.arange(len(places), len(candidates.rows))))

@@ -105,6 +105,14 @@ class Candidates:
         enough = self.scores >= self.whereabouts.least
         return self if enough.all() else self.take(np.flatnonzero(enough))
 
+    def weighed(self, calibration: Calibration) -> Candidates:
+        """The candidates in the order of both stages and the prior, which took from the scores of the first what there
+        was above unrelated places, and takes the rest from what the second has added."""
+        if self.weights is None:
+            return self
+        ordered = weighed(self.scores, self.weights, calibration)
+        return replace(self, ordered=ordered).take(np.argsort(-ordered, kind="stable"))
+
     def with_geometry(self, geometry: Geometry, verifications: tuple[Verification | None, ...]) -> Candidates:
         """The candidates, which are in the order of three stages, with the results of their verification."""
         return replace(self, geometry=geometry, verifications=verifications)
@@ -132,7 +140,7 @@ def calibration_of(map_: Map, encoder: Encoder) -> Calibration:
 
 def neighborhood_of(map_: Map) -> Neighborhood:
     """Which places count as the same place in a map, by distance or position in the sequence."""
-    return Neighborhood(map_.record.same_place_radius, map_.record.same_place_frames)
+    return Neighborhood(map_.record.same_place_radius, map_.record.same_place_frames, map_.record.same_place_height)
 
 
 def rank_places(
@@ -229,7 +237,7 @@ def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: 
         ).believable()
         if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates):
             break
-    return candidates
+    return candidates.weighed(calibration)
 
 
 def no_candidates(map_: Map) -> Candidates:

@@ -28,7 +28,7 @@ from core.judgement.position import places_apart
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
 from core.maps import Map
 from core.method.encoder import Encoder
-from core.places import NO_POSE
+from core.places import NO_POSE, Neighborhood
 from core.recognition.comparison import Comparison, MapComparison
 from core.recognition.question import Query, Verifier
 from core.recognition.stages import Candidates, Positions, calibration_of, neighborhood_of
@@ -283,7 +283,7 @@ def sightings(
     compared = {at: one for at, one in enumerate(candidates.verifications) if one is not None}
     stored = {at: stage.stored.get(int(candidates.rows[at])) for at in compared}
     if 0 in compared and compared[0].evidence >= LEAST_EVIDENCE:
-        around = [at for at in _around(candidates, neighborhood_of(map_).radius) if at not in compared]
+        around = [at for at in _around(candidates, neighborhood_of(map_)) if at not in compared]
         there = zip(around, map_.keypoints_at(candidates.rows[around].tolist()), strict=True)
         more = {at: keypoints for at, keypoints in there if keypoints is not None}
         stored |= more
@@ -299,12 +299,13 @@ def sightings(
     return found
 
 
-def _around(candidates: Candidates, reach: float) -> list[int]:
-    """The candidates around the best match that tell how far the query is, at most NEIGHBOURS, the nearest ones."""
-    places = candidates.whereabouts
-    distances = np.linalg.norm(places.position - places.position[0], axis=1)
+def _around(candidates: Candidates, neighborhood: Neighborhood) -> list[int]:
+    """The candidates around the best match, on its storey, that tell how far the query is, at most NEIGHBOURS, the
+    nearest ones."""
+    places = candidates.whereabouts.on_level_of(0, neighborhood.height)
+    distances = np.linalg.norm(places.ground - places.ground[0], axis=1)
     order = np.argsort(np.where(places.kind == places.kind[0], distances, np.inf), kind="stable").tolist()
-    return places_apart(places, reach, order, NEIGHBOURS)
+    return places_apart(places, neighborhood.radius, order, NEIGHBOURS)
 
 
 def verified(candidates: Candidates, found: Mapping[int, Verification]) -> Candidates:

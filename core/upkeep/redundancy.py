@@ -28,10 +28,11 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
     for kind in np.unique(where.kind[where.kind != NO_POSE]):
         members = np.flatnonzero(where.kind == kind)
         count = min(len(members), MOST_NEIGHBOURS + 1)
-        tree = cKDTree(where.position[members])
+        ground = where.ground[members]
+        tree = cKDTree(ground)
         # The tree's bound is exclusive and rounded, but places at exactly the radius are near.
         bound = 1.001 * neighborhood.radius + 1e-6
-        apart, found = tree.query(where.position[members], k=[*range(1, count + 1)], distance_upper_bound=bound)
+        apart, found = tree.query(ground, k=[*range(1, count + 1)], distance_upper_bound=bound)
         first = np.repeat(np.arange(len(members)), count)
         second = found.reshape(-1)
         there = apart.reshape(-1) <= neighborhood.radius
@@ -44,7 +45,9 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
         # Several traverses may have a frame at each station.
         pairs += _along(where, where.track, where.station, neighborhood.frames, _STEPS)
     ordered = np.sort(np.concatenate(pairs), axis=1)
-    return np.unique(ordered[ordered[:, 0] != ordered[:, 1]], axis=0)
+    one, other = ordered.T
+    ordered = ordered[(one != other) & ~where.on_other_levels(one, other, neighborhood.height)]
+    return np.unique(ordered, axis=0)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from core.judgement.alignment import LARGEST_STEP, SharedStretch, of_matrix, shared_stretches
 from core.maps import Snapshot
 from core.method.encoder import Encoder
-from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
+from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 from core.threads import allowed_threads, compute_alone, in_turns
 
 Rows = NDArray[np.int64]
@@ -105,15 +105,13 @@ def stretches_of(scores: NDArray[np.float32]) -> list[SharedStretch]:
     return [SharedStretch(one.second, one.first, one.gain) for one in turned]
 
 
-def nearest_by_pose(queries: Whereabouts, references: Whereabouts, radius: float) -> Rows | None:
-    """The column of the nearest reference of each query by their poses, int64 [Q]; NONE if none is within ``radius``.
+def nearest_by_pose(queries: Whereabouts, references: Whereabouts, neighborhood: Neighborhood) -> Rows | None:
+    """The column of the nearest reference of each query by their poses, int64 [Q]; NONE if none is the same place.
 
     None if not a single pair of them has poses of one kind.
-
-    Args:
-        radius: metres.
     """
     found = np.full(len(queries), NONE, np.int64)
+    both, ground = Whereabouts.joined([queries, references]), (queries.ground, references.ground)
     comparable = False
     for kind in np.unique(queries.kind[queries.kind != NO_POSE]):
         rows, columns = np.flatnonzero(queries.kind == kind), np.flatnonzero(references.kind == kind)
@@ -122,10 +120,12 @@ def nearest_by_pose(queries: Whereabouts, references: Whereabouts, radius: float
         comparable = True
         for part in _parts(len(rows), ROWS):
             some = rows[part]
-            apart = queries.position[some, np.newaxis] - references.position[columns]
+            apart = ground[0][some, np.newaxis] - ground[1][columns]
             squares = np.einsum("qrc,qrc->qr", apart, apart)
+            above = both.on_other_levels(some[:, np.newaxis], len(queries) + columns, neighborhood.height)
+            squares[above] = np.inf
             nearest = squares.argmin(axis=1)
-            near = np.sqrt(squares[np.arange(len(some)), nearest]) <= radius
+            near = np.sqrt(squares[np.arange(len(some)), nearest]) <= neighborhood.radius
             found[some] = np.where(near, columns[nearest], NONE)
     return found if comparable else None
 

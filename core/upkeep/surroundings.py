@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.places import GEOGRAPHIC, METRIC, Pose, Whereabouts
+from core.places import GEOGRAPHIC, METRIC, SAME_STOREY, Pose, Whereabouts
 from core.upkeep.coverage import walks
 
 FACING = 45.0
@@ -68,18 +68,21 @@ class Surroundings:
         return "outside" if self.between is None else "gap"
 
 
-def surroundings(where: Whereabouts, pose: Pose, radius: float) -> Surroundings:
+def surroundings(where: Whereabouts, pose: Pose, radius: float, height: float = SAME_STOREY) -> Surroundings:
     """The frames of a map around a pose.
 
     Args:
         where: of the n frames of the map, those of looks included.
-        pose: without ``z``, distances are those in the plane.
-        radius: metres within which a frame shows the same place.
+        pose: without ``z``, frames of all storeys count.
+        radius: metres along the ground within which a frame shows the same place.
+        height: metres within which frames are on the storey of the pose.
     """
     kind = METRIC if pose.kind() == "metric" else GEOGRAPHIC
     here, there = pose.position(), where.position
-    if kind == METRIC and pose.z is None:
+    if kind == METRIC:
         here, there = here[:2], there[:, :2]
+    if pose.z is not None:
+        where = where.without_poses(np.abs(where.height - pose.z) > height)
     distance = np.where(where.kind == kind, np.sqrt(np.square(there - here).sum(axis=1)), np.inf)
     turn = np.full(len(where), np.nan)
     if pose.heading is not None:

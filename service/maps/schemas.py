@@ -37,6 +37,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "description": "Second floor, by day",
     "keep": "thumbnail",
     "same_place_radius": 5.0,
+    "same_place_height": 1.5,
     "same_place_frames": 3,
     "verification": True,
     "review": None,
@@ -95,8 +96,11 @@ class MapView(BaseModel):
     description: str
     keep: Keep = Field(description="The picture that is stored of each frame.")
     same_place_radius: float = Field(
-        description="Distance in metres up to which two enrolled places count as the same place, so that neither is "
-        "a rival of the other."
+        description="Distance in metres along the ground up to which two enrolled places count as the same place, so "
+        "that neither is a rival of the other."
+    )
+    same_place_height: float = Field(
+        description="Metres up or down beyond which they are on different storeys, unless both have a level."
     )
     same_place_frames: int = Field(
         description="The same for places without poses: their distance in frames of one sequence."
@@ -245,6 +249,7 @@ class MapChanges(BaseModel):
     description: str | None = Field(default=None, max_length=2000)
     keep: Keep | None = None
     same_place_radius: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
+    same_place_height: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
     same_place_frames: int | None = Field(strict=True, default=None, ge=0, le=2**31)
     verification: bool | None = Field(strict=True, default=None)
     index: TierSetting | None = Field(

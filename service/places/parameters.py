@@ -80,7 +80,7 @@ class PlaceDescription(PoseParameters):
     level: Level | None = Field(default=None, description="The storey on which the frame was taken.", examples=["2"])
 
 
-class NewPlace(PlaceDescription):
+class FlatFields(PlaceDescription):
     """The fields of a place, flat, but for its metadata."""
 
     accuracy_metres: float | None = Field(
@@ -121,14 +121,14 @@ class NewPlace(PlaceDescription):
         )
 
 
-class EnrolParameters(NewPlace):
+class EnrolParameters(FlatFields):
     """Beside one frame to enrol."""
 
     metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"camera": "front"}'])
     encoder: EncoderAssertion = None
 
     def place_fields(self, settings: Settings) -> PlaceFields:
-        """The fields of the place; it raises what ``NewPlace.fields`` raises."""
+        """The fields of the place; it raises what ``FlatFields.fields`` raises."""
         metadata = {} if self.metadata is None else parse_metadata(self.metadata)
         return self.fields(metadata, settings)
 
@@ -185,7 +185,7 @@ class BatchParameters(Parameters):
         return self
 
 
-class BatchItem(NewPlace):
+class BatchItem(FlatFields):
     """One place of a batch: its frame is in a part of the form, or is the one that the place already has."""
 
     id: str = Field(description="Id of the place.", examples=["p7"])

@@ -111,7 +111,7 @@ def coverage_of(map_: Map, options: CoverageParameters) -> CoverageView:
     where = snapshot.whereabouts_at(rows)
     check_coordinates(pose_kinds(where.kind), pose.kind(), "The pose")
     radius = neighborhood_of(map_).radius
-    found = surroundings(where, pose, radius)
+    found = surroundings(where, pose, radius, neighborhood_of(map_).height)
     near = found.order[: min(found.near, MOST_FRAMES)]
     within = [one for one in map_.places_at(rows[near].tolist()) if one is not None]
     turns = found.turn[near]

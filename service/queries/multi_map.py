@@ -15,9 +15,11 @@ from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Verdict
 from core.maps import Map
+from core.places import GEOGRAPHIC, Whereabouts
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
+from core.recognition.stages import neighborhood_of
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -213,12 +215,9 @@ def _same_place(a: MapReport, b: MapReport) -> bool:
     """
     assert a.answer is not None and b.answer is not None
     assert a.map_ is not None and b.map_ is not None
-    poses = [report.answer.matches[0][1].pose for report in (a, b) if report.answer is not None]
-    first, second = poses
-    if first is None or second is None or first.kind() != "geographic" or second.kind() != "geographic":
-        return False
-    reach = max(a.map_.record.same_place_radius, b.map_.record.same_place_radius)
-    return float(np.linalg.norm(first.position() - second.position())) <= reach
+    both = Whereabouts.joined(report.answer.candidates.whereabouts.take([0]) for report in (a, b) if report.answer)
+    reach = max((neighborhood_of(report.map_) for report in (a, b)), key=lambda one: one.radius)
+    return bool((both.kind == GEOGRAPHIC).all() and both.near(0, reach)[1])
 
 
 def match_log_odds(report: MapReport) -> list[float]:

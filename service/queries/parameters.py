@@ -8,22 +8,23 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from core.judgement.priors import Constraint, Disc, Facing, GeographicBox, Period
+from core.judgement.priors import Constraint, Disc, Facing, GeographicBox, OnLevels, Period
 from core.ledger.maps.places import LONGEST_TEXT
 from core.maps.place_filter import Scalar
 from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
-from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
+from core.places import Camera, Level, Pose, Sequence, Timestamp, check_map_id, level_code, microseconds
 from core.recognition.question import Question
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.filters import MOST_NAMES, checked_metadata, parsed_json
-from service.places.parameters import NewPlace, PlaceDescription
+from service.places.parameters import FlatFields, PlaceDescription
 from service.poses.geoposes import AnswerFormat
 
-Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
-KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
+Kind = Literal["position", "bbox", "heading", "sequences", "levels", "time", "where"]
+KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "levels", "time", "where")
 
 _NAMES: TypeAdapter[list[str]] = TypeAdapter(Annotated[list[Sequence], Field(min_length=1, max_length=MOST_NAMES)])
+_LEVELS: TypeAdapter[list[str]] = TypeAdapter(Annotated[list[Level], Field(min_length=1, max_length=MOST_NAMES)])
 _DEGREES = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]+)?")
 
 
@@ -57,6 +58,18 @@ class FilterParameters(PlaceDescription):
         description="The place belongs to one of these traverses: names separated by commas, or a JSON array of texts.",
         examples=["monday,tuesday"],
     )
+    level: Level | None = Field(
+        default=None,
+        description="The storey on which the frame was taken: a prior, as places on others are less probable then; "
+        "`levels` is a filter.",
+        examples=["2"],
+    )
+    levels: str | None = Field(
+        default=None,
+        max_length=20_000,
+        description="The place is on one of these storeys: names separated by commas, or a JSON array.",
+        examples=["1,2"],
+    )
     after: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or later.")
     before: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or earlier.")
     where: str | None = Field(
@@ -77,8 +90,8 @@ class FilterParameters(PlaceDescription):
         default=None,
         ge=0,
         lt=1,
-        description=f"The probability that the soft parameters are right; {TRUST} if left out. The odds of a place "
-        "that contradicts them are multiplied by at least 1 - prior_trust.",
+        description=f"The probability that level and the soft parameters are right; {TRUST} if left out. The odds of a "
+        "place that contradicts them are multiplied by at least 1 - prior_trust.",
     )
     exclude_frames: int | None = Field(
         default=None, ge=0, le=10**9, description="Leave out this many of the last places of the frame's own sequence."
@@ -118,6 +131,7 @@ class FilterParameters(PlaceDescription):
             TRUST if self.prior_trust is None else self.prior_trust,
             self._recent(),
         )
+        made = made if self.level is None else made.at_level(self.level)
         return made if made else None
 
     def again(self) -> dict[str, Any]:
@@ -142,6 +156,9 @@ class FilterParameters(PlaceDescription):
             found["heading"] = Facing(self.heading, self.heading_tolerance)
         if self.bbox is not None:
             found["bbox"] = parse_box(self.bbox)
+        if self.levels is not None:
+            names = _named(self.levels, _LEVELS, "levels", "storeys")
+            found["levels"] = OnLevels(tuple(level_code(name) for name in names))
         if self.after is not None or self.before is not None:
             if self.after is not None and self.before is not None and self.after > self.before:
                 raise InvalidRequest("after: the time is later than that of before.")
@@ -150,15 +167,7 @@ class FilterParameters(PlaceDescription):
         return found
 
     def _sequences(self) -> tuple[str, ...] | None:
-        if self.sequences is None:
-            return None
-        names: Any = self.sequences.split(",")
-        if self.sequences.startswith("["):
-            names = parsed_json(self.sequences, "sequences")
-        try:
-            return tuple(_NAMES.validate_python(names, strict=True))
-        except ValidationError as error:
-            raise InvalidRequest(f"sequences: give the names of 1 to {MOST_NAMES} traverses.") from error
+        return None if self.sequences is None else tuple(_named(self.sequences, _NAMES, "sequences", "traverses"))
 
     def _metadata(self) -> dict[str, Scalar]:
         if self.where is None:
@@ -167,7 +176,7 @@ class FilterParameters(PlaceDescription):
 
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
-            if self.prior_trust is not None:
+            if self.prior_trust is not None and self.level is None:
                 raise InvalidRequest("prior_trust: it needs soft, which names the parameters to which it applies.")
             return set()
         names = set(self.soft.split(","))
@@ -186,6 +195,19 @@ class FilterParameters(PlaceDescription):
             raise InvalidRequest("exclude_seconds: it needs the frame's own timestamp.")
         moment = None if self.timestamp is None else microseconds(self.timestamp)
         return RecentFrames(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
+
+
+def _named(text: str, names: TypeAdapter[list[str]], parameter: str, what: str) -> list[str]:
+    """The names in a parameter, separated by commas or a JSON array.
+
+    Raises:
+        InvalidRequest: they are none.
+    """
+    given: Any = parsed_json(text, parameter) if text.startswith("[") else text.split(",")
+    try:
+        return names.validate_python(given, strict=True)
+    except ValidationError as error:
+        raise InvalidRequest(f"{parameter}: give the names of 1 to {MOST_NAMES} {what}.") from error
 
 
 def _conditions(
@@ -253,7 +275,7 @@ class SingleQueryParameters(QueryParameters):
     format: AnswerFormat = None
 
 
-class ClosureParameters(FilterParameters, NewPlace):
+class ClosureParameters(FilterParameters, FlatFields):
     """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
 
     id: str = Field(description="Id of the place that is created if the frame is unknown.", examples=["p9"])

@@ -10,7 +10,7 @@ from core.judgement.verdict import Verdict
 from core.maps import ReviewFrame
 from core.places import Timestamp
 from service.http.schemas import Cursor
-from service.places.parameters import PlaceDescription
+from service.places.parameters import FlatFields
 from service.places.schemas import PlaceView
 
 
@@ -71,7 +71,7 @@ class ReviewPage(BaseModel):
     bytes: int = Field(description="The bytes of their files together.")
 
 
-class NewPlace(PlaceDescription):
+class NewPlace(FlatFields):
     """The place as which a frame is enrolled."""
 
     id: str = Field(description="Id of the place.", examples=["p9"])

@@ -15,6 +15,7 @@ from core.errors import FrameOutOfOrder
 from core.judgement.change import WorldChange
 from core.learning import RunFrame
 from core.maps import Map
+from core.maps.selection import Selection
 from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
@@ -92,9 +93,12 @@ async def process_frame(
             return repeated
         since = _since_last(session, options)
         session.receive(ASKER.get())
-        question = Question(options.k, session.selection, session.options.verify, session.options.camera)
+        selection = session.selection
+        if options.level is not None:
+            selection = (selection or Selection()).at_level(options.level)
+        question = Question(options.k, selection, session.options.verify, session.options.camera)
         answered = await engine.ask(map_, data, question, deadline)
-        asked = _question(session, options.k)
+        asked = _question(session, options)
         distrust = _distrust(options.timestamp)
         taken = options.timestamp if distrust is None else None
         queried = QueriedFrame(session.options.camera, session.id, options.frame, asked, taken)
@@ -220,7 +224,7 @@ def _advance(
     started = time.perf_counter()
     step, motion = _step(session, run, options, since)
     seen = NOTHING if answered.blank else evidence_of(answered, neighborhood_of(map_))
-    run.advance(seen, step, view, options.odometry_pose())
+    run.advance(seen, step, view, options.odometry_pose(), options.storey())
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -352,13 +356,15 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
     )
 
 
-def _question(session: Session, k: int) -> dict[str, Any]:
+def _question(session: Session, frame: FrameParameters) -> dict[str, Any]:
     """The parameters of a query that asks what each frame of a session does."""
     given: dict[str, Any] = session.options.model_dump(include={"verify", "camera"}, exclude_none=True)
     if session.options.sequences is not None:
         given["sequences"] = json.dumps(session.options.sequences)
     usual = QueryParameters().model_dump()
-    return {name: value for name, value in {**given, "k": k}.items() if value != usual[name]}
+    return {
+        name: value for name, value in {**given, "k": frame.k, "level": frame.level}.items() if value != usual[name]
+    }
 
 
 def session_view(session: Session, private: bool) -> SessionView:

@@ -8,10 +8,11 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from core.belief import Odometry, OdometryPose, RunOptions, Sight, Stride
+from core.belief.storeys import Storey
 from core.clocks import Stamp
 from core.judgement.verdict import Verdict
 from core.numerals import check_numeral
-from core.places import Sequence, Timestamp
+from core.places import Coordinate, Level, Sequence, Timestamp, level_code
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
 from service.queries.schemas import ChangeView, QueryAnswer
@@ -181,6 +182,16 @@ class FrameParameters(Parameters):
         description="A name for where odometry began. If the frame before had another one, the motion between the two "
         "is not known.",
     )
+    level: Level | None = Field(
+        default=None,
+        description="The storey on which the robot is, as far as it knows: a prior, which holds until another one is "
+        "stated. Where another is, the robot has come there by a lift.",
+    )
+    height: Coordinate | None = Field(
+        default=None,
+        description="Metres, by a barometer for example: where it leaps by more than the map's same_place_height, the "
+        "robot is on another storey; nothing else of it counts.",
+    )
     k: Matches = 5
     encoder: EncoderAssertion = None
 
@@ -209,6 +220,10 @@ class FrameParameters(Parameters):
     def stamp(self) -> Stamp:
         """When the frame was taken, and its number."""
         return Stamp(None if self.timestamp is None else self.timestamp.timestamp(), self.frame)
+
+    def storey(self) -> Storey:
+        """What the frame states of the robot's storey."""
+        return Storey(level_code(self.level), self.height)
 
     def odometry(self) -> Odometry | None:
         """The odometry of the frame; None if it has none."""

@@ -19,6 +19,7 @@ from core.judgement.alignment import LARGEST_STEP, LEAST_FRAMES, shared_stretche
 from core.maps import Correspondence, Map, Snapshot
 from core.maps.records import Outline
 from core.places import NO_POSE
+from core.recognition.stages import neighborhood_of
 from core.upkeep.correspondence import common_stations, handed_over, on_its_own
 from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames
@@ -248,6 +249,7 @@ def _change(
     for name in ("sequence", "ordinal"):
         still &= getattr(snapshot.whereabouts, name)[: then.rows] == getattr(before, name)
     pairs = _pairs(found, still)
+    pairs = pairs[~before.on_other_levels(*pairs.T, neighborhood_of(map_).height)]
     if not len(pairs) and not forget:
         return Correspondence()
     rows = np.flatnonzero(snapshot.alive)

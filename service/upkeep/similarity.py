@@ -20,6 +20,7 @@ from core import errors
 from core.judgement.alignment import SharedStretch
 from core.maps import Map, own_poses
 from core.method.encoder import Encoder
+from core.recognition.stages import neighborhood_of
 from core.upkeep.similarity import NONE, GreyScale, Rows, counterparts, nearest_by_pose, score_pairs, stretches_of
 from service.errors.faults import EncoderNotInstalled, TooManyPairs
 from service.errors.problems import problem_documentation
@@ -166,7 +167,7 @@ def _view(
 ) -> SimilarityView:
     queries, references = (own_poses(map_.counterparts, traverses.snapshot.whereabouts_at(some), some) for some in rows)
     radius = map_.record.same_place_radius
-    truth, aligned = nearest_by_pose(queries, references, radius), counterparts(queries, references)
+    truth, aligned = nearest_by_pose(queries, references, neighborhood_of(map_)), counterparts(queries, references)
     return SimilarityView(
         map=map_.record.id,
         encoder=encoder.identity,

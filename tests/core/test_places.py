@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from core.places import METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
+from core.places import (
+    EARTH_RADIUS,
+    GEOGRAPHIC,
+    METRIC,
+    NO_LEVEL,
+    NO_POSE,
+    NO_SEQUENCE,
+    Neighborhood,
+    PlaceFields,
+    Whereabouts,
+)
 
 NEARBY = Neighborhood(5.0, 1)
 # Traverse 0 has four frames.  Of traverse 1 the second and third show what stations 1 and 2 of traverse 0 show, and a
@@ -40,6 +52,56 @@ def aligned() -> Whereabouts:
 )
 def test_places_at_one_station_are_the_same(row: int, expected: list[int]) -> None:
     assert np.flatnonzero(aligned().near(row, NEARBY)).tolist() == expected
+
+
+def storeys(kind: int, levels: list[int], heights: list[float]) -> Whereabouts:
+    """Places one above the other, each of a traverse of its own."""
+    count = len(levels)
+    position = np.array([[EARTH_RADIUS, 0, 0] if kind == GEOGRAPHIC else [0, 0, z] for z in np.nan_to_num(heights)])
+    return Whereabouts(
+        np.full(count, kind, np.int8),
+        position,
+        np.arange(count, dtype=np.int32),
+        np.zeros(count, np.int64),
+        level=np.array(levels, np.int32),
+        height=np.array(heights),
+    )
+
+
+@pytest.mark.parametrize("kind", [METRIC, GEOGRAPHIC])
+def test_places_on_different_storeys_are_never_the_same(kind: int) -> None:
+    no, nan = NO_LEVEL, np.nan
+    where = storeys(kind, [no, no, no, no, 1, 1, 2], [0.0, 1.5, 4.0, nan, 0.0, 4.0, 0.0])
+    near = [np.flatnonzero(where.near(row, NEARBY)).tolist() for row in range(7)]
+    assert near[0] == [0, 1, 3, 4, 6], "without a level the height counts, where both are known"
+    assert near[3] == [0, 1, 2, 3, 4, 5, 6]
+    assert near[4] == [0, 1, 3, 4, 5], "two levels decide, whatever the heights"
+    assert near[6] == [0, 1, 3, 6]
+
+
+def test_a_radius_is_one_along_the_ground_and_a_storey_stays_as_high() -> None:
+    where = storeys(METRIC, [NO_LEVEL] * 3, [0.0, 1.4, 2.0])
+    where.position[:, 0] = [0, 4.9, 0]
+    assert np.flatnonzero(where.near(0, NEARBY)).tolist() == [0, 1]
+    assert np.flatnonzero(where.near(0, NEARBY.times(3))).tolist() == [0, 1]
+
+
+def test_one_sequence_on_two_levels_is_two_places() -> None:
+    where = replace(Whereabouts.along_sequence([0, 0, 1]), level=np.array([1, 2, 1], np.int32))
+    assert np.flatnonzero(where.near(0, NEARBY)).tolist() == [0, 2]
+    assert where.others(0, NEARBY).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "level"),
+    [
+        ({"floor": 2}, "2"), ({"level": "EG", "floor": 2}, "EG"), ({"story": -1.0}, "-1"), ({"storey": "e\u0301"}, "é"),
+        ({"floor": True}, None), ({"floor": 1.5}, None), ({"floor": "x" * 33}, None), ({"floor": ""}, None), ({}, None),
+    ],
+)  # fmt: skip
+def test_a_level_is_read_from_metadata(metadata: dict[str, object], level: str | None) -> None:
+    assert PlaceFields(metadata=metadata).level == level
+    assert PlaceFields(level="roof", metadata=metadata).level == "roof"
 
 
 def test_poses_decide_before_tracks_do() -> None:

@@ -50,6 +50,7 @@ Keep = Annotated[
     Literal["none", "thumbnail", "image"] | None, typer.Option(help="Pictures that the map stores of each frame.")
 ]
 Radius = Annotated[float | None, typer.Option(min=0, help="Places within N metres count as the same place.")]
+Height = Annotated[float | None, typer.Option(min=0, help="Places over N metres up or down are on another storey.")]
 Frames = Annotated[
     int | None,
     typer.Option(min=0, help="Without poses: places within N frames of a sequence count as the same place."),
@@ -118,6 +119,7 @@ def create_map(
     description: Description = None,
     keep: Keep = None,
     same_place_radius: Radius = None,
+    same_place_height: Height = None,
     same_place_frames: Frames = None,
     verification: Verification = None,
     learning: Learning = None,
@@ -126,7 +128,7 @@ def create_map(
     as_json: AsJson = False,
 ) -> None:
     """Create a map. Its encoder cannot be changed later."""
-    given = _given(description, keep, same_place_radius, same_place_frames, verification, learning)
+    given = _given(description, keep, same_place_radius, same_place_height, same_place_frames, verification, learning)
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
     _show_map(ask(CommandTarget(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
 
@@ -137,6 +139,7 @@ def edit_map(
     description: Description = None,
     keep: Keep = None,
     same_place_radius: Radius = None,
+    same_place_height: Height = None,
     same_place_frames: Frames = None,
     verification: Verification = None,
     learning: Learning = None,
@@ -150,7 +153,7 @@ def edit_map(
     as_json: AsJson = False,
 ) -> None:
     """Change settings of a map; the others stay as they are."""
-    changes = _given(description, keep, same_place_radius, same_place_frames, verification, learning)
+    changes = _given(description, keep, same_place_radius, same_place_height, same_place_frames, verification, learning)
     calibration = {"threshold": threshold, "margin": margin}
     calibration = {name: value for name, value in calibration.items() if value is not None}
     if calibration and default_calibration:
@@ -201,6 +204,7 @@ def _given(
     description: str | None,
     keep: str | None,
     radius: float | None,
+    height: float | None,
     frames: int | None,
     verification: bool | None,
     learning: str | None,
@@ -209,6 +213,7 @@ def _given(
         "description": description,
         "keep": keep,
         "same_place_radius": radius,
+        "same_place_height": height,
         "same_place_frames": frames,
         "verification": verification,
         "learning": None if learning is None else {"mode": learning},

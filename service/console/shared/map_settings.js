@@ -27,6 +27,9 @@ export function MapSettings({ fields, change }) {
       <${Field} label="Same place, metres">
         <${NumberInput} min="0" step="any" required value=${fields.same_place_radius} change=${(metres) => change({ same_place_radius: metres })} />
       <//>
+      <${Field} label="One storey, metres up or down">
+        <${NumberInput} min="0" step="any" required value=${fields.same_place_height} change=${(metres) => change({ same_place_height: metres })} />
+      <//>
       <${Field} label="Same place, frames">
         <${NumberInput} min="0" step="1" required value=${fields.same_place_frames} change=${(frames) => change({ same_place_frames: frames })} />
       <//>

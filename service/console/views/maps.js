@@ -146,7 +146,7 @@ function Damaged({ damaged, open, close, changed }) {
 
 function Create({ close, changed }) {
   const encoders = useResource((signal) => get("/encoders", {}, { signal }), []);
-  const [fields, setFields] = useState({ id: "", encoder: "", precision: "half", keep: "thumbnail", description: "", same_place_radius: 5, same_place_frames: 3, verification: true, index: "auto" });
+  const [fields, setFields] = useState({ id: "", encoder: "", precision: "half", keep: "thumbnail", description: "", same_place_radius: 5, same_place_height: 1.5, same_place_frames: 3, verification: true, index: "auto" });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const create = async () => {
     const { encoder, ...others } = fields;
@@ -191,7 +191,7 @@ function getTaggedMap(map) {
   return getTagged(mapPath(map));
 }
 
-const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification", "alarms"];
+const EDITED = ["description", "keep", "same_place_radius", "same_place_height", "same_place_frames", "verification", "alarms"];
 
 function EditForm({ map, read, close, changed }) {
   const [fields, setFields] = useState({

@@ -9,7 +9,7 @@ import pytest
 
 from core.belief import place_graph
 from core.belief.graph import ALONG
-from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import METRIC, NO_LEVEL, NO_POSE, Neighborhood, Whereabouts
 from tests.core.belief.maps import graph_of, posed, walk
 
 
@@ -26,6 +26,9 @@ def test_the_same_place_is_what_the_verdict_takes_for_it(frames: int, aligned: b
         track = np.where(counterparts, 0, where.sequence).astype(np.int32)
         station = np.where(counterparts, random.integers(0, 400, 80), ordinal)
         where = replace(where, track=track, station=station)
+    levels = random.choice([NO_LEVEL, 1, 2], 80, p=[0.5, 0.3, 0.2]).astype(np.int32)
+    heights = np.where(random.random(80) < 0.3, np.nan, random.choice([0.0, 1.0, 4.0], 80))
+    where = replace(where, level=levels, height=heights)
     neighborhood = Neighborhood(3.0, frames)
     graph = graph_of(where, neighborhood)
     for place in range(80):
@@ -54,6 +57,24 @@ def test_a_place_is_joined_to_its_neighbours_and_to_what_comes_next() -> None:
         beside = range(max(graph.first[place], place - ALONG), min(graph.last[place], place + ALONG + 1))
         assert set(beside) <= set(joined)
     assert graph.heading[65] == pytest.approx(0)
+
+
+@pytest.mark.parametrize("known", ["levels", "heights", "both"])
+def test_only_a_traverse_leads_to_another_storey(known: str) -> None:
+    corridor = [(float(x), 0.0) for x in range(20)]
+    where = posed(corridor, corridor, [(0.0, 0.5)] * 2)  # the third goes up in a lift
+    storey = np.repeat([0, 1, 0, 1], [20, 20, 1, 1])
+    if known != "heights":
+        where = replace(where, level=storey.astype(np.int32))
+    if known != "levels":
+        where.position[:, 2] = 4.0 * storey
+        where = replace(where, height=4.0 * storey)
+    graph = graph_of(where, Neighborhood(5.0, 1))
+    sources = np.repeat(np.arange(42), np.diff(graph.starts))
+    across = storey[sources] != storey[graph.targets]
+    assert set(zip(sources[across].tolist(), graph.targets[across].tolist(), strict=True)) == {(40, 41), (41, 40)}
+    inside = graph.targets[graph.starts[5] : graph.starts[6]]
+    assert {3, 4, 6, 7} <= set(inside.tolist()), "those of its own storey are joined as before"
 
 
 def test_a_map_of_none_and_of_one() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from core.judgement.priors import (
     GeographicBox,
     InSequences,
     NotLately,
+    OnLevels,
     Period,
     decision_slope,
     holding,
@@ -26,7 +28,7 @@ from core.judgement.priors import (
 )
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_LEVEL, NO_POSE, NO_TIME, Pose, Whereabouts
 
 CALIBRATION = Calibration(
     source="test", threshold=0.2, margin=0.01, background_mean=0.1, background_deviation=0.05,
@@ -144,6 +146,12 @@ def test_ones_own_last_frames() -> None:
     assert held(NotLately(3, 0), *nowhere, **rows) == [True] * 5
     assert held(InSequences((1, 5)), *nowhere, **rows) == [True, True, True, False, True]
     assert held(InSequences(()), *nowhere, **rows) == [False] * 5
+
+
+def test_places_without_a_level_are_on_none_and_fit_any() -> None:
+    where = replace(Whereabouts.along_sequence(range(3)), level=np.array([NO_LEVEL, 7, 8], np.int32))
+    assert OnLevels((7, 9)).holds(where).tolist() == [False, True, False]
+    assert OnLevels((7, 9)).fit(where).tolist() == [1, 1, 0]
 
 
 def test_all_of_several() -> None:

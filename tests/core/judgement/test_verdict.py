@@ -66,6 +66,39 @@ def test_a_close_rival_elsewhere_makes_it_ambiguous() -> None:
     assert judgement.rival == 1
 
 
+STOREYS = Whereabouts(
+    np.full(62, METRIC, np.int8),
+    np.array([(0, 0, 0), (0, 0, 4), *((100.0 + 20 * i, 0, 0) for i in range(60))]),
+    np.arange(62, dtype=np.int32),
+    np.zeros(62, np.int64),
+    height=np.array([0.0, 4.0] + [0.0] * 60),
+)
+"""Two places one above the other, and others."""
+
+
+@pytest.mark.parametrize(
+    ("lead", "alike", "verdict"),
+    [(0.005, 0.2, "ambiguous"), (0.1, 0.8, "ambiguous"), (0.1, 0.4, "recognized"), (0.1, None, "recognized")],
+)
+def test_a_storey_is_told_by_what_the_query_shows_alone(lead: float, alike: float | None, verdict: str) -> None:
+    """However large the lead, of two storeys that are more alike than the query is like either none is recognized."""
+    curve = CALIBRATION.model_copy(update={"curve": Curve(slope=40.0, intercept=-8.0)})
+    rest = [0.03 - 0.0001 * i for i in range(60)]
+    scores = falling(0.5, 0.5 - lead, *rest)
+
+    def likeness(positions: NDArray[np.int64]) -> NDArray[np.float32]:
+        return np.where(positions == 1, alike or 0.0, 0.0).astype(np.float32)
+
+    judgement = judge(scores, STOREYS, curve, NEARBY, likeness=None if alike is None else likeness)
+    assert judgement.verdict == verdict and judgement.probability is not None
+    assert (judgement.probability <= 0.5) == (verdict == "ambiguous")
+    assert judgement.twins == ((1,) if verdict == "ambiguous" else ())
+    stated = judge(scores, STOREYS, curve, NEARBY, likeness=likeness, prior=np.log(np.where(STOREYS.height, 0.1, 1.0)))
+    assert stated.verdict == ("recognized" if lead > 0.01 else "ambiguous")
+    together = replace(STOREYS, level=np.zeros(62, np.int32))
+    assert judge(scores, together, curve, NEARBY, likeness=likeness).verdict == "recognized", "one storey, by its level"
+
+
 def test_poses_decide_before_sequences_do() -> None:
     # Other sequences (codes differ), but 3 m and 8 m away.
     judgement = judge(falling(0.5, 0.49, 0.3), at([(0, 0), (3, 0), (8, 0)]), CALIBRATION, NEARBY)

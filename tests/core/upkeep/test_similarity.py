@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Whereabouts
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 from core.upkeep.similarity import NONE, GreyScale, counterparts, nearest_by_pose, stretches_of
 
 SCORES = arrays(np.float32, st.tuples(st.integers(1, 7), st.integers(1, 7)), elements=st.floats(-2, 2, width=32))
@@ -49,10 +51,17 @@ def places(kind: list[int], x: list[float], sequence: int = 0) -> Whereabouts:
 def test_the_nearest_by_pose_is_of_the_same_kind_and_within_the_radius() -> None:
     queries = places([METRIC, METRIC, NO_POSE, GEOGRAPHIC, METRIC], [0.0, 4.9, 0.0, 0.0, 100.0])
     references = places([NO_POSE, METRIC, METRIC, METRIC], [0.0, 1.0, 5.0, 0.5])
-    found = nearest_by_pose(queries, references, 5.0)
+    found = nearest_by_pose(queries, references, Neighborhood(5.0, 0))
     assert found is not None and found.tolist() == [3, 2, NONE, NONE, NONE]
-    assert nearest_by_pose(queries, places([NO_POSE], [0.0]), 5.0) is None
-    assert nearest_by_pose(places([GEOGRAPHIC], [0.0]), places([METRIC], [0.0]), 5.0) is None
+    assert nearest_by_pose(queries, places([NO_POSE], [0.0]), Neighborhood(5.0, 0)) is None
+    assert nearest_by_pose(places([GEOGRAPHIC], [0.0]), places([METRIC], [0.0]), Neighborhood(5.0, 0)) is None
+
+
+def test_the_nearest_by_pose_is_on_the_same_storey() -> None:
+    queries = replace(places([METRIC] * 2, [0.0, 0.0]), height=np.array([0.0, np.nan]))
+    references = replace(places([METRIC] * 2, [0.0, 3.0]), height=np.array([4.0, 1.0]))
+    found = nearest_by_pose(queries, references, Neighborhood(5.0, 0))
+    assert found is not None and found.tolist() == [1, 0]
 
 
 def test_counterparts_are_at_the_same_station_of_another_traverse() -> None:

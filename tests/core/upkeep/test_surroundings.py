@@ -20,6 +20,7 @@ def along(x: list[float], headings: list[float] | None = None, z: float = 0.0) -
         np.zeros(count, np.int32),
         np.arange(count),
         np.array([math.nan] * count if headings is None else headings, np.float32),
+        height=np.full(count, z),
     )
 
 

@@ -1,0 +1,114 @@
+"""The storey of a run's robot: what is stated of it, and what a lift does to the belief.
+
+A belief stays on its storey by itself, as only traverses that climb lead to another one.  What the robot states of its
+level is no evidence of one frame, for it is repeated with every frame: it weighs the summary of the belief, once.
+Where another level is stated than before, or its height has leapt, the robot was in a lift: it may be anywhere on the
+storeys that fit, and the frames say where.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.belief.filter import Belief, uninformed
+from core.belief.graph import PlaceGraph
+from core.judgement.priors import OnLevels
+from core.maps.selection import TRUST
+from core.places import NO_LEVEL
+
+
+@dataclass(frozen=True)
+class Storey:
+    """What is stated of a robot's storey: the code of its level, or NO_LEVEL; its height in metres, by a barometer for
+    example, of which differences alone count; None: not stated."""
+
+    level: int = NO_LEVEL
+    height: float | None = None
+
+
+UNSTATED = Storey()
+
+LIKELY = 512
+"""At most this many of the likeliest places are those from which a robot may have come."""
+
+
+def later(before: Storey, now: Storey, limit: float) -> tuple[Storey, float | None]:
+    """What is stated after a frame, and by how many metres the robot has climbed since the last storey.
+
+    Args:
+        limit: metres within which two heights may be on one storey.
+
+    Returns:
+        The statements that hold now; and NaN for a height that is not known, None where the robot stays on its storey.
+    """
+    climb = None if now.height is None or before.height is None else now.height - before.height
+    leaps = climb is not None and abs(climb) > limit
+    changes = now.level != NO_LEVEL and before.level not in (NO_LEVEL, now.level)
+    height = now.height if leaps or changes or before.height is None else before.height
+    level = before.level if now.level == NO_LEVEL and not leaps else now.level
+    if not leaps and not changes:
+        return Storey(level, height), None
+    return Storey(level, height), climb if leaps and climb is not None else float("nan")
+
+
+def after_lift(belief: Belief, graph: PlaceGraph, before: Storey, now: Storey, climb: float) -> Belief:
+    """The belief of a robot that has come to another storey: to the level that it states, if the map has it, else from
+    each place where it may have been to those that are as much higher or, if there are none, on any other storey.
+
+    Args:
+        before, now: what it stated on the storeys.
+        climb: metres; NaN: not known.
+    """
+    if not len(graph):
+        return belief
+    where, limit, every = graph.whereabouts, graph.neighborhood.height, np.arange(len(graph))
+    was = weighed(belief, graph, before).given
+    likely = np.argsort(-was, kind="stable")[:LIKELY]
+    there = np.abs(where.height - where.height[likely, np.newaxis] - climb) <= limit
+    if not there.any():
+        there = where.on_other_levels(every, likely[:, np.newaxis], limit)
+    if now.level != NO_LEVEL and (where.level == now.level).any():
+        there = np.broadcast_to(where.level == now.level, there.shape)
+    if not there.any():
+        return belief
+    arrived = was[likely] @ (there / np.maximum(there.sum(axis=1, keepdims=True), 1))
+    anywhere = uninformed(len(graph))
+    given = (1 - TRUST) * anywhere.given + TRUST * arrived / arrived.sum()
+    return replace(anywhere, given=given.astype(np.float32), unknown=belief.unknown)
+
+
+def undecided(ahead: Belief, seen: Belief, graph: PlaceGraph, rows: NDArray[np.int64]) -> Belief:
+    """The belief after a frame that may as well show several storeys: each of them is as probable as before.
+
+    Args:
+        ahead, seen: the belief before and after the frame.
+        rows: int64 [m], of the map, places on these storeys.
+    """
+    every, given = np.arange(len(graph)), seen.given.copy()
+    left, storeys = np.ones(len(graph), np.bool_), []
+    for place in graph.places_at(rows).tolist():
+        storey = left & ~graph.whereabouts.on_other_levels(every, place, graph.neighborhood.height)
+        if place >= 0 and storey.any():
+            storeys.append(storey)
+            left &= ~storey
+    before = np.array([ahead.given[storey].sum(dtype=np.float64) for storey in storeys])
+    after = np.array([given[storey].sum(dtype=np.float64) for storey in storeys])
+    if len(storeys) > 1 and before.min() > 0 and after.min() > 0:
+        for storey, factor in zip(storeys, before / before.sum() * after.sum() / after, strict=True):
+            given[storey] *= np.float32(factor)
+    return replace(seen, given=given)
+
+
+def weighed(belief: Belief, graph: PlaceGraph, storey: Storey) -> Belief:
+    """The belief by what the robot states of its level (:mod:`core.judgement.priors`)."""
+    if storey.level == NO_LEVEL or not len(graph):
+        return belief
+    given: NDArray[np.float32] = belief.given * (
+        1 - TRUST + TRUST * OnLevels((storey.level,)).fit(graph.whereabouts)
+    ).astype(np.float32)
+    inside = float(given.sum(dtype=np.float64))
+    known = (1 - belief.unknown) * inside
+    return replace(belief, given=given / np.float32(inside), unknown=belief.unknown / (known + belief.unknown))
