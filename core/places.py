@@ -474,8 +474,9 @@ class Whereabouts:
             one, other: integers that broadcast against each other.
             height: metres within which two places may be on one storey.
         """
-        ours, theirs = self.level[one], self.level[other]
-        apart = np.abs(self.height[one] - self.height[other]) > height
+        here, there = np.asarray(one), np.asarray(other)
+        ours, theirs = self.level[here], self.level[there]
+        apart = np.abs(np.asarray(self.height[here]) - self.height[there]) > height
         return np.where((ours != NO_LEVEL) & (theirs != NO_LEVEL), ours != theirs, apart)
 
     def on_level_of(self, row: int, height: float) -> Whereabouts:
