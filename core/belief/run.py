@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.belief.consistency import Contradiction, OdometryCheck
 from core.belief.estimate import Estimate, estimate
 from core.belief.evidence import NOTHING, Evidence, Sighting
 from core.belief.filter import (
@@ -75,6 +78,30 @@ class RunOptions:
     lag: int = 0
 
 
+REPLAYED = 12
+"""Frames from which the belief is made anew, without odometry, once they have contradicted it."""
+
+LISTED = 32
+"""Of these frames, the places with most evidence are remembered."""
+
+
+@dataclass(frozen=True, eq=False)
+class CountedLook:
+    """A frame that counted, for a belief that is made anew.
+
+    seen: its evidence for the LISTED likeliest places.
+    share: of a whole look, without odometry.
+    frames, constant: the run's frames since the one before it that counted.
+    change: of the view since then; None: not known.
+    """
+
+    seen: Evidence
+    share: float
+    frames: int
+    constant: int
+    change: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class RunState:
     """From what a run can be continued: all but the probabilities of the least likely places and the last frames.
@@ -89,6 +116,8 @@ class RunState:
     pending_reach: metres that the robot may have moved in the constant frames.
     pose: as of the :class:`Run`.
     sighting: of the last frame that counted; None if it was not recognized by itself.
+    check: of odometry, by what frames show.
+    looks: the last frames that counted, the oldest first; none while odometry does not move the belief.
     """
 
     rows: NDArray[np.int64]
@@ -105,6 +134,8 @@ class RunState:
     pose: OdometryPose | None = None
     shares: NDArray[np.float32] = field(default_factory=lambda: UNKNOWN.shares)
     sighting: Sighting | None = None
+    check: OdometryCheck = field(default_factory=OdometryCheck)
+    looks: tuple[CountedLook, ...] = ()
 
 
 def _apart(speed: ArrayLike) -> NDArray[np.float64]:
@@ -113,7 +144,9 @@ def _apart(speed: ArrayLike) -> NDArray[np.float64]:
 
 
 def freshness(motion: Odometry | None, spacing: float) -> float:
-    """The weight of a frame, from SAME_SPOT to 1: less than 1 if odometry says that the robot has hardly moved.
+    """The weight of a frame, from SAME_SPOT to 1: less than 1 if odometry is sure that the robot has hardly moved.
+
+    What counts is the root mean square of the motion, by what odometry says and by how sure it is of that.
 
     Args:
         motion: since the last frame; None: it is not known.
@@ -121,7 +154,9 @@ def freshness(motion: Odometry | None, spacing: float) -> float:
     """
     if motion is None or not spacing:
         return 1.0
-    return float(min(1.0, max(SAME_SPOT, motion.distance / (0.5 * spacing), abs(motion.turn) / TURN_NOTED)))
+    moved = math.sqrt(motion.distance**2 + 2 * motion.variance) / (0.5 * spacing)
+    turned = math.sqrt(motion.turn**2 + motion.turn_variance) / TURN_NOTED
+    return float(min(1.0, max(SAME_SPOT, moved, turned)))
 
 
 class Run:
@@ -149,6 +184,13 @@ class Run:
         self._pending_reach = 0.0
         self._pending = Pending()
         self._smoother = Smoother(options.lag)
+        self._check = OdometryCheck()
+        self._looks: deque[CountedLook] = deque(maxlen=REPLAYED)
+
+    @property
+    def contradiction(self) -> Contradiction | None:
+        """What is wrong with odometry, which then does not move the belief; None while nothing speaks against it."""
+        return self._check.contradiction
 
     @property
     def lost(self) -> bool:
@@ -212,12 +254,47 @@ class Run:
             self._view = view or self._view
         if self.sight != "constant":  # a view that stays shows what it has shown
             self._sighting = seen.sighting
+        step = self._trusted(step, seen, share, change, pose)
         self._guided = by_poses(self.graph, step)
         stands = self.sight == "constant" and (step.odometry is None or not self._guided)
         self._filter(seen, step, share, stands, change)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
         self.frames += 1
+
+    def _trusted(
+        self, step: Step, seen: Evidence, share: float, change: float | None, pose: OdometryPose | None
+    ) -> Step:
+        """The step without odometry that frames contradict.
+
+        Once they do, the belief is made anew from the last frames, for it has been led astray.
+        """
+        if not self.graph.posed.any():
+            return step
+        before = self.contradiction
+        self._check = self._check.moved(step.odometry)
+        counts = self.sight is None
+        if counts:
+            self._check = self._check.sighted(seen, pose, self.graph)
+        if self.contradiction is not None and before is None:
+            self._begin_anew()
+        if step.odometry is None and pose is None:
+            self._looks.clear()
+        elif counts:
+            self._looks.append(CountedLook(seen.strongest(LISTED), share, step.frames, 0, change))
+        elif self._looks and self.sight == "constant":
+            self._looks[-1] = replace(self._looks[-1], constant=self._looks[-1].constant + 1)
+        return step if self.contradiction is None else replace(step, odometry=None)
+
+    def _begin_anew(self) -> None:
+        """Make the belief anew from the last frames that counted, by the sequences of the map alone."""
+        self.belief, self._pending = uninformed(len(self.graph)), Pending()
+        self._smoother.clear()
+        frames, self.frames, self.constant = self.frames, 0, 0
+        for look in self._looks:
+            self._filter(look.seen, Step(frames=look.frames), look.share, False, look.change)
+            self.frames, self.constant = self.frames + 1, look.constant
+        self.frames = frames
 
     def _confirms(self, sighting: Sighting | None) -> bool:
         """Whether a frame is recognized by itself where the last one that counted was."""
@@ -354,6 +431,8 @@ class Run:
             self.pose,
             self.belief.speeds.at(best),
             self._sighting,
+            self._check,
+            tuple(self._looks),
         )
 
     @classmethod
@@ -364,6 +443,7 @@ class Run:
         run._pending = Pending(state.odometry, state.reach)
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
         run._pending_reach, run.pose, run._sighting = state.pending_reach, state.pose, state.sighting
+        run._check, run._looks = state.check, deque(state.looks, REPLAYED)
         if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))
             given = np.full(len(graph), max(rest / len(graph), 1e-12), np.float32)
