@@ -4,7 +4,8 @@ A *sighting* is such a frame: where its place is, p, and where odometry has led,
 from the heading of the place that was seen before it.  Explanations of the last sightings are compared by their
 marginal likelihoods, which are Gaussian and in closed form:
 
-* odometry as stated:  p = c + w, with the variance that it states, its drift, and headings that are known roughly;
+* odometry as stated:  p = c + w, with its drift, headings that are known roughly, and the variance that it states, or
+  none, whichever fits better;
 * odometry of an unknown scale and turn:  p = c + s·w, with any complex s;
 * odometry of no use:  p = c + v·k at the k-th sighting, with any velocity v, or none.
 
@@ -97,7 +98,7 @@ class SeenPlace:
         each axis, metres², by its evidence for the places around.
     leg, by_degrees: x + iy in the map's directions, metres; the second if headings that were given as degrees are
         radians.
-    variance: of the leg along each axis, metres².
+    variance: of the leg along each axis, metres², by its length alone; ``stated``: what odometry adds to that.
     """
 
     row: int
@@ -106,6 +107,7 @@ class SeenPlace:
     leg: complex = 0j
     by_degrees: complex = 0j
     variance: float = 0.0
+    stated: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -158,23 +160,24 @@ class OdometryCheck:
         assert self.motion is not None
         heading = float(graph.heading[_place(graph, self.seen[-1].row)])
         ahead = complex(self.motion.forward, self.motion.left)
-        variance = self.motion.variance + (DRIFT * self.path) ** 2
+        variance, stated = (DRIFT * self.path) ** 2, self.motion.variance
         if math.isnan(heading):
-            return replace(new, variance=variance + 0.5 * abs(ahead) ** 2)
+            return replace(new, variance=variance + 0.5 * abs(ahead) ** 2, stated=stated)
         by_degrees = ahead
         if pose is not None and self.pose is not None:
             before = math.degrees(self.pose.heading)
             by_degrees = complex(pose.x - self.pose.x, pose.y - self.pose.y) * np.exp(-1j * before)
         onto = complex(np.exp(1j * heading))
         variance += 0.5 * (HEADING_SPREAD * abs(ahead)) ** 2
-        return replace(new, leg=onto * ahead, by_degrees=onto * complex(by_degrees), variance=variance)
+        by_degrees = onto * complex(by_degrees)
+        return replace(new, leg=onto * ahead, by_degrees=by_degrees, variance=variance, stated=stated)
 
     def _followed(self, new: SeenPlace, graph: PlaceGraph) -> tuple[tuple[SeenPlace, ...], tuple[SeenPlace, ...]]:
         """The sightings with a new one, and those before a leap."""
         if _fits((*self.seen, new), graph):
             return (*self.seen, new)[-MOST:], ()
         if not self.aside:
-            return (replace(new, leg=0j, by_degrees=0j, variance=0.0),), (*self.seen, new)
+            return (replace(new, leg=0j, by_degrees=0j, variance=0.0, stated=0.0),), (*self.seen, new)
         *before, leapt = self.aside
         if _fits((*before, leapt, new), graph):  # a course of long strides
             return (*before, leapt, new)[-MOST:], ()
@@ -183,10 +186,11 @@ class OdometryCheck:
             leg=leapt.leg + new.leg,
             by_degrees=leapt.by_degrees + new.by_degrees,
             variance=leapt.variance + new.variance,
+            stated=leapt.stated + new.stated,
         )
         if _fits((*before, skipped), graph):  # one wrong sighting
             return (*before, skipped)[-MOST:], ()
-        return (replace(new, leg=0j, by_degrees=0j, variance=0.0),), (*before, skipped)
+        return (replace(new, leg=0j, by_degrees=0j, variance=0.0, stated=0.0),), (*before, skipped)
 
     def _decided(self, graph: PlaceGraph) -> OdometryCheck:
         if len(self.seen) < LEAST:
@@ -247,7 +251,9 @@ def _fits(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> bool:
     expected = [0j, leg]
     if len(way) > 2:
         expected.append((way[-2] - way[0]) / (len(way) - 2))
-    farthest = GUARD_FACTOR * max(graph.neighborhood.radius, graph.spacing) + 3 * math.sqrt(seen[-1].variance)
+    farthest = GUARD_FACTOR * max(graph.neighborhood.radius, graph.spacing) + 3 * math.sqrt(
+        seen[-1].variance + seen[-1].stated
+    )
     return min(abs(step - one) for one in expected) <= farthest
 
 
@@ -258,42 +264,48 @@ def _against(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> NDArray[np.float
     are those of fewer sightings, so that one Cholesky decomposition gives the likelihoods of all.
     """
     way = _way(graph, list(seen[::-1]))
-    legs, _, variances = _legs(seen)
+    legs, _ = _legs(seen)
     number = np.arange(len(seen), dtype=np.float64)
     placed = _deviation(graph) ** 2
     noise = np.diag([placed + one.spread for one in reversed(seen)]) + 100**2 * placed
-    drift = np.minimum(np.minimum(variances[:, np.newaxis], variances), VAGUEST * placed)
+    drift, vague = (
+        np.minimum(_spread_backwards([getattr(one, name) for one in seen]), VAGUEST * placed)
+        for name in ("variance", "stated")
+    )
     step = graph.spacing or 1.0
     longest = float(np.abs(legs).max()) / (FARTHER * float(np.abs(way).max() + _deviation(graph)))
     along, across = np.outer(legs, legs.conj()) / max(1.0, longest) ** 2, np.outer(number, number)
-    explained = [noise + drift]
+    explained = [noise + drift, noise + drift + vague]
     explained += [noise + drift + spread**2 * along for spread in SPREADS]
     explained += [noise] + [noise + (spread * step) ** 2 * across for spread in SPREADS]
-    rest = np.stack([way - legs] + [way] * (len(explained) - 1))
+    rest = np.stack([way - legs] * 2 + [way] * (len(explained) - 2))
     factors = np.linalg.cholesky(2 * np.stack([one.astype(np.complex128) for one in explained]))
     white = np.linalg.solve(factors, rest[..., np.newaxis])[..., 0]
     scales = np.log(np.einsum("hkk->hk", factors).real)
     likely = -np.cumsum(np.square(np.abs(white)) + 2 * scales, axis=1)[:, LEAST - 1 :]
-    stated, others = likely[0], likely[1:]
-    return np.asarray(np.logaddexp.reduce(others, axis=0) - math.log(len(others)) - stated)
+    others = likely[2:]
+    return np.asarray(np.logaddexp.reduce(others, axis=0) - math.log(len(others)) - likely[:2].max(axis=0))
 
 
-def _legs(
-    seen: tuple[SeenPlace, ...],
-) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.float64]]:
-    """Where odometry was at each sighting from the latest on backwards, as stated and by degrees, and the variance."""
+def _spread_backwards(variances: list[float]) -> NDArray[np.float64]:
+    """Covariances of the positions from the latest on backwards, by the variance of the leg that led to each."""
+    grown = np.concatenate([[0.0], np.cumsum(variances[:0:-1])])
+    return np.minimum(grown[:, np.newaxis], grown)
+
+
+def _legs(seen: tuple[SeenPlace, ...]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Where odometry was at each sighting, from the latest on backwards, as stated and by degrees; complex128 [n]."""
 
     def back(values: list[complex]) -> NDArray[np.complex128]:
         return -np.concatenate([[0], np.cumsum(values[:0:-1])])
 
-    variances = np.concatenate([[0.0], np.cumsum([one.variance for one in seen[:0:-1]])])
-    return back([one.leg for one in seen]), back([one.by_degrees for one in seen]), variances
+    return back([one.leg for one in seen]), back([one.by_degrees for one in seen])
 
 
 def described(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> Contradiction:
     """What odometry looks like beside some sightings."""
     way = _way(graph, list(seen[::-1]))
-    legs, by_degrees, _ = _legs(seen)
+    legs, by_degrees = _legs(seen)
     extent = float(np.abs(way).max())
     way, legs, by_degrees = way - way.mean(), legs - legs.mean(), by_degrees - by_degrees.mean()
     shown, gone = float(np.linalg.norm(way)), float(np.linalg.norm(legs))

@@ -141,7 +141,13 @@ def _check_fields(check: OdometryCheck) -> list[Any]:
 
 def _seen_fields(seen: SeenPlace) -> list[float]:
     points = (seen.offset, seen.leg, seen.by_degrees)
-    return [seen.row, seen.spread, seen.variance, *(part for one in points for part in (one.real, one.imag))]
+    return [
+        seen.row,
+        seen.spread,
+        seen.variance,
+        seen.stated,
+        *(part for one in points for part in (one.real, one.imag)),
+    ]
 
 
 def _check(fields: Any) -> OdometryCheck:
@@ -156,9 +162,9 @@ def _check(fields: Any) -> OdometryCheck:
     )
 
 
-def _seen(row: int, spread: float, variance: float, *parts: float) -> SeenPlace:
+def _seen(row: int, spread: float, variance: float, stated: float, *parts: float) -> SeenPlace:
     offset, leg, by_degrees = (complex(*parts[at : at + 2]) for at in (0, 2, 4))
-    return SeenPlace(row, offset, spread, leg, by_degrees, variance)
+    return SeenPlace(row, offset, spread, leg, by_degrees, variance, stated)
 
 
 def _pose(fields: Any) -> OdometryPose | None:

@@ -202,7 +202,7 @@ class Run:
         """Upper bound of the run's memory in bytes, without the graph."""
         moments = 1 + (self.options.lag + 1 if self.options.lag else 0)
         speeds = 4 * (len(SPEEDS) + 1) * min(len(self.graph), TRACKED) if self.options.stride is None else 0
-        return (4 * len(self.graph) + speeds) * moments + WIDTH * HEIGHT
+        return (4 * len(self.graph) + speeds) * moments + WIDTH * HEIGHT + 12 * LISTED * REPLAYED
 
     def place_on(self, graph: PlaceGraph) -> None:
         """Continue on another graph, after the map's places have changed."""
@@ -269,7 +269,9 @@ class Run:
 
         Once they do, the belief is made anew from the last frames, for it has been led astray.
         """
-        if not self.graph.posed.any():
+        if not self.graph.posed.any() or (step.odometry is None and pose is None):
+            self._check = OdometryCheck()
+            self._looks.clear()
             return step
         before = self.contradiction
         self._check = self._check.moved(step.odometry)
@@ -278,9 +280,7 @@ class Run:
             self._check = self._check.sighted(seen, pose, self.graph)
         if self.contradiction is not None and before is None:
             self._begin_anew()
-        if step.odometry is None and pose is None:
-            self._looks.clear()
-        elif counts:
+        if counts:
             self._looks.append(CountedLook(seen.strongest(LISTED), share, step.frames, 0, change))
         elif self._looks and self.sight == "constant":
             self._looks[-1] = replace(self._looks[-1], constant=self._looks[-1].constant + 1)

@@ -24,7 +24,7 @@ from core.belief import (
     to_bytes,
 )
 from core.belief.motion import Odometry
-from core.places import Neighborhood, Pose, Whereabouts
+from core.places import GEOGRAPHIC, Neighborhood, Pose, Whereabouts
 from tests.core.belief.maps import graph_of, posed, walk
 
 METRES, PLACES = 2.0, 160
@@ -129,7 +129,7 @@ def test_a_fault_of_odometry_is_noticed_and_does_no_harm(
     fault, _, _ = FAULTS[name]
     rows = range(20, 120)
     told = follow(graph, rows, poses(rows, fault, range(start, 100), deviation))
-    assert not any(told.kinds[: start + 2]), "as long as it was right"
+    assert not any(told.kinds[:start]), "as long as it was right"
     soon = 4 * SOON if name == "radians" or deviation else SOON
     assert told.kinds[start + soon], f"within {soon} frames"
     assert sum(map(bool, told.kinds[start + soon :])) >= 0.8 * (100 - start - soon), "and stays so"
@@ -210,8 +210,8 @@ def test_a_map_on_the_earth_is_checked_as_well() -> None:
     where = Whereabouts.along_sequence(np.arange(PLACES))
     where = replace(
         where,
-        kind=np.full(PLACES, earthly[0].kind, np.int8),
-        position=np.array([one.position for one in earthly]),
+        kind=np.full(PLACES, GEOGRAPHIC, np.int8),
+        position=np.array([one.position() for one in earthly]),
     )
     graph, rows = graph_of(where, Neighborhood(5.0, 2)), range(20, 80)
     assert graph.geographic
