@@ -255,8 +255,9 @@ class Run:
         if self.sight != "constant":  # a view that stays shows what it has shown
             self._sighting = seen.sighting
         step = self._trusted(step, seen, share, change, pose)
-        self._guided = by_poses(self.graph, step)
-        stands = self.sight == "constant" and (step.odometry is None or not self._guided)
+        guided = by_poses(self.graph, step)
+        self._guided = guided and (step.odometry is None or step.odometry.variance <= (0.5 * self.graph.spacing) ** 2)
+        stands = self.sight == "constant" and (step.odometry is None or not guided)
         self._filter(seen, step, share, stands, change)
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
