@@ -45,6 +45,7 @@ def to_bytes(state: RunState) -> bytes:
         "view": 0 if state.view is None else len(state.view.levels),
         "blind": state.blind,
         "constant": state.constant,
+        "unlike": state.unlike,
         "pending_reach": state.pending_reach,
         "pose": _pose_fields(pose),
         "sighting": None if sighting is None else [sighting.row, sighting.probability],
@@ -115,6 +116,7 @@ def from_bytes(data: bytes) -> RunState:
                 CountedLook(Evidence(array("<i8", count), array("<f4", count), unknown), *fields)
                 for count, unknown, *fields in head["looks"]
             ),
+            head["unlike"],
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error
