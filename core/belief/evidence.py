@@ -84,6 +84,13 @@ class Evidence:
         """The evidence with every log likelihood ratio multiplied by ``weight``."""
         return replace(self, gains=self.gains * np.float32(weight), unknown=self.unknown * weight)
 
+    def strongest(self, count: int) -> Evidence:
+        """The evidence for the ``count`` places that gain most."""
+        if len(self.rows) <= count:
+            return self
+        best = np.argpartition(-self.gains, count)[:count]
+        return replace(self, rows=self.rows[best], gains=self.gains[best])
+
 
 NOTHING = Evidence(np.empty(0, np.int64), np.empty(0, np.float32), 0.0)
 """The evidence of a frame that says nothing: one without regions, or one in an empty map."""

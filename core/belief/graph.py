@@ -122,6 +122,11 @@ class PlaceGraph:
         order = order[np.diff(places[order], prepend=-1) > 0]  # of several frames of one place the best
         return places[order], seen.gains[order]
 
+    def displacements(self, origin: int, places: NDArray[np.integer]) -> NDArray[np.complex128]:
+        """Metres from one place to others in the plane, x + iy, complex128 [k]."""
+        apart = self.coordinates[places] - self.coordinates[origin]
+        return np.asarray(apart[:, 0] * self.shrink[origin] + 1j * apart[:, 1], np.complex128)
+
     def same_place(self, place: int) -> NDArray[np.int64]:
         """The places that are the same place as one, itself included; int64 [m], ascending.
 

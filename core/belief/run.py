@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.belief.consistency import Contradiction, OdometryCheck
 from core.belief.estimate import Estimate, estimate
 from core.belief.evidence import NOTHING, Evidence, Sighting
 from core.belief.filter import (
@@ -57,7 +60,9 @@ SAME_SPOT = 0.1
 
 FADING = 0.8
 """With each further frame that is covered, or constant and unlike the map, the robot is believed to see the map by this
-factor less.  After three of them not even a belief that was sure is recognized."""
+factor less.  After three of them not even a belief that was sure is recognized.  So it is with frames that are new and
+fit no better, beside what they say as evidence: on 24 ways out of corridor and lip6 no robot with odometry is answered
+wrongly twice, where 16 were, and of 1864 right answers in other situations 3 are lost."""
 
 MOST_PLACES = 512
 """The state has the probabilities of this many places; the others share the rest."""
@@ -76,6 +81,30 @@ class RunOptions:
     lag: int = 0
 
 
+REPLAYED = 12
+"""Frames from which the belief is made anew, without odometry, once they have contradicted it."""
+
+LISTED = 32
+"""Of these frames, the places with most evidence are remembered."""
+
+
+@dataclass(frozen=True, eq=False)
+class CountedLook:
+    """A frame that counted, for a belief that is made anew.
+
+    seen: its evidence for the LISTED likeliest places.
+    share: of a whole look, without odometry.
+    frames, constant: the run's frames since the one before it that counted.
+    change: of the view since then; None: not known.
+    """
+
+    seen: Evidence
+    share: float
+    frames: int
+    constant: int
+    change: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class RunState:
     """From what a run can be continued: all but the probabilities of the least likely places and the last frames.
@@ -86,11 +115,13 @@ class RunState:
     frames, unrecognized: as of the :class:`Run`.
     odometry, reach: motion that was reported but not yet applied.
     view: the last frame that counted; None before the first.
-    blind, constant: as of the :class:`Run`.
+    blind, constant, unlike: as of the :class:`Run`.
     pending_reach: metres that the robot may have moved in the constant frames.
     pose: as of the :class:`Run`.
     sighting: of the last frame that counted; None if it was not recognized by itself.
     storey: as of the :class:`Run`.
+    check: of odometry, by what frames show.
+    looks: the last frames that counted, the oldest first; none while odometry does not move the belief.
     """
 
     rows: NDArray[np.int64]
@@ -108,6 +139,9 @@ class RunState:
     shares: NDArray[np.float32] = field(default_factory=lambda: UNKNOWN.shares)
     sighting: Sighting | None = None
     storey: Storey = UNSTATED
+    check: OdometryCheck = field(default_factory=OdometryCheck)
+    looks: tuple[CountedLook, ...] = ()
+    unlike: float = 0.0
 
 
 def _apart(speed: ArrayLike) -> NDArray[np.float64]:
@@ -116,7 +150,9 @@ def _apart(speed: ArrayLike) -> NDArray[np.float64]:
 
 
 def freshness(motion: Odometry | None, spacing: float) -> float:
-    """The weight of a frame, from SAME_SPOT to 1: less than 1 if odometry says that the robot has hardly moved.
+    """The weight of a frame, from SAME_SPOT to 1: less than 1 if odometry is sure that the robot has hardly moved.
+
+    What counts is the root mean square of the motion, by what odometry says and by how sure it is of that.
 
     Args:
         motion: since the last frame; None: it is not known.
@@ -124,7 +160,9 @@ def freshness(motion: Odometry | None, spacing: float) -> float:
     """
     if motion is None or not spacing:
         return 1.0
-    return float(min(1.0, max(SAME_SPOT, motion.distance / (0.5 * spacing), abs(motion.turn) / TURN_NOTED)))
+    moved = math.sqrt(motion.distance**2 + 2 * motion.variance) / (0.5 * spacing)
+    turned = math.sqrt(motion.turn**2 + motion.turn_variance) / TURN_NOTED
+    return float(min(1.0, max(SAME_SPOT, moved, turned)))
 
 
 class Run:
@@ -135,6 +173,8 @@ class Run:
     sight: why the last frame did not count; None if it did.
     blind: how many frames since the last one that gave evidence of a place, or of none in the map.
     constant: how many frames since the last one that counted showed the same as it.
+    unlike: how many whole looks since the last recognized one neither fit where the robot is believed nor are
+        recognized alone.
     pose: where odometry said that the robot was at the last frame; None if that had no such pose.
     storey: what was stated last of the robot's storey.
     """
@@ -146,6 +186,7 @@ class Run:
         self.belief = uninformed(len(graph))
         self.sight: Sight | None = None
         self.blind = self.constant = 0
+        self.unlike = 0.0
         self.pose: OdometryPose | None = None
         self.storey = UNSTATED
         self._view: View | None = None
@@ -154,6 +195,13 @@ class Run:
         self._pending_reach = 0.0
         self._pending = Pending()
         self._smoother = Smoother(options.lag)
+        self._check = OdometryCheck()
+        self._looks: deque[CountedLook] = deque(maxlen=REPLAYED)
+
+    @property
+    def contradiction(self) -> Contradiction | None:
+        """What is wrong with odometry, which then does not move the belief; None while nothing speaks against it."""
+        return self._check.contradiction
 
     @property
     def lost(self) -> bool:
@@ -165,7 +213,7 @@ class Run:
         """Upper bound of the run's memory in bytes, without the graph."""
         moments = 1 + (self.options.lag + 1 if self.options.lag else 0)
         speeds = 4 * (len(SPEEDS) + 1) * min(len(self.graph), TRACKED) if self.options.stride is None else 0
-        return (4 * len(self.graph) + speeds) * moments + WIDTH * HEIGHT
+        return (4 * len(self.graph) + speeds) * moments + WIDTH * HEIGHT + 12 * LISTED * REPLAYED
 
     def place_on(self, graph: PlaceGraph) -> None:
         """Continue on another graph, after the map's places have changed."""
@@ -225,12 +273,52 @@ class Run:
             self._view = view or self._view
         if self.sight != "constant":  # a view that stays shows what it has shown
             self._sighting = seen.sighting
-        self._guided = by_poses(self.graph, step)
-        stands = self.sight == "constant" and (step.odometry is None or not self._guided)
-        self._filter(seen, step, share, stands, change)
+        step = self._trusted(step, seen, share, change, pose)
+        guided = by_poses(self.graph, step)
+        self._guided = guided and (step.odometry is None or step.odometry.variance <= (0.5 * self.graph.spacing) ** 2)
+        stands = self.sight == "constant" and (step.odometry is None or not guided)
+        fitting = self._filter(seen, step, share, stands, change)
+        if self.sight is None:
+            expected = self.unlike > 0 or self.unrecognized == 0
+            unlike = expected and not fitting and seen.sighting is None
+            self.unlike = self.unlike + min(share, self._freshness(step)) if unlike else 0.0
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
         self.frames += 1
+
+    def _trusted(
+        self, step: Step, seen: Evidence, share: float, change: float | None, pose: OdometryPose | None
+    ) -> Step:
+        """The step without odometry that frames contradict.
+
+        Once they do, the belief is made anew from the last frames, for it has been led astray.
+        """
+        if not self.graph.posed.any() or (step.odometry is None and pose is None):
+            self._check = OdometryCheck()
+            self._looks.clear()
+            return step
+        before = self.contradiction
+        self._check = self._check.moved(step.odometry)
+        counts = self.sight is None
+        if counts:
+            self._check = self._check.sighted(seen, pose, self.graph)
+        if self.contradiction is not None and before is None:
+            self._begin_anew()
+        if counts:
+            self._looks.append(CountedLook(seen.strongest(LISTED), share, step.frames, 0, change))
+        elif self._looks and self.sight == "constant":
+            self._looks[-1] = replace(self._looks[-1], constant=self._looks[-1].constant + 1)
+        return step if self.contradiction is None else replace(step, odometry=None)
+
+    def _begin_anew(self) -> None:
+        """Make the belief anew from the last frames that counted, by the sequences of the map alone."""
+        self.belief, self._pending = uninformed(len(self.graph)), Pending()
+        self._smoother.clear()
+        frames, self.frames, self.constant = self.frames, 0, 0
+        for look in self._looks:
+            self._filter(look.seen, Step(frames=look.frames), look.share, False, look.change)
+            self.frames, self.constant = self.frames + 1, look.constant
+        self.frames = frames
 
     def _confirms(self, sighting: Sighting | None) -> bool:
         """Whether a frame is recognized by itself where the last one that counted was."""
@@ -239,10 +327,14 @@ class Run:
         here, there = self.graph.places_at(np.array([self._sighting.row, sighting.row])).tolist()
         return here >= 0 and there in self.graph.same_place(here)
 
-    def _filter(self, seen: Evidence, step: Step, share: float, stands: bool, change: float | None) -> None:
-        """Move the belief and weigh it by what was seen, and by how much the view has changed, if that is known."""
+    def _filter(self, whole: Evidence, step: Step, share: float, stands: bool, change: float | None) -> bool:
+        """Move the belief and weigh it by what was seen, and by how much the view has changed, if that is known.
+
+        Returns:
+            Whether what was seen is likelier where the robot is believed after its motion than outside of the map.
+        """
         share = min(share, self._freshness(step))
-        seen = seen.tempered(share * self._independence(step))
+        seen = whole.tempered(share * self._independence(step))
         moved, ahead = Transition(()), self.belief
         if not self.frames or stands:
             self._pending_reach = min(self._pending_reach + (step.reach or 0.0), self.graph.spacing)
@@ -258,6 +350,7 @@ class Run:
             moved = transition(self.graph, self._caught_up(step), stride, self._pending)
             self._pending_reach = 0.0
             ahead = predicted(self.belief, moved, share, JUMP if step.known else CARRIED)
+        fitting = fits(ahead, whole, self.graph)
         if self.frames and share and self._by_speed(step):
             if change is not None:
                 ahead = contradicted(ahead, plausible(change, step.frames, self.constant))
@@ -271,6 +364,7 @@ class Run:
             if not step.known:
                 self._smoother.clear()
             self._smoother.append(self.belief, moved, seen, share)
+        return fitting
 
     def _by_speed(self, step: Step) -> bool:
         """Whether the robot goes along the sequences at a speed that is to be learnt."""
@@ -345,9 +439,10 @@ class Run:
         return estimate(belief, self.graph, count, sighting, self._guided)
 
     def _now(self) -> Belief:
-        """The present belief; the belief to see the map fades while the view is covered or shows nothing."""
+        """The present belief; the belief to see the map fades while the view is covered, or unlike what is believed."""
+        faded = FADING ** (self.blind + self.unlike)
         shown = weighed(self.belief, self.graph, self.storey)
-        return replace(shown, unknown=1 - (1 - shown.unknown) * FADING**self.blind)
+        return replace(shown, unknown=1 - (1 - shown.unknown) * faded)
 
     def state(self) -> RunState:
         """The state from which the run can be continued."""
@@ -371,6 +466,9 @@ class Run:
             self.belief.speeds.at(best),
             self._sighting,
             self.storey,
+            self._check,
+            tuple(self._looks),
+            self.unlike,
         )
 
     @classmethod
@@ -382,6 +480,7 @@ class Run:
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
         run._pending_reach, run.pose, run._sighting = state.pending_reach, state.pose, state.sighting
         run.storey = state.storey
+        run._check, run._looks, run.unlike = state.check, deque(state.looks, REPLAYED), state.unlike
         if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))
             given = np.full(len(graph), max(rest / len(graph), 1e-12), np.float32)

@@ -149,7 +149,7 @@ def scale_of(trail: Trail, anchors: Anchors, graph: PlaceGraph) -> float | None:
         apart = np.abs(trail.points[frames] - trail.points[first])
         near = (apart >= 2 * radius) & (apart <= REACH * radius) & graph.posed[places] & graph.posed[place]
         near &= (trail.piece[frames] == trail.piece[first]) & (frames > first)
-        there = np.abs(relative(graph, places[near], place))
+        there = np.abs(graph.displacements(place, places[near]))
         ratios += (there / apart[near]).tolist()
     return float(np.median(ratios)) if len(ratios) >= LEAST_PAIRS else None
 
@@ -216,7 +216,7 @@ class Way:
     ) -> tuple[Fit | None, NDArray[np.float64]]:
         graph, trail, places, frames = self.graph, self.trail, self.places[around], self.anchors[around]
         origin = int(self.places[np.flatnonzero(self.anchors == before)[0]])
-        there = relative(graph, places, origin)
+        there = graph.displacements(origin, places)
         gone = trail.points[frames]
         middle, shown = gone.mean(), there.mean()
         spread = graph.neighborhood.radius or graph.spacing or 1.0
@@ -249,7 +249,7 @@ class Way:
             if not self.graph.posed[place]:
                 return math.inf
             origin = int(self.places[np.flatnonzero(self.anchors == fit.before)[0]])
-            return float(abs(relative(self.graph, np.array([place]), origin)[0] - fit.point))
+            return float(abs(self.graph.displacements(origin, np.array([place]))[0] - fit.point))
         where = self.graph.whereabouts
         if fit.ordinal is None or where.sequence[place] != fit.sequence:
             return math.inf
@@ -274,9 +274,3 @@ def turn_of(
     turn = complex(np.sum(there * np.conj(gone)) / spread**2)
     turn += complex(np.sum(np.exp(1j * apart[~np.isnan(apart)])) / HEADING_SPREAD**2)
     return None if abs(turn) < 1e-9 else turn / abs(turn)
-
-
-def relative(graph: PlaceGraph, places: NDArray[np.integer], origin: int) -> NDArray[np.complex128]:
-    """Metres from one place to others in the plane, complex128 [k]."""
-    apart = graph.coordinates[places] - graph.coordinates[origin]
-    return np.asarray(apart[:, 0] * graph.shrink[origin] + 1j * apart[:, 1], np.complex128)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from core.belief import PlaceGraph
 from core.belief.motion import DRIFT, HEADING_SPREAD
-from core.learning.anchors import BESIDE, REACH, relative, turn_of
+from core.learning.anchors import BESIDE, REACH, turn_of
 from core.learning.frames import RunFrame, Trail
 from core.learning.proposals import LEAST_PROBABILITY, TURNED, Lesson
 from core.places import EARTH_RADIUS, Pose
@@ -229,7 +229,7 @@ class _Survey:
 
     def _distance(self, one: GroundFrame, origin: int) -> float:
         """Metres from a frame to the nearest place of the map."""
-        return float(np.abs(relative(self.graph, self._posed, origin) - one.point).min())
+        return float(np.abs(self.graph.displacements(origin, self._posed) - one.point).min())
 
     def _recognized_off(self, frames: Sequence[GroundFrame], origin: int) -> int | GroundRefusal:
         """How many frames off the map were recognized alone; or why those of a stretch are not surely off the map."""
@@ -295,7 +295,7 @@ class _Chain:
             frames, places: of the anchors.
             placed: standard deviation of a robot from its place, metres.
         """
-        there, gone = relative(graph, places, origin), trail.points[frames]
+        there, gone = graph.displacements(origin, places), trail.points[frames]
         apart = graph.heading[places] - trail.headings[frames]
         turn = turn_of(there - there.mean(), gone - gone.mean(), apart, placed)
         if turn is None:

@@ -6,7 +6,7 @@ their way by odometry leads to another place or turns another way; or keypoints 
 anchor of the same run that was taken where the views overlap.
 
 A run teaches nothing at all if too few of its frames are recognized, or if the run contradicts too many of those that
-are: then the robot is in another building, or its odometry is wrong.
+are: then the robot is in another building, or its odometry is wrong.  Nor does it without odometry.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ DESCRIBED = 40
 Refusal = Literal["recognized", "covered", "constant", "uncertain", "no anchors", "odometry", "turned", "geometry"]
 """Why a frame is no proposal: it was recognized at its place; its view; or what speaks against it."""
 
-Contradiction = Literal["no places", "too few recognized", "contradicted", "odometry"]
+Contradiction = Literal["no places", "no odometry", "too few recognized", "contradicted", "odometry"]
 """Why a run teaches nothing."""
 
 
@@ -151,6 +151,8 @@ def lesson_of(frames: Sequence[RunFrame], graph: PlaceGraph, options: LessonOpti
     if not len(graph) or not len(frames):
         return Lesson((), "no places", none, none, np.full(len(frames), -1, np.int64))
     trail = Trail.of(frames)
+    if all(motion is None for motion in trail.motions):
+        return Lesson((), "no odometry", none, none, np.full(len(frames), -1, np.int64))
     pace = None if graph.posed.all() else pace_of(trail, graph)
     posteriors = smoothed(trail.looks(graph, pace), graph)
     anchors = anchors_of(frames, posteriors, graph)

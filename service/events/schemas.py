@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, Field
 
+from core.belief import ContradictionKind
 from core.judgement.verdict import Verdict
 from core.maps.records import AlarmName
 from core.places import Pose, Timestamp
@@ -130,6 +131,11 @@ class SessionEvent(Event):
     lost: bool | None = None
     place: str | None = Field(default=None, description="Id of the place; non-null only if recognized.")
     pose: Pose | None = Field(default=None, description="The pose of that place.")
+    motion: str | None = Field(default=None, description="How the robot's motion was known, as in the answer.")
+    contradiction: ContradictionKind | None = Field(
+        default=None, description="What odometry looks like where frames contradict it, as in the answer."
+    )
+    contradiction_note: str | None = Field(default=None, description="A sentence for a person on that.")
     world: dict[str, Any] | None = Field(
         default=None, description="Whether the frame shows the map as it is, by the run: `change` of the answer."
     )

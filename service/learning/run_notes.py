@@ -5,7 +5,7 @@ A run that a crash ends teaches nothing: its notes are gone with the service.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from threading import Lock
 from weakref import WeakSet
@@ -64,6 +64,19 @@ class RunNotes:
         self.frames.append(noted)
         self.bytes += len(noted.data)
         return True
+
+    def drop_odometry(self) -> None:
+        """Note that odometry was wrong: the frames so far teach nothing by it."""
+        self.frames = [replace(one, frame=replace(one.frame, pose=None)) for one in self.frames]
+
+    @property
+    def teaches_nothing(self) -> str | None:
+        """Why the run teaches its map nothing as far as it is noted, in words; None: it may, or has no frame yet."""
+        if not self.frames or any(one.frame.pose is not None for one in self.frames):
+            return None
+        return (
+            "The run teaches its map nothing: its frames have no odometry_x, odometry_y and odometry_heading to go by."
+        )
 
     @property
     def full(self) -> bool:

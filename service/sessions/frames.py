@@ -9,7 +9,19 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, agreement, evidence_of, view_of
+from core.belief import (
+    NOTHING,
+    Candidate,
+    Contradiction,
+    Estimate,
+    Evidence,
+    Run,
+    Step,
+    View,
+    agreement,
+    evidence_of,
+    view_of,
+)
 from core.clocks import Interval, future, interval
 from core.errors import FrameOutOfOrder
 from core.judgement.change import WorldChange
@@ -130,6 +142,8 @@ async def process_frame(
         engine, statistics, map_, single, data, queried,
         milliseconds=total, passed=_passed(answer), run=answer.verdict,
     )  # fmt: skip
+    if answer.motion == "contradicted" and answer.contradiction is not None:
+        engine.metrics.contradicted.labels(answer.contradiction).inc()
     tell_belief(engine, map_, session, answer)
     return answer
 
@@ -158,6 +172,9 @@ def tell_belief(engine: Engine, map_: Map, session: Session, answer: SessionAnsw
         lost=answer.lost,
         place=None if answer.place is None else answer.place.id,
         pose=None if answer.place is None else answer.place.pose,
+        motion=answer.motion,
+        contradiction=answer.contradiction,
+        contradiction_note=answer.contradiction_note,
         world=None if answer.change is None else answer.change.model_dump(),
     )
     engine.events.publish(event)
@@ -222,9 +239,12 @@ def _advance(
 ) -> tuple[SessionAnswer, Evidence]:
     """Update the belief, save the session, and answer; also with what the frame alone said."""
     started = time.perf_counter()
+    before = run.contradiction
     step, motion = _step(session, run, options, since)
     seen = NOTHING if answered.blank else evidence_of(answered, neighborhood_of(map_))
     run.advance(seen, step, view, options.odometry_pose(), options.storey())
+    if run.contradiction is not None and before is None:
+        log.warning("session %s goes on without odometry: %s", session.id, run.contradiction.note)
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -250,7 +270,8 @@ def _advance(
             verdict=earlier.verdict,
             candidates=_believed(map_, earlier.candidates),
         ),
-        motion=motion,
+        motion="contradicted" if motion == "odometry" and run.contradiction is not None else motion,
+        **_contradiction(run.contradiction),
         note=" ".join(notes) or None,
         view=run.sight,
         restored=session.restored,
@@ -273,6 +294,13 @@ def _advance(
     answer.saved = sessions.save(session)
     answer.milliseconds |= rounded({"save": 1e3 * (time.perf_counter() - started) - believed})
     return answer, seen
+
+
+def _contradiction(found: Contradiction | None) -> dict[str, Any]:
+    """The fields that say what is wrong with odometry."""
+    if found is None:
+        return {"contradiction": None, "contradiction_note": None}
+    return {"contradiction": found.kind, "contradiction_note": found.note}
 
 
 def _change(run: Run, found: Estimate, answered: Answer, single: QueryAnswer) -> ChangeView | None:
@@ -303,9 +331,11 @@ def _note(
     rows = answered.candidates.rows
     judgement = answered.judgement
     frame = RunFrame(
-        seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None, options.odometry_pose(),
-        run.sight,
+        seen, judgement.verdict, judgement.probability, int(rows[0]) if len(rows) else None,
+        options.odometry_pose() if run.contradiction is None else None, run.sight,
     )  # fmt: skip
+    if run.contradiction is not None:
+        notes.drop_odometry()
     taken = given.frame.taken or given.at
     told = given.for_review(given.event(map_.record.id))
     if not notes.add(NotedFrame(frame, data, taken, told)):
@@ -383,6 +413,8 @@ def session_view(session: Session, private: bool) -> SessionView:
         key=session.key if private else None,
         restored=session.restored,
         frames_lost=session.lost,
+        **_contradiction(session.contradiction),
+        teaches_nothing=None if session.notes is None else session.notes.teaches_nothing,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from core.belief import Odometry, OdometryPose, RunOptions, Sight, Stride
+from core.belief import ContradictionKind, Odometry, OdometryPose, RunOptions, Sight, Stride
 from core.belief.storeys import Storey
 from core.clocks import Stamp
 from core.judgement.verdict import Verdict
@@ -35,6 +35,9 @@ SESSION_EXAMPLE: dict[str, Any] = {
     "key": "fleet-7",
     "restored": False,
     "frames_lost": None,
+    "contradiction": None,
+    "contradiction_note": None,
+    "teaches_nothing": None,
 }
 
 
@@ -44,7 +47,11 @@ LARGEST_COVARIANCE = 1e12
 RETIRED = ("filter", "path_frames")
 """Options of sessions before there was one filter."""
 
-Motion = Literal["first", "sequence", "speed-limit", "odometry"]
+Motion = Literal["first", "sequence", "speed-limit", "odometry", "contradicted"]
+
+CONTRADICTION = "What odometry looks like beside frames that are recognized by themselves, while these contradict it: "
+CONTRADICTION += "frozen, of another scale, turned, in other units, or inconsistent; null: nothing speaks against it."
+CONTRADICTION_NOTE = "A sentence for a person on what is wrong with odometry; null while nothing is."
 
 
 class NewSession(BaseModel):
@@ -306,6 +313,8 @@ class SessionAnswer(BeliefView):
                     "change": {"verdict": "changed", "known": 0.12, "changed": 0.87, "new": 0.01},
                     "earlier": None,
                     "motion": "odometry",
+                    "contradiction": None,
+                    "contradiction_note": None,
                     "note": None,
                     "view": None,
                     "repeated": False,
@@ -328,7 +337,12 @@ class SessionAnswer(BeliefView):
         "frame alone does not show as any look of it does. Null for a covered frame, and where that of `single` is.",
     )
     earlier: EarlierBelief | None = Field(description="With a lag, once there are enough frames.")
-    motion: Motion = Field(description="How the robot's motion since the last frame was known.")
+    motion: Motion = Field(
+        description="How the motion since the last frame was known. contradicted: odometry contradicts what "
+        "frames show, so that it does not count."
+    )
+    contradiction: ContradictionKind | None = Field(default=None, description=CONTRADICTION)
+    contradiction_note: str | None = Field(default=None, description=CONTRADICTION_NOTE)
     note: str | None = Field(
         default=None,
         description="That the robot's clock or its counter of frames has jumped, so that the motion is not known and "
@@ -369,6 +383,15 @@ class SessionView(NewSession):
     )
     restored: bool
     frames_lost: int | None
+    contradiction: ContradictionKind | None = Field(
+        default=None, description=CONTRADICTION + " Null also where a service has not read the session yet."
+    )
+    contradiction_note: str | None = Field(default=None, description=CONTRADICTION_NOTE)
+    teaches_nothing: str | None = Field(
+        default=None,
+        description="Why the run teaches its map nothing so far, although the map learns: no frame has odometry's pose "
+        "that frames do not contradict. In words; null: it may teach, or the map does not learn from it.",
+    )
 
 
 class SessionReport(SessionView):

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
-from core.belief import Run, to_bytes
+from core.belief import Contradiction, Run, to_bytes
 from core.clocks import Stamp
 from core.maps import Map
 from core.maps.selection import Conditions, Selection
@@ -142,6 +142,11 @@ class Session:
     def key(self) -> str | None:
         """The name of the key that began the session; None without one."""
         return key_of(self.begun_by)
+
+    @property
+    def contradiction(self) -> Contradiction | None:
+        """What frames say is wrong with odometry; None while nothing is, and while the belief is not read."""
+        return None if self.run is None else self.run.contradiction
 
     @property
     def stamp(self) -> Stamp:

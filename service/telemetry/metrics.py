@@ -109,6 +109,12 @@ class Metrics:
         self.scores = Histogram(
             "placerec_best_score", "Best score of a query.", ["map"], buckets=SCORES, registry=self.registry
         )
+        self.contradicted = Counter(
+            "placerec_contradicted_frames",
+            "Frames of sessions whose odometry contradicts what frames show, by what it looks like.",
+            ["kind"],
+            registry=self.registry,
+        )
         self.verdicts = Counter(
             "placerec_verdicts", "Queries by their verdict.", ["map", "verdict"], registry=self.registry
         )

@@ -67,6 +67,7 @@ FLEET_EXAMPLE: dict[str, Any] = {
             "pose": None,
             "recognized_at": "2026-11-22T18:02:01Z",
             "lost_since": "2026-11-22T18:02:02Z",
+            "contradiction_note": None,
             "verdicts": ["unknown", "unknown", "recognized"],
             "answers": 312,
         }
@@ -124,6 +125,10 @@ class FleetRobot(BaseModel):
     lost_since: Timestamp | None = Field(
         description="The time of the first of its latest answers, none of which told it a place (less than three in a "
         "row do not count once it is an alarm); null if it is not lost."
+    )
+    contradiction_note: str | None = Field(
+        default=None,
+        description="What is wrong with its odometry, which its session does not use; null while nothing is.",
     )
     verdicts: list[Verdict] = Field(description="Of its latest single frames, the latest first.")
     answers: int = Field(description="How many of the latest answers of the map are its own.")
@@ -299,6 +304,7 @@ def _robot(
         pose=pose,
         recognized_at=None if where is None else where.at,
         lost_since=lost_since if alarm is None else alarm,
+        contradiction_note=None if session is None or session.contradiction is None else session.contradiction.note,
         verdicts=[one.verdict for one in answers[:MOST_VERDICTS]],
         answers=len(answers),
     )

@@ -90,7 +90,7 @@ export function RobotTable({ robots, label = "Robots" }) {
           ${robots.map((one) => html`
             <tr key=${`${one.map} ${one.session} ${one.label} ${one.camera}`} class=${one.silent ? "faint" : ""}>
               <td><strong><${Name} text=${one.label} /></strong>${one.camera && one.camera !== one.label && html` <span class="faint small">${one.camera}</span>`}</td>
-              <td><${RobotState} robot=${one} /></td>
+              <td><${RobotState} robot=${one} />${one.contradiction_note && html` <${Pill} tone="warn" title=${one.contradiction_note}>odometry contradicted<//>`}</td>
               <td>${one.verdict ? html`<${Verdict} verdict=${one.verdict} />` : "–"}</td>
               <td class="long"><a href=${href("maps", one.map, "plan")}>${one.map}</a>${one.place && html`, ${one.lost === null && !one.silent ? "" : "last "}at <a href=${href("maps", one.map, "places", one.place)}>${one.place}</a>`}</td>
               <td><${Recent} verdicts=${one.verdicts} /></td>

@@ -359,6 +359,34 @@ def test_a_covered_camera_is_unknown_and_says_so(seen: Evidence, shown: View, si
         assert told.verdict == "recognized" and abs(told.candidates[0].row - 130) <= 3, "the place was not forgotten"
 
 
+@pytest.mark.parametrize("motion", [None, Odometry(1.0)])
+def test_of_a_robot_that_leaves_the_map_one_answer_is_wrong_at_most(motion: Odometry | None) -> None:
+    for seed in range(10):
+        random, graph = np.random.default_rng(seed), graph_of(posed([(float(i), 0.0) for i in range(300)]))
+        run = Run(DEFAULT, graph)
+        for row in range(100, 130):
+            run.advance(seen_at(row, 300, random), Step(odometry=motion), view(row))
+        assert run.estimate(1, alive(graph)).verdict == "recognized"
+        verdicts = []
+        for number in range(6):
+            outside = Evidence(random.choice(300, 6, False), random.uniform(0.2, 1, 6).astype(np.float32), 1.2)
+            run = Run.restored(DEFAULT, graph, from_bytes(to_bytes(run.state())))
+            run.advance(outside, Step(odometry=motion), view(number))
+            verdicts.append(run.estimate(1, alive(graph)).verdict)
+        assert verdicts[1:] == ["unknown"] * 5
+
+
+def test_people_before_a_robot_that_stands_by_odometry_do_not_drive_it_out_of_the_map() -> None:
+    random, graph = np.random.default_rng(5), graph_of(posed([(float(i), 0.0) for i in range(300)]))
+    run = Run(DEFAULT, graph)
+    for row in range(100, 130):
+        run.advance(seen_at(row, 300, random), Step(odometry=Odometry(1.0)), view(row))
+    for number in range(5):
+        hidden = Evidence(random.choice(300, 6, False), random.uniform(0.2, 1, 6).astype(np.float32), 1.0)
+        run.advance(hidden, Step(odometry=Odometry(0.0)), view(number))
+        assert run.estimate(1, alive(graph)).verdict == "recognized"
+
+
 def test_single_frames_that_do_not_fit_do_not_unsettle_a_robot_that_stands() -> None:
     random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
     run = Run(DEFAULT, graph)
