@@ -67,6 +67,7 @@ class CameraRanking:
     weights: float64 [n], log prior of the places, the same for all cameras; None: there is no prior.
     geometry: the results of verification for the n places; None: none was verified.
     descriptor: of the frame, float32 [D]; None: not known, and the frame is like none of the others.
+    recognized: the row that the camera recognizes as a plain query, which may have needed fewer stages; None: none.
     """
 
     rows: NDArray[np.int64]
@@ -76,6 +77,7 @@ class CameraRanking:
     weights: Values | None = None
     geometry: Geometry | None = None
     descriptor: NDArray[np.float32] | None = None
+    recognized: int | None = None
 
     @property
     def values(self) -> Values:
@@ -186,11 +188,9 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     found = values.max(axis=0)[order].astype(np.float32)
     of_best = evidence[:, near[best]]
     best_evidence = None if np.isnan(of_best).all() else float(np.nanmax(of_best))
-    contradicting = [
-        int(np.flatnonzero(order == head)[0])
-        for head, one in zip(heads.tolist(), judgements, strict=True)
-        if one.verdict == "recognized" and not near[best, head]
-    ]
+    known = {int(rows[head]) for head, one in zip(heads, judgements, strict=True) if one.verdict == "recognized"}
+    known |= {view.recognized for view in views if view.recognized is not None}
+    contradicting = np.flatnonzero(np.isin(rows[order], list(known)) & ~near[best, order]).tolist()
     imagined = judgements[int(surest.argmax())].imagined
     judgement = _judged(
         total[order], found, near[np.ix_(order, order)], contradicting, calibration, steepness, best_evidence, imagined

@@ -56,13 +56,14 @@ def locate_rig(
             third_stage(map_, encoder, candidates, judged, query)
             for candidates, query in zip(ranked, queries, strict=True)
         ]
+        alone = [int(one.rows[0]) if found.verdict == "recognized" else None for one, found, _ in verified]
         if any(stage.state == "verified" for *_, stage in verified):
             verified = [
                 one if _is_verified(one[0]) else _later(one, third_stage(map_, encoder, candidates, judged, query))
                 for one, candidates, query in zip(verified, ranked, map(_all_of, queries), strict=True)
             ]
         finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
-        views = [_ranking(*one) for one in zip(finals, queries, strict=True)]
+        views = [_ranking(*one) for one in zip(finals, queries, alone, strict=True)]
         fused = fuse(views, calibration, neighborhood)
         places = places_of(map_, fused.rows, question.k)
         if None not in places:
@@ -88,10 +89,14 @@ def locate_rig(
 Verified = tuple[Candidates, Judgement, ThirdStage]
 
 
-def _ranking(one: Candidates, query: Query) -> CameraRanking:
-    """The candidates of one camera as the fusion sees them."""
-    descriptor = query.encoding.descriptor
-    return CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry, descriptor)
+def _ranking(one: Candidates, query: Query, recognized: int | None = None) -> CameraRanking:
+    """The candidates of one camera as the fusion sees them.
+
+    Args:
+        recognized: the row that the camera recognizes as a plain query.
+    """
+    ranked = one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry
+    return CameraRanking(*ranked, query.encoding.descriptor, recognized)
 
 
 def _all_of(query: Query) -> Query:

@@ -79,6 +79,14 @@ def test_two_that_contradict_each_other_are_ambiguous() -> None:
     assert not fused(view({3: 0.5, **BACKGROUND})).judgement.rivals
 
 
+def test_what_a_camera_recognizes_with_fewer_stages_contradicts_as_well() -> None:
+    weak = view({5: 0.15, **BACKGROUND})
+    assert fused(view({3: 0.6, **BACKGROUND}), weak).judgement.verdict == "recognized"
+    found = fused(view({3: 0.6, **BACKGROUND}), replace(weak, recognized=5))
+    assert found.judgement.verdict == "ambiguous"
+    assert [found.rows[list(one.positions)].tolist() for one in found.judgement.rivals] == [[5]]
+
+
 def verified(one: CameraRanking, evidence: dict[int, float]) -> CameraRanking:
     """A camera whose candidates were verified, with the evidence of some rows; a hundredth of it is their gain."""
     found = np.array([evidence.get(row, np.nan) for row in one.rows.tolist()])
