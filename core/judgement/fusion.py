@@ -1,18 +1,19 @@
 """The fusion of several frames of one moment into one query, and of several maps' answers into one.
 
-*Cameras of a rig.*  Frames that are near each other by :meth:`Whereabouts.near` are one place.  Compared with the
-places outside it, a camera's best score within a place gives a decision value, and the calibrated curve its log odds x.
-A camera that does not recognize a place says little against it: its view may be blocked, or it may look where no frame
-was taken.  With the probability e it says nothing at all, so that it contributes
+*Cameras of a rig.*  Frames that are near each other by :meth:`Whereabouts.near` are one place.  A camera's best match
+has the log odds of its own judgement, and every other place has fewer, by the slope of the curve for each unit by which
+its final score is lower: one scale, whether places were verified or not.  The log odds of a place are those of the
+camera x that is surest of it, and of each further camera
 
-    log((1 - e) · exp(x) + e)  >=  log e,
+    (1 - r) · max(log e, x),
 
-and the log odds of a place are the sum over the cameras.  Where a camera's candidates were verified, x has the evidence
-of the place and its lead as well (``geometry.py``).  Leads of cameras that see one scene say nearly the same, so that
-of each counts by its share of the cameras.  The evidence is 0 of a place that could not win any more; so the candidates
-of all cameras are verified where those of one are (``core.recognition.rigs``).  Cameras are
-assumed to be independent given the place, which is not quite true, since they share the light and the weather.  A rig
-of one camera is a plain query.
+where e is the probability that a camera says nothing about the place where it is, as it may look where no frame was
+taken; a camera whose own best match is the place takes nothing away from it (0 for log e).  r, the likeness of its
+frame to those of the cameras before it, is the cosine of their descriptors: a frame that is sent twice is no second
+witness.  A rig of one camera, or of one twice, is a plain query.
+
+Rivals are judged as those of a plain query are, by the difference of the log odds from those of the best place.
+Cameras that each recognize places apart contradict each other: the answer is ambiguous, however sure one of them is.
 
 *Maps.*  Each map's best match has the log odds x_m of being right.  At most one of the maps' matches can be right, and
 perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
@@ -22,28 +23,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.background import GUARD_FACTOR
-from core.judgement.geometry import Geometry, share_of_lead
+from core.judgement.geometry import Geometry
 from core.judgement.priors import decision_slope, log_odds
-from core.judgement.probability import FARTHEST
-from core.judgement.verdict import MOST_RIVALS, Calibration, Judgement, Rivals, Verdict
+from core.judgement.probability import FARTHEST, sigmoid
+from core.judgement.verdict import EVEN, MOST_RIVALS, Calibration, Judgement, Rivals, Verdict, judge
+from core.judgement.verdict import log_odds_of as log_odds_of_stages
 from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
 
 BLIND = 0.3
-"""e, the probability that a camera of a rig says nothing about the place where it is."""
+"""e, the probability that a camera of a rig says nothing about the place where it is.  With 0.1 to 0.3 the left
+and the right part of corridor's frames are recognized together in the same frames, but for five of 222."""
+
+SHOWS_SOMETHING = 2.0
+"""Deviations by which the best score of a map has to exceed the mean of unrelated frames if a frame shows anything.
+Noise and a hand on the lens reach at most 1.2 on corridor and lip6, strangers there at least 3.4."""
+
+SAME_FRAME = 0.999
+"""From this cosine of their descriptors on two frames are the same."""
 
 LISTED = 50
 """Without a second stage, this many places of each camera's ranking count."""
 
 ALIKE = float(np.log(4))
-"""If the log odds of two maps' places, or of two verified places of a rig, differ by less than this (a factor of four
-in the odds), the answer is ambiguous."""
+"""If the log odds of two maps' places differ by less than this (a factor of four in the odds), the answer is
+ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,8 @@ class CameraRanking:
     examined: bool [n], which of them the second stage has compared; none if the encoder has no second stage.
     weights: float64 [n], log prior of the places, the same for all cameras; None: there is no prior.
     geometry: the results of verification for the n places; None: none was verified.
+    descriptor: of the frame, float32 [D]; None: not known, and the frame is like none of the others.
+    recognized: the row that the camera recognizes as a plain query, which may have needed fewer stages; None: none.
     """
 
     rows: NDArray[np.int64]
@@ -64,6 +76,8 @@ class CameraRanking:
     examined: NDArray[np.bool_]
     weights: Values | None = None
     geometry: Geometry | None = None
+    descriptor: NDArray[np.float32] | None = None
+    recognized: int | None = None
 
     @property
     def values(self) -> Values:
@@ -95,6 +109,33 @@ class Fused:
     weights: Values
 
 
+def shows_something(view: CameraRanking, calibration: Calibration) -> bool:
+    """Whether a camera's frame resembles any place more than unrelated frames do; a blocked one does not."""
+    least = calibration.background_mean + SHOWS_SOMETHING * calibration.background_deviation
+    return float(view.scores.max(initial=-np.inf)) > least
+
+
+def likeness_of_frames(views: Sequence[CameraRanking]) -> Values:
+    """The cosines of the frames' descriptors, float64 [C, C], at least 0; of a frame without one 0 to all others."""
+    alike = np.eye(len(views))
+    for one, other in combinations(range(len(views)), 2):
+        first, second = views[one].descriptor, views[other].descriptor
+        if first is not None and second is not None:
+            lengths = float(np.linalg.norm(first)) * float(np.linalg.norm(second))
+            alike[one, other] = alike[other, one] = min(1.0, max(0.0, float(first @ second) / max(lengths, 1e-12)))
+    return alike
+
+
+def witnesses(views: Sequence[CameraRanking], calibration: Calibration) -> list[int]:
+    """The cameras that say something: not blocked, nor with the same frame as one before; the first if all are."""
+    alike = likeness_of_frames(views)
+    found: list[int] = []
+    for camera, view in enumerate(views):
+        if shows_something(view, calibration) and not (alike[camera, found] >= SAME_FRAME).any():
+            found.append(camera)
+    return found or [0]
+
+
 def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood: Neighborhood) -> Fused:
     """Judge the frames of several cameras of a rig together, against one map.
 
@@ -107,103 +148,109 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     )
     parts = [view.whereabouts.take(part) for view, part in zip(views, listed, strict=True)]
     places = Whereabouts.joined(parts).take(first)
-    scores, values = np.full((2, len(views), len(rows)), -np.inf)
-    evidence = np.full((len(views), len(rows)), np.nan)
-    for camera, (view, part) in enumerate(zip(views, listed, strict=True)):
-        at = np.searchsorted(rows, view.rows[part])
-        scores[camera, at], values[camera, at] = view.scores[part], view.values[part]
-        if view.geometry is not None:
-            evidence[camera] = 0.0  # of places that are not worth verifying
-            evidence[camera, at] = np.nan_to_num(view.geometry.evidence[part])
     near = np.stack([places.near(i, neighborhood) for i in range(len(rows))])
-    beside = np.stack([places.near(i, neighborhood.times(GUARD_FACTOR)) for i in range(len(rows))])
-    counts = [len(view.rows) for view in views]
-    of_place = _added(
-        np.stack(
-            [
-                _camera_log_odds(*one, near, beside, calibration, len(views))
-                for one in zip(scores, values, evidence, counts, strict=True)
-            ]
-        )
-    )
+    steepness, alike = decision_slope(calibration), likeness_of_frames(views)
+    values = np.full((len(views), len(rows)), -np.inf)
+    evidence = np.full((len(views), len(rows)), np.nan)
+    judgements = [_judged_alone(view, calibration, neighborhood) for view in views]
+    for camera, view in enumerate(views):
+        known = np.flatnonzero(np.isin(view.rows, rows))
+        at = np.searchsorted(rows, view.rows[known])
+        values[camera, at] = view.values[known]
+        if view.geometry is not None:
+            evidence[camera, at] = view.geometry.evidence[known]
+    lowest = np.where(np.isfinite(values), values, np.inf).min(axis=1, keepdims=True)
+    behind = values.max(axis=1, keepdims=True) - np.where(np.isfinite(values), values, lowest)
+    surest = np.array([_log_odds_alone(one, calibration) for one in judgements])
+    own = surest[:, None] - steepness * behind
+    heads = own.argmax(axis=1)
     prior = np.concatenate(
         [
             np.zeros(len(part)) if view.weights is None else view.weights[part]
             for view, part in zip(views, listed, strict=True)
         ]
     )[first]
-    of_place += np.where(near, prior, -np.inf).max(axis=1)
-    steepness = decision_slope(calibration)
+
+    def of_places(reach: NDArray[np.bool_]) -> Values:
+        """The log odds of places if each has the frames of a row of ``reach``, bool [n, n]."""
+        shared = np.stack([np.where(reach, row, -np.inf).max(axis=1) for row in own])
+        return _added(shared, near[:, heads].T, alike) + np.where(reach, prior, -np.inf).max(axis=1)
+
     # The frames of one place share its evidence; among them, those with the best scores of their own come first.
-    lowest = np.where(np.isfinite(values), values, np.inf).min(axis=1, keepdims=True)
-    own = np.where(np.isfinite(values), values, lowest)
-    behind = np.stack([np.where(near, row, -np.inf).max(axis=1) for row in own]) - own
-    total = of_place - steepness * behind.mean(axis=0)
-    # Places that lead for no camera have the same odds and are ranked by their scores.
-    order = np.lexsort((-own.mean(axis=0), -np.round(total, 9)))
+    total = of_places(near)
+    alone = _added(own, np.zeros(own.shape, np.bool_), alike) + prior
+    order = np.lexsort((-alone, -np.round(total, 9)))
+    best = int(order[0])
+    others = np.flatnonzero(~near[best])
+    # A frame beside the best place has no share in its evidence when it is compared with it.
+    total[others] = of_places(near & ~near[best])[others]
+    order = np.append(best, order[order != best][np.argsort(-np.round(total[order[order != best]], 9), kind="stable")])
     found = values.max(axis=0)[order].astype(np.float32)
-    of_best = evidence[:, near[order[0]]]
+    of_best = evidence[:, near[best]]
     best_evidence = None if np.isnan(of_best).all() else float(np.nanmax(of_best))
-    judgement = _judged(of_place[order], found, near[np.ix_(order, order)], calibration, steepness, best_evidence)
+    known = {int(rows[head]) for head, one in zip(heads, judgements, strict=True) if one.verdict == "recognized"}
+    known |= {view.recognized for view in views if view.recognized is not None}
+    contradicting = np.flatnonzero(np.isin(rows[order], list(known)) & ~near[best, order]).tolist()
+    imagined = judgements[int(surest.argmax())].imagined
+    judgement = _judged(
+        total[order], found, near[np.ix_(order, order)], contradicting, calibration, steepness, best_evidence, imagined
+    )
     return Fused(judgement, rows[order], places.take(order), found, total[order], prior[order])
 
 
-def _camera_log_odds(
-    scores: Values,
-    values: Values,
-    evidence: Values,
-    places: int,
-    near: NDArray[np.bool_],
-    beside: NDArray[np.bool_],
-    calibration: Calibration,
-    cameras: int,
-) -> Values:
-    """The log odds of each place by one camera, float64 [n].
+def _judged_alone(view: CameraRanking, calibration: Calibration, neighborhood: Neighborhood) -> Judgement:
+    """The judgement of one camera's frame as a plain query, without a prior."""
+    order = np.argsort(-view.values, kind="stable")
+    geometry = None if view.geometry is None else view.geometry.take(order)
+    places = view.whereabouts.take(order)
+    return judge(view.scores[order], places, calibration, neighborhood, view.examined[order], geometry=geometry)
+
+
+def _log_odds_alone(judgement: Judgement, calibration: Calibration) -> float:
+    """The log odds of a camera's best match by its own judgement; without a curve, by the decision value."""
+    decision = 0.0 if judgement.decision is None else judgement.decision
+    evidence = None if judgement.evidence is None else judgement.evidence
+    stated = log_odds_of_stages(decision, judgement.lead, calibration, judgement.imagined, evidence)
+    return log_odds(decision, calibration) if stated is None else float(stated)
+
+
+def _added(parts: Values, own: NDArray[np.bool_], alike: Values) -> Values:
+    """The log odds of places by all cameras (see the module), float64 [n].
 
     Args:
-        scores, values: float64 [n], of two stages and of all; -inf for places that the camera does not list.
-        evidence: float64 [n]; NaN if none of the camera's places was verified.
-        places: how many the camera's ranking has.
-        near: bool [n, n], which places are the same place.
-        beside: bool [n, n], which places may overlap.
-        cameras: how many the rig has.
+        parts: float64 [C, n], by each camera.
+        own: bool [C, n], whether a camera's own best match is the place.
+        alike: float64 [C, C], the likeness of the frames.
     """
-    found = np.empty(len(scores))
-    for place, same in enumerate(near):
-        best = float(scores[same].max())
-        rest = np.sort(scores[~same & np.isfinite(scores)])[::-1].astype(np.float32)
-        if not np.isfinite(best):
-            best = min(calibration.background_mean, float(rest[0]) if len(rest) else np.inf)
-        apart = scores[~beside[place] & np.isfinite(scores)]
-        behind = calibration.background(rest, places - int(same.sum()), apart)
-        found[place] = log_odds(behind.decision(best), calibration, behind.imagined)
-        if calibration.geometry is not None and not np.isnan(evidence[same]).any():
-            lead = values[same].max() - values[~same].max(initial=-np.inf)
-            leads = share_of_lead(lead, behind.imagined) / cameras
-            found[place] = calibration.geometry.log_odds(found[place], evidence[same].max(), leads)
+    found = np.empty(parts.shape[1])
+    for place, (odds, is_own) in enumerate(zip(parts.T, own.T, strict=True)):
+        first, *further = np.argsort(-odds, kind="stable").tolist()
+        total, before = float(odds[first]), [first]
+        for camera in further:
+            least = 0.0 if is_own[camera] else float(np.log(BLIND))
+            total += (1 - float(alike[camera, before].max())) * max(least, float(odds[camera]))
+            before.append(camera)
+        found[place] = total
     return found
-
-
-def _added(parts: Values) -> Values:
-    """Σ log((1 - e) · exp(x) + e) over cameras, float64 [C, n] to [n]; x itself for a single camera."""
-    if len(parts) == 1:
-        return np.asarray(parts[0], np.float64)
-    return np.asarray(np.logaddexp(np.log1p(-BLIND) + parts, np.log(BLIND)).sum(axis=0), np.float64)
 
 
 def _judged(
     log_odds_of_places: Values,
     scores: NDArray[np.float32],
     near: NDArray[np.bool_],
+    contradicting: Sequence[int],
     calibration: Calibration,
     steepness: float,
     evidence: float | None,
+    imagined: float,
 ) -> Judgement:
     """Judge the first of the ranked places; ``near`` says which of them are the same place, bool [n, n].
 
-    The verdict is ambiguous if the margin is too small, and also if the best rival alone would be recognized.  Where
-    the first was verified, each place that shares its view fits and would be; the rival is then close if its odds are
-    within a factor of four.
+    The verdict is ambiguous if a rival is within the margin, in log odds, or a camera recognizes another place.
+
+    Args:
+        contradicting: the places that cameras recognize which are not the first.
+        imagined: the share of the background that was imagined.
     """
     best = float(log_odds_of_places[0])
     others = np.flatnonzero(~near[0])
@@ -212,25 +259,20 @@ def _judged(
         rival = int(others[np.argmax(log_odds_of_places[others])])
         margin = max(0.0, (best - float(log_odds_of_places[rival])) / steepness)
     least = log_odds(calibration.threshold, calibration)
-    decision = calibration.threshold + (best - least) / decision_slope(calibration)
-    if evidence is not None:
-        least = max(0.0, least)
-    # Of places that the cameras prefer each alone is close, or would be believed.
-    weighed = evidence is not None and calibration.geometry is not None
-    likely = best - log_odds_of_places < ALIKE if weighed else log_odds_of_places >= least
-    close = likely | (best - log_odds_of_places < calibration.margin * steepness)
+    decision = calibration.threshold + (best - least) / steepness
+    least = max(least, 0.0 if evidence is not None else log_odds(calibration.threshold, calibration, imagined))
+    close = np.flatnonzero(best - log_odds_of_places < calibration.margin * steepness)
+    rivals = np.append(np.array(contradicting, np.int64), np.setdiff1d(np.intersect1d(close, others), contradicting))
     verdict: Verdict = "recognized"
-    rivals: tuple[Rivals, ...] = ()
-    if best < least:
+    if best < least and not contradicting:
         verdict = "unknown"
-    elif rival is not None and close[rival]:
+    elif len(rivals):
         verdict = "ambiguous"
-        rivals = tuple(Rivals((head,), False) for head in _heads(others[close[others]], near))
+    named = tuple(Rivals((head,), False) for head in _heads(rivals, near)) if verdict == "ambiguous" else ()
     probability = None
     if calibration.curve is not None:
-        against = () if rival is None else (float(log_odds_of_places[rival]),)
-        probability = float(joint_probabilities([best, *against])[0])
-    return Judgement(verdict, float(scores[0]), decision, margin, rival, probability, rivals=rivals, evidence=evidence)
+        probability = float(sigmoid(np.array(best))) * (EVEN if len(rivals) else 1.0)
+    return Judgement(verdict, float(scores[0]), decision, margin, rival, probability, imagined, named, evidence)
 
 
 def _heads(places: NDArray[np.int64], near: NDArray[np.bool_]) -> list[int]:

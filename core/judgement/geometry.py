@@ -15,8 +15,9 @@ and the evidence of the best match joins the log odds L of the first two stages 
 with its lead m over the best rival in the final order, and the share u of other places that were imagined.  Evidence
 needs no other place to be compared with, so it says in a map of one place what it says in a large one.  Places of one
 scene share keypoints, though: one that fits better than all others is right far oftener than its evidence alone says.
-Where two stages say next to nothing, as in a small map, the evidence decides.  As keypoints are the same for every
-encoder, and L is a log odds whatever the encoder's scores are, so are the four numbers.
+Where two stages say next to nothing, as in a small map, the evidence decides.  A right match has none now and then, so
+that the lack of it takes away at most as much as that is worth (``MOST_TAKEN``).  As keypoints are the same for every
+encoder, and L is a log odds whatever the encoder's scores are, so are the numbers.
 
 A rival takes away from the certainty of an answer as far as it fits as well.  Two places of one picture are so
 ``ambiguous``, however much evidence both have, and a best match that fits, of whose rivals none does, is ``recognized``
@@ -86,7 +87,7 @@ class GeometryTerms(BaseModel):
     intercept: float = Field(allow_inf_nan=False, description="Log odds where nothing says anything.")
 
     def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike, leads: ArrayLike) -> Values:
-        """The log odds of three stages, all of one shape.
+        """The log odds of three stages, all of one shape; lower than those of two by at most ``MOST_TAKEN``.
 
         Args:
             two_stages: the log odds of two.
@@ -95,8 +96,15 @@ class GeometryTerms(BaseModel):
         """
         before, found = np.asarray(two_stages, np.float64), np.log1p(np.asarray(evidence, np.float64))
         gained = self.lead * np.asarray(leads, np.float64)
-        return np.asarray(self.support * before + self.slope * found + gained + self.intercept, np.float64)
+        three_stages = self.support * before + self.slope * found + gained + self.intercept
+        return np.asarray(np.maximum(three_stages, before - MOST_TAKEN), np.float64)
 
+
+MOST_TAKEN = 1.9
+"""The most that the third stage takes away from the log odds of two, -ln of 0.066 / 0.423: how often right and wrong
+best matches have no evidence on tasks made of training photographs, each kind of change counting alike.  From 1.5 to
+2.5 the calibration error changes by at most 0.015 on all but one of these, nights cut on one side, where right ones
+have no evidence oftener (0.173 to 0.195)."""
 
 LEAD = 0.05
 """A lead over the best rival from here on says as much as one can."""

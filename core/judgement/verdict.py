@@ -14,10 +14,11 @@ map was scored or a shortlist.  As a map of a few places says little about other
 The calibration's curve turns a decision value into a probability (``probability.py``).  Of two places that score alike
 at most one is right, so that
 
-    P = curve(d) · (½ + ½ min(1, m / m₀)),
+    P = curve(d), or ½ curve(d) where m < m₀,
 
-with the lead m over the best rival and the margin m₀ under which an answer is ambiguous: without a lead, half of the
-probability is left.
+with the lead m over the best rival and the margin m₀ under which an answer is ambiguous.  In log odds a margin is a
+tenth, so that within it either is about as likely as the other.  So an answer that a rival makes ambiguous is no
+likelier than a half, and a recognized one no less likely than the threshold demands.
 
 Rivals can be the reason why nothing stands out: a second traverse of the same places, or another place that looks the
 same.  They are left out of the background one after the other.  If the best match stands out of what is left, the
@@ -64,6 +65,8 @@ in a session.  Without a prior none is, and one with a trust of 0.5 is enough; i
 
 HALFWAY = 0.5
 """Of the lead of a query that shows the best match over a place on another storey: under this share it shows either."""
+EVEN = 0.5
+"""The most that is left of a probability where another place is about as likely."""
 
 MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
@@ -198,13 +201,13 @@ def log_odds_of(
 
 
 def share_of_leads(margin: ArrayLike, calibration: Calibration) -> Values:
-    """The part of a probability that the lead over the best rival leaves, ½ + ½ min(1, m / m₀), float64 of any shape.
+    """The part of a probability that the lead over the best rival leaves, ½ under the margin, float64 of any shape.
 
     Args:
         margin: the leads, at least 0; infinite without a rival.
     """
     leads = np.maximum(0.0, np.asarray(margin, np.float64))
-    return (1 + (np.minimum(1.0, leads / calibration.margin) if calibration.margin else leads > 0)) / 2
+    return np.where((leads >= calibration.margin) & (leads > 0), 1.0, EVEN)
 
 
 def probability_of(
@@ -235,15 +238,27 @@ def stands_out(
 ) -> NDArray[np.bool_]:
     """Whether best matches are believed if their leads are large enough, bool of any shape.
 
-    By the decision value; or, where one was verified, by the probability of three stages, which has to be a half at
-    least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
+    By the decision value, and in a small map by the probability as well, which has to be that of the threshold; or,
+    where one was verified, by the probability of three stages, which has to be a half as well.  The arguments are those
+    of :func:`log_odds_of`.
     """
     believed = np.asarray(decision, np.float64) >= calibration.threshold
     odds = log_odds_of(decision, margin, calibration, imagined, evidence)
-    if odds is None or evidence is None or calibration.geometry is None or calibration.curve is None:
+    if odds is None or calibration.curve is None:
         return np.asarray(believed)
-    surely = odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
+    least = float(calibration.curve.log_odds(calibration.threshold))
+    if evidence is None or calibration.geometry is None:
+        return np.asarray(believed & (odds >= least))
+    believed, surely = believed & (odds >= least), odds >= max(0.0, least)
     return np.where(np.isnan(np.asarray(evidence, np.float64)), believed, surely)
+
+
+def least_probability(judgement: Judgement, calibration: Calibration) -> float:
+    """The least probability with which an answer is recognized; 0 by a calibration without a curve."""
+    if calibration.curve is None:
+        return 0.0
+    least = calibration.curve.probability(calibration.threshold)
+    return least if judgement.evidence is None else max(EVEN, least)
 
 
 def most_doubtful(calibration: Calibration) -> float:

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from core.geometry.verification import Verification
-from core.judgement.fusion import CameraRanking, Fused, fuse
+from core.judgement.fusion import CameraRanking, Fused, fuse, witnesses
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Judgement
@@ -48,20 +48,22 @@ def locate_rig(
         ranked = rank_places(map_, encoder, encodings, question.selection)
         if not len(ranked[0].rows):
             return locate(map_, encoder, queries[:1])[0]  # no place is allowed, or there is none
+        saying = witnesses([_ranking(*one) for one in zip(ranked, queries, strict=True)], calibration)
+        if len(saying) == 1:
+            return locate(map_, encoder, [queries[saying[0]]])[0]
+        ranked, queries = [ranked[one] for one in saying], [queries[one] for one in saying]
         verified = [
             third_stage(map_, encoder, candidates, judged, query)
             for candidates, query in zip(ranked, queries, strict=True)
         ]
+        alone = [int(one.rows[0]) if found.verdict == "recognized" else None for one, found, _ in verified]
         if any(stage.state == "verified" for *_, stage in verified):
             verified = [
                 one if _is_verified(one[0]) else _later(one, third_stage(map_, encoder, candidates, judged, query))
                 for one, candidates, query in zip(verified, ranked, map(_all_of, queries), strict=True)
             ]
         finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
-        views = [
-            CameraRanking(one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry)
-            for one in finals
-        ]
+        views = [_ranking(*one) for one in zip(finals, queries, alone, strict=True)]
         fused = fuse(views, calibration, neighborhood)
         places = places_of(map_, fused.rows, question.k)
         if None not in places:
@@ -86,6 +88,16 @@ def locate_rig(
 
 
 Verified = tuple[Candidates, Judgement, ThirdStage]
+
+
+def _ranking(one: Candidates, query: Query, recognized: int | None = None) -> CameraRanking:
+    """The candidates of one camera as the fusion sees them.
+
+    Args:
+        recognized: the row that the camera recognizes as a plain query.
+    """
+    ranked = one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry
+    return CameraRanking(*ranked, query.encoding.descriptor, recognized)
 
 
 def _all_of(query: Query) -> Query:

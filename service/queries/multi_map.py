@@ -13,7 +13,7 @@ from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
-from core.judgement.verdict import Verdict
+from core.judgement.verdict import EVEN, Verdict, least_probability
 from core.maps import Map
 from core.places import GEOGRAPHIC, Whereabouts
 from core.recognition.question import Query, Question
@@ -191,7 +191,8 @@ def judge_together(reports: Sequence[MapReport]) -> JointVerdict:
     """The verdict over all maps that answered.
 
     It is the verdict of the map with the most probable match.  If another map has a match of another place that is
-    nearly as probable, the verdict is ``ambiguous`` instead of ``recognized``.
+    nearly as probable, or those of all leave less than its threshold demands, the verdict is ``ambiguous`` instead of
+    ``recognized``.  The probability of an ambiguous answer is a half at most.
     """
     found = [report for report in reports if report.answer is not None and report.answer.matches]
     if not found:
@@ -205,7 +206,10 @@ def judge_together(reports: Sequence[MapReport]) -> JointVerdict:
         verdict = "ambiguous"
     if judgement.probability is None:
         return JointVerdict(verdict, best, None)
-    return JointVerdict(verdict, best, float(joint_probabilities([best.log_odds, *rivals])[0]))
+    probability = float(joint_probabilities([best.log_odds, *rivals])[0])
+    if verdict == "recognized" and rivals and probability < least_probability(judgement, best.answer.calibration):
+        verdict = "ambiguous"
+    return JointVerdict(verdict, best, min(EVEN, probability) if verdict == "ambiguous" else probability)
 
 
 def _same_place(a: MapReport, b: MapReport) -> bool:

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from core.judgement.fusion import BLIND, CameraRanking, Fused, fuse, joint_probabilities, log_odds_of
+from core.judgement.fusion import BLIND, CameraRanking, Fused, fuse, joint_probabilities, log_odds_of, witnesses
 from core.judgement.geometry import TERMS, Geometry
 from core.judgement.probability import Curve, sigmoid
 from core.judgement.verdict import Calibration, Judgement, judge
@@ -77,6 +79,14 @@ def test_two_that_contradict_each_other_are_ambiguous() -> None:
     assert not fused(view({3: 0.5, **BACKGROUND})).judgement.rivals
 
 
+def test_what_a_camera_recognizes_with_fewer_stages_contradicts_as_well() -> None:
+    weak = view({5: 0.15, **BACKGROUND})
+    assert fused(view({3: 0.6, **BACKGROUND}), weak).judgement.verdict == "recognized"
+    found = fused(view({3: 0.6, **BACKGROUND}), replace(weak, recognized=5))
+    assert found.judgement.verdict == "ambiguous"
+    assert [found.rows[list(one.positions)].tolist() for one in found.judgement.rivals] == [[5]]
+
+
 def verified(one: CameraRanking, evidence: dict[int, float]) -> CameraRanking:
     """A camera whose candidates were verified, with the evidence of some rows; a hundredth of it is their gain."""
     found = np.array([evidence.get(row, np.nan) for row in one.rows.tolist()])
@@ -96,14 +106,51 @@ def test_the_evidence_of_a_camera_joins_its_log_odds() -> None:
     assert fits.scores[0] == pytest.approx(0.62)
 
 
-def test_the_lead_of_a_camera_counts_by_its_share_of_the_cameras() -> None:
+def of_frame(one: CameraRanking, *components: float) -> CameraRanking:
+    """The ranking of a camera whose frame has a descriptor."""
+    return replace(one, descriptor=np.array(components, np.float32))
+
+
+@pytest.mark.parametrize("evidence", [None, {3: 300.0, 4: 280.0, **dict.fromkeys(BACKGROUND, 5.0)}])
+def test_a_camera_doubled_says_what_it_says_alone(evidence: dict[int, float] | None) -> None:
+    """Also where a place five metres on looks nearly the same."""
     weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
-    one = verified(view({3: 0.32, **BACKGROUND}), {3: 40.0})
-    before = fuse([view({3: 0.32, **BACKGROUND})], weighing, NEIGHBORHOOD).log_odds[0]
-    alone, both = (fuse([one] * cameras, weighing, NEIGHBORHOOD).log_odds[0] for cameras in (1, 2))
-    assert alone == pytest.approx(float(TERMS.log_odds(before, 40.0, 1.0)))
-    each = float(TERMS.log_odds(before, 40.0, 0.5))
-    assert both == pytest.approx(2 * np.log((1 - BLIND) * np.exp(each) + BLIND))
+    one = of_frame(view({3: 0.5, 4: 0.47, **BACKGROUND}), 3.0, 4.0)
+    if evidence is not None:
+        one = verified(one, evidence)
+    alone, doubled = (fuse([one] * cameras, weighing, NEIGHBORHOOD) for cameras in (1, 2))
+    order = np.argsort(-one.values)
+    parts = one.scores[order], one.whereabouts.take(order), weighing, NEIGHBORHOOD, one.examined
+    plain = judge(*parts, geometry=None if one.geometry is None else one.geometry.take(order))
+    assert doubled.judgement.verdict == alone.judgement.verdict == plain.verdict == "recognized"
+    assert doubled.judgement.probability == pytest.approx(alone.judgement.probability)
+    assert plain.probability == pytest.approx(alone.judgement.probability)
+    assert doubled.rows.tolist() == alone.rows.tolist()
+
+
+def test_a_camera_counts_by_what_the_others_do_not_show() -> None:
+    left, right = of_frame(view({3: 0.32, **BACKGROUND}), 1.0, 0.0), view({3: 0.33, **BACKGROUND})
+    same, like, other = (
+        fused(left, of_frame(right, np.cos(angle), np.sin(angle))).log_odds[0] for angle in (0.0, 0.7, np.pi / 2)
+    )
+    assert same == pytest.approx(fused(right).log_odds[0])
+    assert same < like < other == pytest.approx(fused(left).log_odds[0] + fused(right).log_odds[0])
+
+
+def test_a_blocked_camera_and_one_that_repeats_another_say_nothing() -> None:
+    clear, covered = view({3: 0.6, **BACKGROUND}), view({3: 0.06, **dict.fromkeys(BACKGROUND, 0.05)})
+    assert witnesses([covered, clear], CALIBRATION) == [1]
+    assert witnesses([covered, covered], CALIBRATION) == [0]
+    first, second = of_frame(clear, 0.0, 2.0), of_frame(view({5: 0.4, **BACKGROUND}), 2.0, 0.0)
+    assert witnesses([first, second, first], CALIBRATION) == [0, 1]
+
+
+@pytest.mark.parametrize("sureness", [0.45, 0.6, 0.9])
+def test_however_sure_one_of_two_is_that_contradict_each_other(sureness: float) -> None:
+    found = fused(view({3: sureness, **BACKGROUND}), view({5: 0.4, **BACKGROUND}))
+    assert found.judgement.verdict == "ambiguous" and found.rows[0] == 3
+    assert found.judgement.probability is not None and found.judgement.probability <= 0.5
+    assert [found.rows[list(one.positions)].tolist() for one in found.judgement.rivals] == [[5]]
 
 
 def test_geometry_settles_what_two_cameras_disagree_about() -> None:
@@ -116,7 +163,7 @@ def test_geometry_settles_what_two_cameras_disagree_about() -> None:
     assert settled.rows[0] == 3 and settled.judgement.verdict == "recognized"
 
 
-def test_of_places_that_fit_one_has_to_be_four_times_as_likely() -> None:
+def test_of_places_that_fit_one_has_to_lead_by_the_margin() -> None:
     """Whatever shares the view fits: what stands a little farther is no reason for doubt, but a place as likely is."""
     weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
     scores = {3: 0.5, 5: 0.499, **BACKGROUND}
@@ -124,15 +171,16 @@ def test_of_places_that_fit_one_has_to_be_four_times_as_likely() -> None:
         cameras = [verified(view(scores), {3: 300.0, 5: evidence})] * 2
         found = fuse(cameras, weighing, NEIGHBORHOOD)
         assert found.rows.tolist()[:2] == [3, 5] and found.judgement.verdict == verdict
-        assert found.log_odds[1] > 0, "it would be believed alone"
 
 
-def test_a_place_that_a_verified_camera_left_out_has_no_evidence() -> None:
-    weighing = CALIBRATION.model_copy(update={"geometry": TERMS})
-    one = view({3: 0.4, 5: 0.39, **BACKGROUND})
-    found = fuse([verified(one, {3: 150.0})], weighing, NEIGHBORHOOD)
-    assert found.rows.tolist()[:2] == [3, 5]
-    assert found.log_odds[1] < float(TERMS.log_odds(0.0, 0.0, 0.0)) + 4
+@given(st.lists(st.lists(st.floats(0.1, 0.9), min_size=10, max_size=10), min_size=1, max_size=3))
+def test_verdict_and_probability_never_disagree(cameras: list[list[float]]) -> None:
+    judgement = fused(*[view(dict(enumerate(scores))) for scores in cameras]).judgement
+    assert judgement.probability is not None and CALIBRATION.curve is not None
+    if judgement.verdict == "ambiguous":
+        assert judgement.probability <= 0.5
+    if judgement.verdict == "recognized":
+        assert judgement.probability >= CALIBRATION.curve.probability(CALIBRATION.threshold)
 
 
 def test_what_each_takes_for_one_of_two_both_take_for_the_third() -> None:

@@ -12,6 +12,7 @@ from core.judgement.geometry import (
     AGREEMENT,
     INLIERS,
     LEAD,
+    MOST_TAKEN,
     SIMILARITY,
     TERMS,
     Geometry,
@@ -19,7 +20,7 @@ from core.judgement.geometry import (
     final_gains,
     final_order,
 )
-from core.judgement.probability import Curve
+from core.judgement.probability import Curve, sigmoid
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration, Judgement, Likeness, Rivals, judge, worth_verifying
 from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
@@ -201,7 +202,8 @@ def test_another_order_leaves_the_background_the_same() -> None:
         (np.array([0.6], np.float32), (), True),
         (np.array([], np.float32), (), False),
         (full(0.157), (300.0,), False),  # verified for the pose
-        (full(0.157), (0.0,), False),
+        (full(0.157), (0.0,), True),  # two stages were in doubt, and no evidence does not settle it
+        (full(0.11), (0.0,), False),
         (full(0.157), (8.0,), True),
     ],
 )
@@ -254,3 +256,14 @@ def test_old_calibrations_are_written_as_they_were_read() -> None:
     assert Calibration.model_validate(CALIBRATION.model_dump(mode="json")) == CALIBRATION
     before_leads = {"support": 0.5, "slope": 1.463, "intercept": -4.954}
     assert GeometryTerms.model_validate(before_leads).model_dump(mode="json") == before_leads
+
+
+def test_no_evidence_takes_away_no_more_than_right_matches_without_any_allow() -> None:
+    """A best match of two stages with 0.84 had 0.08 after verification found nothing."""
+    likely = np.log(0.84 / 0.16)
+    assert sigmoid(TERMS.log_odds(likely, 0.0, 1.0)) > 0.4
+    before = np.linspace(-6, 6, 25)
+    for evidence in (0.0, 3.0, 20.0, 300.0):
+        after = TERMS.log_odds(before, evidence, 0.0)
+        assert (after >= before - MOST_TAKEN - 1e-12).all()
+        assert (np.diff(after) > 0).all()

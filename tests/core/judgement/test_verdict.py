@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from core.judgement.geometry import TERMS
 from core.judgement.probability import Curve
-from core.judgement.verdict import Calibration, Environment, Likeness, Rivals, judge, probability_of
+from core.judgement.verdict import Calibration, Environment, Likeness, Rivals, judge, probability_of, stands_out
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Pose, Whereabouts
 
 CALIBRATION = Calibration(
@@ -196,6 +197,22 @@ def test_a_better_answer_is_never_less_probable(a: float, b: float, more: float,
     less, better = probability_of(a, b, CURVED), probability_of(a + more, b + further, CURVED)
     assert less is not None and better is not None
     assert 0 < less <= better < 1
+
+
+@given(st.floats(0, 2), st.floats(0, 0.1), st.floats(0, 1), st.one_of(st.none(), st.floats(0, 400)))
+def test_verdict_and_probability_of_one_frame_never_disagree(
+    decision: float, margin: float, imagined: float, evidence: float | None
+) -> None:
+    """Within the margin a half is left at most; what is believed is as likely as the threshold, in any map."""
+    for strict in (0.2, 0.33):
+        calibration = SMALL.model_copy(update={"threshold": strict / 3, "geometry": TERMS})
+        values = decision, margin, calibration, imagined, np.nan if evidence is None else evidence
+        stated, curve = probability_of(*values), calibration.curve
+        assert stated is not None and curve is not None
+        if margin < calibration.margin:
+            assert stated <= 0.5
+        elif stands_out(*values):
+            assert stated >= curve.probability(calibration.threshold) - 1e-9
 
 
 def test_the_best_part_of_a_ranking_says_the_same_as_all_of_it() -> None:
