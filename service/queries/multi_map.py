@@ -15,7 +15,7 @@ from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Verdict
 from core.maps import Map
-from core.recognition.question import Query, Question
+from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from service.engine.encoders import Encoded
@@ -126,10 +126,9 @@ async def locate_in_maps(
                 # The pose of a rig does not come from the geometry of one of its cameras.
                 camera = frames[seen[0][0]].camera if len(seen) == 1 else None
                 queries = [
-                    Query(
-                        one.encoding,
-                        replace(question, camera=camera),
-                        finders.setdefault((index, _key(one.mask)), cache(one.find_keypoints)),
+                    replace(
+                        one.query(replace(question, camera=camera)),
+                        find_keypoints=finders.setdefault((index, _key(one.mask)), cache(one.find_keypoints)),
                     )
                     for index, one in seen
                 ]
