@@ -35,8 +35,8 @@ FITS = 0.27
 """A best match whose cells have this mean squared cosine is not doubted: of frames cut to 60 % hardly any has."""
 
 SHRUNK, PROMISING, STEEPNESS = 0.6, 0.9, 2.2
-"""Others are tried where cells, shrunk so far, gain more than PROMISING + STEEPNESS times their mean squared cosine, as a
-factor: with FITS that are 0.11 and 0.09 of the plain frames of corridor and lip6, and of those cut to 60 % 1.0 and
+"""Others are tried where cells, shrunk so far, gain more than PROMISING + STEEPNESS times their mean squared cosine, as
+a factor: with FITS that are 0.11 and 0.09 of the plain frames of corridor and lip6, and of those cut to 60 % 1.0 and
 0.93, to 75 % 1.0 and 0.54.  With 0.85 it is 0.15 and 0.11 of the plain frames, and 0.95 and 0.58 of the last two."""
 
 BESIDE = 16

@@ -386,7 +386,8 @@ def _put_together(
     if len(listed) < len(places):
         candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
-    lens = other_view(map_, query.question.camera, places[0].camera, view.framing) if places else None
+    framing = SAME_VIEW if judgement.verdict == "unknown" else view.framing  # a place that it does not show tells none
+    lens = other_view(map_, query.question.camera, places[0].camera, framing) if places else None
     return Answer(
         judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note, lens
     )
