@@ -11,7 +11,7 @@ from benchmarks.day.pictures import another_look, file
 from benchmarks.day.walks import PlanarPose, WalkPair, pixels
 from placerec_client import Client, NewPlace
 
-Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike"]
+Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike", "cameras"]
 Size: TypeAlias = Literal["small", "large", "bare"]
 """Of the walk alone; with the pictures of other environments in traverses of their own; of the walk, without poses."""
 
@@ -20,6 +20,9 @@ STOOD, LOOKS = 0.4, 30
 
 ALIKE = (0.4, 0.55)
 """The stretch that another one looks like, as shares of the walk."""
+
+WHOLE, CUT, LEFT = "whole", "cut", 0.6
+"""Cameras of one lens that a map knows, one whose frames are whole, and one whose are cut to a share of their sides."""
 
 TRAVERSE = 400
 """Frames of a traverse of other pictures."""
@@ -40,7 +43,8 @@ def places(walk: WalkPair, change: Change, size: Size, others: Sequence[bytes]) 
 
     def place(kind: str, number: int, data: bytes, metres: float, serial: int = 0) -> NewPlace:
         pose = None if size == "bare" else walk.pose(metres)
-        return NewPlace(f"{kind}-{serial:03d}-{number:05d}", data, fields(pose, kind))
+        camera = {"camera": WHOLE} if change == "cameras" else {}
+        return NewPlace(f"{kind}-{serial:03d}-{number:05d}", data, fields(pose, kind) | camera)
 
     for number, data in enumerate(walk.references):
         yield place("walk", number, data, number * walk.spacing)
@@ -70,6 +74,20 @@ def shown_by(place_id: str) -> int | None:
     return int(number) if number.isdigit() else None
 
 
+def _lens(width: int, height: int, share: float) -> dict[str, float]:
+    """The intrinsics of a usual lens, of frames that are cut to a share of their sides."""
+    sides = [side - 2 * round((1 - share) * side / 2) for side in (width, height)]
+    focal = 0.75 * width
+    return {
+        "width": sides[0],
+        "height": sides[1],
+        "fx": focal,
+        "fy": focal,
+        "cx": (sides[0] - 1) / 2,
+        "cy": (sides[1] - 1) / 2,
+    }
+
+
 def make_map(client: Client, map_id: str, walk: WalkPair, change: Change, size: Size, others: Sequence[bytes]) -> None:
     """Enrol a map.
 
@@ -77,6 +95,10 @@ def make_map(client: Client, map_id: str, walk: WalkPair, change: Change, size: 
         PlacerecError: a frame was refused.
     """
     made = client.maps.create(map_id)
+    if change == "cameras":
+        height, width = pixels(walk.references[0]).shape[:2]
+        for name, share in ((WHOLE, 1.0), (CUT, LEFT)):
+            made.cameras.put(name, intrinsics=_lens(width, height, share))
     for one in made.enrol(places(walk, change, size, others), known=()):
         if one.error is not None:
             raise one.error

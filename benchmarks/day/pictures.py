@@ -87,12 +87,37 @@ def exposure(pixels: Pixels, _random: Random, number: int) -> Pixels:
     return _clipped(pixels * (0.35, 1.0, 1.9, 0.6)[number % 4])
 
 
-def narrower(pixels: Pixels, _random: Random, _number: int) -> Pixels:
+def cut(across: float, down: float) -> Look:
+    """A camera that sees so much of the width and height; the file has the pixels that are left."""
+
+    def look(pixels: Pixels, _random: Random, _number: int) -> Pixels:
+        height, width = pixels.shape[:2]
+        top, left = round((1 - down) * height / 2), round((1 - across) * width / 2)
+        return np.ascontiguousarray(pixels[top : height - top, left : width - left])
+
+    return look
+
+
+def portrait(pixels: Pixels, random: Random, number: int) -> Pixels:
+    """A camera held upright: all of the height, and 9 / 16 of that across."""
+    height, width = pixels.shape[:2]
+    return cut(height * 9 / 16 / width, 1.0)(pixels, random, number)
+
+
+def narrower(pixels: Pixels, random: Random, number: int) -> Pixels:
     """A camera of a longer lens: 70 % of the view, in a file of the same size."""
     height, width = pixels.shape[:2]
-    top, left = int(0.15 * height), int(0.15 * width)
-    middle = pixels[top : height - top, left : width - left]
+    middle = cut(0.7, 0.7)(pixels, random, number)
     return np.asarray(cv2.resize(middle, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def wider(pixels: Pixels, _random: Random, _number: int) -> Pixels:
+    """A camera of a shorter lens: the view fills 70 % of the file, and around it is more of the same."""
+    height, width = pixels.shape[:2]
+    small = cv2.resize(pixels, (round(0.7 * width), round(0.7 * height)), interpolation=cv2.INTER_AREA)
+    top, left = (height - small.shape[0]) // 2, (width - small.shape[1]) // 2
+    edges = top, height - small.shape[0] - top, left, width - small.shape[1] - left
+    return np.asarray(cv2.copyMakeBorder(small, *edges, cv2.BORDER_REFLECT), np.uint8)
 
 
 def upside_down(pixels: Pixels, _random: Random, _number: int) -> Pixels:

@@ -104,7 +104,8 @@ class Single:
 
     def ask(self, moment: Moment) -> RobotAnswer:
         """A query."""
-        return _answer_of(self.client.maps[self.map_id].query(moment.picture, verify=self.verify))
+        camera: parameters.Query = {} if moment.camera is None else {"camera": moment.camera}
+        return _answer_of(self.client.maps[self.map_id].query(moment.picture, verify=self.verify, **camera))
 
 
 @dataclass

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.day import pictures
-from benchmarks.day.maps import STOOD, Change
+from benchmarks.day.maps import CUT, STOOD, Change
 from benchmarks.day.pictures import UPRIGHT, Look, Random, another_look
 from benchmarks.day.walks import PlanarPose, WalkPair, pixels
 
@@ -66,6 +66,7 @@ class Situation:
     rate: frames a second; the map was made at one.
     start: where the robot begins, as a share of the walk.
     map: how the map differs from one traverse enrolled once.
+    camera: of the robot, if the map knows it.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Situation:
     rate: float = 1.0
     start: float = 0.1
     map: Change = "plain"
+    camera: str | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class Moment:
     pose: the true one, in the map's frame; ``wheels``: that of the odometry, in its own.
     right: the references whose place the frame shows; none if it shows nothing of the map.
     again: it is the first after a disturbance.
+    camera: that took it, if the map knows it.
     """
 
     second: float
@@ -97,6 +100,7 @@ class Moment:
     fate: Fate
     restart: bool
     again: bool
+    camera: str | None = None
 
 
 def moments(situation: Situation, walk: WalkPair, scale: float = 1.0) -> Iterator[Moment]:
@@ -136,6 +140,7 @@ def moments(situation: Situation, walk: WalkPair, scale: float = 1.0) -> Iterato
                 stretch.fate if hit else "answered",
                 stretch.restart and number == 0,
                 stretch.again and number == 0,
+                situation.camera,
             )
             before, sent = (at, aside), sent + 1
             second += 1 / situation.rate
@@ -228,6 +233,11 @@ SITUATIONS: dict[str, Situation] = {
         _throughout("half the lens dirty", pictures.dirty),
         _throughout("exposure jumps", pictures.exposure),
         _throughout("longer lens", pictures.narrower),
+        _throughout("cut to 60 %", pictures.cut(0.6, 0.6)),
+        _throughout("cut to 75 %", pictures.cut(0.75, 0.75)),
+        _throughout("cut to portrait", pictures.portrait),
+        _throughout("shorter lens", pictures.wider),
+        replace(_throughout("cut to 60 %, with intrinsics", pictures.cut(0.6, 0.6)), map="cameras", camera=CUT),
         Situation("5 frames a second", (SteadyStretch(12),), rate=5.0),
         Situation("60 frames a second", (SteadyStretch(2),), rate=60.0),
     )

@@ -65,6 +65,7 @@ in a session.  Without a prior none is, and one with a trust of 0.5 is enough; i
 
 HALFWAY = 0.5
 """Of the lead of a query that shows the best match over a place on another storey: under this share it shows either."""
+
 EVEN = 0.5
 """The most that is left of a probability where another place is about as likely."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Protocol
 
+from core.frames.framing import Framing
 from core.geometry.keypoints import Keypoints
 from core.maps import Selection
 from core.method.encoder import Encoding
@@ -34,17 +35,29 @@ class Question:
     explain: bool = False
 
 
+class Reframing(Protocol):
+    """Makes the query of a frame as it is in another framing (``core.recognition.framings``)."""
+
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frame, in pixels."""
+
+    def __call__(self, query: Query, framing: Framing) -> Query | None:
+        """The query in a framing; None if it shows too little then."""
+
+
 @dataclass(frozen=True)
 class Query:
     """An encoded frame, and the question about it.
 
     encoding: with at least one region, by the map's encoder.
     find_keypoints: finds the keypoints of the frame; None: there is no frame any more, and nothing is verified.
+    reframing: makes the query of the frame in another framing; None: it is compared as it is.
     """
 
     encoding: Encoding
     question: Question = field(default_factory=Question)
     find_keypoints: Callable[[], Keypoints] | None = None
+    reframing: Reframing | None = None
 
     @cached_property
     def verifier(self) -> Verifier | None:

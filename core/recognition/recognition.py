@@ -18,11 +18,12 @@ from functools import partial
 import numpy as np
 
 from core.errors import NoRegions
+from core.frames.framing import SAME_VIEW, Framing
 from core.frames.images import decode, encode_thumbnail
 from core.frames.masks import Mask, range_in
 from core.frames.preprocessing import Pixels
 from core.frames.value_ranges import ValueRange, few_values, told
-from core.geometry.detection import find_keypoints
+from core.geometry.detection import ScaledFrame, find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import PoseEstimate, estimate_pose
@@ -33,6 +34,7 @@ from core.maps.moment import one_look
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
+from core.recognition.framings import FramedView, FrameReframing, doubted, framed, keypoints_in_frame
 from core.recognition.question import Query, Question
 from core.recognition.stages import (
     Candidates,
@@ -67,8 +69,8 @@ class RivalPlaces:
     same_place: bool
 
 
-OTHER_LENS = 1.6
-"""The factor between the horizontal fields of view of two cameras from which an answer is doubtful."""
+OTHER_VIEW = 1.25
+"""The factor between what a frame and a place show across from which on an answer says so."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Answer:
     pose: the estimated pose of the query, from the poses of the best match and its neighbours, and from the geometry
         where they were verified; None if they have none.
     note: why the camera's intrinsics were not used for the pose; None if they were, or if there are none.
-    lens: by how much the camera sees more or less than that of the best match, if that makes answers wrong; else None.
+    lens: that the frame shows more or less than the best match does, if it does; else None.
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them, less further looks of these places.
     third_stage: whether the candidates were verified geometrically.
@@ -144,7 +146,7 @@ def recognize(map_: Map, picture: bytes, encoder: Encoder, question: Question | 
     encoding = encoder.encode(pixels, mask)  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
         return answer_to_blank(map_, encoder, encoding)
-    query = Query(encoding, question, wanted)
+    query = Query(encoding, question, wanted, FrameReframing(encoder, lambda: ScaledFrame.of(pixels, mask)))
     (answer,) = locate(map_, encoder, [query])
     return answer
 
@@ -308,19 +310,25 @@ def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -
     """Verify and judge the candidates, and look up the best places; again if one was deleted since the search."""
 
     k, judged = query.question.k, partial(judgement_of, map_, encoder)
-    ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
+    best, views = framed(map_, encoder, query, candidates)
+    ranked, judgement, stage = third_stage(map_, encoder, best.candidates, judged, best.query)
     attempt = 1
     while None in (places := places_of(map_, ranked.rows, k)) and attempt < ATTEMPTS:
-        (candidates,) = rank_places(map_, encoder, [query.encoding], query.question.selection)
-        ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, query)
+        (candidates,) = rank_places(map_, encoder, [best.query.encoding], query.question.selection)
+        best = replace(best, candidates=candidates)
+        ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, best.query)
         attempt += 1
+    judgement = doubted(judgement, ranked, best, views, neighborhood_of(map_))
+    known = map_.cameras.intrinsics(query.question.camera) is not None  # they are those of the frame as it is
+    if known and best.framing != SAME_VIEW and stage.keypoints is not None and query.reframing is not None:
+        stage = replace(stage, keypoints=keypoints_in_frame(stage.keypoints, best.framing, *query.reframing.size()))
     if None in places:  # places are being deleted all the time: go on without those that are gone
         present = np.ones(len(ranked.rows), np.bool_)
         present[: len(places)] = [place is not None for place in places]
         ranked = ranked.take(np.flatnonzero(present))
         judgement = judged(ranked)
     found = [place for place in places if place is not None]
-    return _put_together(map_, encoder, query, ranked, found, judgement, stage)
+    return _put_together(map_, encoder, best, ranked, found, judgement, stage)
 
 
 def places_of(map_: Map, rows: Positions, k: int) -> list[Place | None]:
@@ -353,13 +361,14 @@ def first_looks(places: Sequence[Place | None]) -> list[int]:
 def _put_together(
     map_: Map,
     encoder: Encoder,
-    query: Query,
+    view: FramedView,
     candidates: Candidates,
     places: list[Place],
     judgement: Judgement,
     stage: ThirdStage,
 ) -> Answer:
-    """The answer by the judged candidates, of which ``places`` are the best."""
+    """The answer by the judged candidates of a view of the frame, of which ``places`` are the best."""
+    query = view.query
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     listed = first_looks(places)
     matches = [(float(candidates.final_scores[position]), places[position]) for position in listed]
@@ -380,31 +389,32 @@ def _put_together(
     if len(listed) < len(places):
         candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
-    lens = other_lens(map_, query.question.camera, places[0].camera) if places else None
+    framing = SAME_VIEW if judgement.verdict == "unknown" else view.framing  # a place that it does not show tells none
+    lens = other_view(map_, query.question.camera, places[0].camera, framing) if places else None
     return Answer(
         judgement, matches, weights, calibration, 0.0, pose, query.encoding, candidates, stage, rivals, note, lens
     )
 
 
-def other_lens(map_: Map, camera: str | None, other: str | None) -> str | None:
-    """Say, in a sentence, that a camera sees much more or less than the one that took a place; else None.
-
-    Nothing can be said where the angle of one is not known.
+def other_view(map_: Map, camera: str | None, other: str | None, framing: Framing) -> str | None:
+    """Say, in a sentence, that a frame shows much more or less than a place does; else None.
 
     Args:
-        camera, other: the names of the camera of the query and of that of the place.
+        camera, other: the names of the camera of the query and of that of the place; None where they are not known.
+        framing: of the query in the view of the place.
     """
-    if camera == other:
-        return None
     ours, theirs = map_.cameras.intrinsics(camera), map_.cameras.intrinsics(other)
-    if ours is None or theirs is None:
+    if known := camera != other and ours is not None and theirs is not None:
+        factor = ours.across / theirs.across
+    else:
+        factor = min(framing.across, framing.down)
+    if not max(factor, 1 / factor) >= OTHER_VIEW:
         return None
-    factor = ours.across / theirs.across
-    if not max(factor, 1 / factor) >= OTHER_LENS:
-        return None
+    found = f"the frame shows a {'narrower' if factor < 1 else 'wider'} view than the map"
+    if not known:
+        return found
     return (
-        f"The camera {camera!r} sees {factor:.2g} times the angle that the camera {other!r} of the place sees: answers "
-        "across so different lenses are often wrong by a few places, however sure they seem."
+        f"{found}: the camera {camera!r} sees {factor:.2g} times the angle that the camera {other!r} of the place sees"
     )
 
 

@@ -24,6 +24,7 @@ from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
+from core.recognition.framings import FrameReframing
 from core.recognition.question import Query, Question
 from service.errors.faults import DeadlineExceeded
 from service.fairness import CALLER, FairQueue
@@ -80,7 +81,7 @@ class Encoded:
 
     def query(self, question: Question) -> Query:
         """A question about the frame, which has regions."""
-        return Query(self.encoding, question, self.find_keypoints)
+        return Query(self.encoding, question, self.find_keypoints, FrameReframing(self.encoder, lambda: self.scaled))
 
     def without_pixels(self, keep_scaled: bool = False) -> Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.

@@ -16,7 +16,7 @@ from core.judgement.priors import decision_slope
 from core.judgement.verdict import EVEN, Verdict, least_probability
 from core.maps import Map
 from core.places import GEOGRAPHIC, Whereabouts
-from core.recognition.question import Query, Question
+from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.stages import neighborhood_of
@@ -128,10 +128,9 @@ async def locate_in_maps(
                 # The pose of a rig does not come from the geometry of one of its cameras.
                 camera = frames[seen[0][0]].camera if len(seen) == 1 else None
                 queries = [
-                    Query(
-                        one.encoding,
-                        replace(question, camera=camera),
-                        finders.setdefault((index, _key(one.mask)), cache(one.find_keypoints)),
+                    replace(
+                        one.query(replace(question, camera=camera)),
+                        find_keypoints=finders.setdefault((index, _key(one.mask)), cache(one.find_keypoints)),
                     )
                     for index, one in seen
                 ]

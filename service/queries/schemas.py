@@ -334,8 +334,8 @@ class QueryAnswer(BaseModel):
     note: str | None = Field(
         default=None,
         exclude_if=lambda note: note is None,
-        description="What makes the answer doubtful beside its numbers: the camera sees 1.6 times the angle of that "
-        "which took the best match, or more, or as much less. Left out where that is not so, or not known.",
+        description="That the frame shows a narrower or a wider view than the map: by 1.25 or more times, by the "
+        "intrinsics of both cameras, or because it fits the map so. Left out where that is not so, or not known.",
     )
     matches: list[Match]
     rivals: list[RivalGroup] = Field(
