@@ -8,7 +8,8 @@ therefore learns nothing from the same sight again. The lasting error of odometr
 Odometry may fail, so there are two models, each with a state of its own and a probability (interacting multiple models:
 the same book, section 11.6.6). In one, odometry is right. In the other it says nothing: the robot goes on as the
 localizations have shown, and less surely with time. A localization may be wrong in both, and counts by the probability
-that it is not (probabilistic data association: Bar-Shalom and Tse, Tracking in a cluttered environment, 1975). the models are told apart, the mean of the last innovations says by how much the pose is off, and widens it.
+that it is not (probabilistic data association: Bar-Shalom and Tse, Tracking in a cluttered environment, 1975). Until
+the models are told apart, the mean of the last innovations says by how much the pose is off, and widens it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Simulated walks for the filter: true poses, odometry that is sound or fails, and localizations, some of them wrong.
 
 A robot walks at 1.2 m/s for 150 s, with bends and stops. Odometry comes ten times a second, with errors of 5 % that
-last and others that do not. Images come every second: 85 in 100 are localized, 3 in 100 elsewhere on the walk. Half of the
-variance of a localization's error is alike for 30 m.
+last and others that do not. Images come every second: 85 in 100 are localized, 3 in 100 elsewhere on the walk. Half of
+the variance of a localization's error is alike for 30 m.
 """
 
 from __future__ import annotations
