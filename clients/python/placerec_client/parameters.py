@@ -31,7 +31,7 @@ class Query(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -52,10 +52,10 @@ class Query(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -122,7 +122,7 @@ class QueryBatch(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -143,10 +143,10 @@ class QueryBatch(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -219,7 +219,7 @@ class EnrolPlace(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -247,10 +247,10 @@ class ListPlaces(TypedDict, total=False):
     camera: str | None
     """Only places that this camera took."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """Only places with this timestamp or a later one."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """Only places with this timestamp or an earlier one."""
 
     where: str | Mapping[str, Any] | None
@@ -305,7 +305,7 @@ class UploadRecording(TypedDict, total=False):
 class AddLook(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/places/{place}/looks``."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     camera: str | None
@@ -331,10 +331,10 @@ class DeleteLearntLooks(TypedDict, total=False):
     run: str | None
     """Those that were learnt from this run."""
 
-    since: datetime | str | None
+    since: datetime | float | str | None
     """Those that were added to the map at this time or later (ISO 8601; UTC without a zone)."""
 
-    until: datetime | str | None
+    until: datetime | float | str | None
     """Those that were added before this time."""
 
 
@@ -418,7 +418,7 @@ class QueryOrEnrol(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -439,10 +439,10 @@ class QueryOrEnrol(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -504,7 +504,7 @@ class QueryMaps(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -525,10 +525,10 @@ class QueryMaps(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -590,7 +590,7 @@ class SendFrame(TypedDict, total=False):
     smaller by more than 1000, or the timestamp says that the robot counts anew.
     """
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken. One up to a second before the last one is refused; where it goes back by more, or
     leaps ahead by more than a day, the robot's clock was set, and the run goes on by it.
     """
@@ -805,10 +805,10 @@ class ReadAudit(TypedDict, total=False):
     operation: str | None
     """Only this operation."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """Only lines of this time or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """Only lines of this time or earlier."""
 
 
@@ -892,7 +892,7 @@ class PlaceChanges(TypedDict, total=False):
 
     pose: PoseChanges | None
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
 
     sequence: str | None
 
@@ -1071,7 +1071,7 @@ class NewKey(TypedDict, total=False):
     learn: bool
     """Whether maps that learn do so from the runs of its holder. An option of the role enrol; admin includes it."""
 
-    expires_at: datetime | str | None
+    expires_at: datetime | float | str | None
     """When it expires; null or left out: never."""
 
     replaces: str | None
@@ -1092,7 +1092,7 @@ class KeyChanges(TypedDict, total=False):
     learn: bool | None
     """false: no map learns from its runs any more."""
 
-    expires_at: datetime | str | None
+    expires_at: datetime | float | str | None
     """Not later than now; null: never."""
 
 
@@ -1267,10 +1267,10 @@ class PlaceConditions(TypedDict):
     camera: NotRequired[str | None]
     """This camera took its frame."""
 
-    after: NotRequired[datetime | str | None]
+    after: NotRequired[datetime | float | str | None]
     """It has this timestamp or a later one."""
 
-    before: NotRequired[datetime | str | None]
+    before: NotRequired[datetime | float | str | None]
     """It has this timestamp or an earlier one."""
 
     where: NotRequired[Mapping[str, Any] | None]
@@ -1298,7 +1298,7 @@ class NewPlace(TypedDict):
     heading: NotRequired[float | None]
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: NotRequired[datetime | str | None]
+    timestamp: NotRequired[datetime | float | str | None]
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: NotRequired[str | None]
@@ -1413,7 +1413,7 @@ class CalibrationChanges(TypedDict):
 
     margin: NotRequired[float | None]
 
-    measured_at: NotRequired[datetime | str | None]
+    measured_at: NotRequired[datetime | float | str | None]
     """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
     was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
     """
@@ -1452,7 +1452,7 @@ class RejectedGround(TypedDict):
     run: str
     """The run that proposed it."""
 
-    at: datetime | str
+    at: datetime | float | str
     """When it was rejected."""
 
     poses: Sequence[Pose]
