@@ -111,7 +111,8 @@ def frame_bytes(frame: Frame) -> bytes:
         if isinstance(frame, str | os.PathLike):
             with open(frame, "rb") as file:
                 return file.read()
-        data = frame.read()
+        opened: Any = frame
+        data = opened.read()
     except OSError as error:
         name = f"{os.fspath(frame)} " if isinstance(frame, str | os.PathLike) else "The frame's file "
         raise InvalidFrame(f"{name}cannot be read: {error.strerror}.") from error
