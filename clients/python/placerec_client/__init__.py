@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         Renamed,
         TransferFailed,
         UnexpectedAnswer,
+        UnreadableFile,
     )
     from placerec_client.events import MapEvent
     from placerec_client.frames import Frame, Picture
@@ -83,6 +84,7 @@ __all__ = [
     "Session",
     "TransferFailed",
     "UnexpectedAnswer",
+    "UnreadableFile",
     "__version__",
     "models",
     "parameters",
@@ -110,6 +112,7 @@ _MODULES = {
             "Renamed",
             "TransferFailed",
             "UnexpectedAnswer",
+            "UnreadableFile",
         ),
     ),
     "events": ("MapEvent",),

@@ -64,12 +64,16 @@ class Renamed(PlacerecError, AttributeError):
         super().__init__(f"{kind}.{old} is {kind}.{new} now: use {new}.")
 
 
-class InvalidFrame(PlacerecError):
+class InvalidFrame(PlacerecError, ValueError):
     """A frame cannot be sent: it cannot be read, or is an array of another shape than a picture's."""
 
 
 class TransferFailed(PlacerecError):
     """A file could not be downloaded or written, or has other bytes than the service says."""
+
+
+class UnreadableFile(TransferFailed, OSError):
+    """A file that is to be uploaded cannot be read."""
 
 
 class JobCancelled(PlacerecError):

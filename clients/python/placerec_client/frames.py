@@ -16,6 +16,7 @@ from placerec_client.errors import InvalidFrame
 if TYPE_CHECKING:
     import numpy
     from numpy.typing import NDArray
+    from PIL import Image
 
     Pixels: TypeAlias = NDArray[numpy.uint8] | NDArray[numpy.uint16]
 
@@ -28,7 +29,8 @@ class Picture:
     """An array as a frame, with the order of its channels, and as which file it is sent.
 
     Args:
-        pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4]; or as the format has them.
+        pixels: uint8 or uint16, [height, width], [height, width, 3] or [height, width, 4]; or as the format has them;
+            or an image of Pillow, whose order is its own.
         order: of the channels: ``bgr`` as OpenCV has them, or ``rgb``; a fourth one, of opacity, is left out.  Or a
             pixel format of ROS, in any case: ``rgba8``, ``mono16``, ``bayer_rggb8`` (which needs OpenCV), ``yuv422`` in
             an array [height, width, 2], ``nv12`` in one of 3/2 height rows; all are ``pixel_formats.NAMES``.
@@ -40,7 +42,7 @@ class Picture:
         InvalidFrame: ``order``, ``encoding`` or ``quality`` is none of these.
     """
 
-    pixels: Pixels
+    pixels: Pixels | Image.Image
     order: Order = "bgr"
     encoding: Encoding = "png"
     quality: int = 90
@@ -63,9 +65,11 @@ class Picture:
             raise InvalidFrame(f"The quality is a whole number from 1 to 100, not {ascii(self.quality)[:140]}.")
 
 
-Frame: TypeAlias = "bytes | bytearray | memoryview | array[int] | str | os.PathLike[str] | BinaryIO | Pixels | Picture"
-"""The bytes of a JPEG, PNG or WebP file, also in an array; the path of one; one opened for reading; or pixels, in
-OpenCV's order BGR."""
+Frame: TypeAlias = (
+    "bytes | bytearray | memoryview | array[int] | str | os.PathLike[str] | BinaryIO | Pixels | Image.Image | Picture"
+)
+"""The bytes of a JPEG, PNG or WebP file, also in an array; the path of one; one opened for reading; pixels, in OpenCV's
+order BGR; or an image of Pillow."""
 
 FEWEST_VALUES = 4095
 """A picture of 16 bits has to reach this value to become a JPEG file: one of fewer bits would be nearly black there."""
@@ -77,6 +81,8 @@ LONGEST_SIDE = 65500
 def frame_bytes(frame: Frame) -> bytes:
     """Return the bytes of the file that is sent for a frame: pixels become a PNG, if nothing else is wanted.
 
+    An image of Pillow is turned upright as its EXIF orientation says.
+
     Raises:
         InvalidFrame: the file cannot be read; the array has no such type and shape; or a JPEG is wanted where nothing
             that writes one is installed.
@@ -84,27 +90,35 @@ def frame_bytes(frame: Frame) -> bytes:
     if isinstance(frame, bytes):
         return frame
     if isinstance(frame, bytearray | memoryview):
-        return bytes(frame)
+        try:
+            return bytes(frame)
+        except ValueError as error:  # one that was released
+            raise InvalidFrame(f"The frame cannot be read: {error}.") from error
+    if is_pillow(frame):
+        return _by_pillow(frame, "png", 0)
     if isinstance(frame, Picture):
+        if is_pillow(frame.pixels):
+            return _by_pillow(frame.pixels, frame.encoding, frame.quality)
         if frame.encoding == "jpeg":
             return jpeg(frame.pixels, frame.order, frame.quality)
         return png(frame.pixels, frame.order)
     if isinstance(frame, array):
         return _file_of(frame, frame.typecode == "B")
-    if hasattr(frame, "__array_interface__"):
+    if hasattr(frame, "__array_interface__") and hasattr(frame, "dtype"):
         found: Any = frame
         return _file_of(found, str(found.dtype) == "uint8") if found.ndim == 1 else png(found)
     try:
         if isinstance(frame, str | os.PathLike):
             with open(frame, "rb") as file:
                 return file.read()
-        data = frame.read()
+        opened: Any = frame
+        data = opened.read()
     except OSError as error:
         name = f"{os.fspath(frame)} " if isinstance(frame, str | os.PathLike) else "The frame's file "
         raise InvalidFrame(f"{name}cannot be read: {error.strerror}.") from error
     except ValueError as error:  # such as a closed file, or a name with a null
         raise InvalidFrame(f"The frame cannot be read: {error}.") from error
-    except AttributeError as error:
+    except (AttributeError, TypeError) as error:
         raise InvalidFrame(f"A {type(frame).__name__} is no frame.") from error
     if not isinstance(data, bytes):
         raise InvalidFrame("The frame's file is not opened in binary mode.")
@@ -117,6 +131,9 @@ def shown(frame: object) -> str:
         return f"<{memoryview(frame).nbytes} bytes>"
     if isinstance(frame, Picture):
         return f"Picture({shown(frame.pixels)}, {frame.order!r}, {frame.encoding!r}, quality={frame.quality})"
+    if is_pillow(frame):
+        image: Any = frame
+        return f"<image of Pillow, {image.mode}, {image.width}x{image.height} pixels>"
     shape = getattr(frame, "shape", None)
     return repr(frame) if shape is None else f"<{type(frame).__name__} of shape {list(shape)}>"
 
@@ -208,6 +225,33 @@ def jpeg(pixels: Any, order: str = "bgr", quality: int = 90) -> bytes:
     return bytes(data)
 
 
+def is_pillow(frame: object) -> bool:
+    """Whether a frame is an image of Pillow, which need not be installed."""
+    return any(kind.__module__.partition(".")[0] == "PIL" for kind in type(frame).__mro__)
+
+
+def _by_pillow(image: Any, encoding: Encoding, quality: int) -> bytes:
+    """The file of an image of Pillow: in grey if it is, also of 16 bits as a PNG, else in RGB.
+
+    Raises:
+        InvalidFrame: its file is damaged or closed, it has no pixels, or it has numbers of other kinds.
+    """
+    file = BytesIO()
+    try:
+        upright = import_module("PIL.ImageOps").exif_transpose(image)
+        if upright.mode == "F" or (upright.mode.startswith("I") and encoding == "jpeg"):
+            raise InvalidFrame(f"An image of the mode {upright.mode} cannot be sent as {encoding}: it has no 8 bits.")
+        if upright.mode != "L" and not upright.mode.startswith("I"):
+            upright = upright.convert("RGB")
+        options = {"quality": quality} if encoding == "jpeg" else {"compress_level": 1}
+        upright.save(file, encoding, **options)
+    except (OSError, ValueError, AttributeError, SyntaxError, SystemError) as error:
+        if isinstance(error, InvalidFrame):
+            raise
+        raise InvalidFrame(f"The image cannot be read: {error}.") from error
+    return file.getvalue()
+
+
 def _jpeg_by_pillow(found: Any, quality: int) -> bytes:
     try:
         image: Any = import_module("PIL.Image")
@@ -224,7 +268,7 @@ def _in_red_green_blue(pixels: Any, order: str) -> Any:
     Raises:
         InvalidFrame: the array has another type or shape, or OpenCV is needed and missing.
     """
-    if not hasattr(pixels, "__array_interface__"):
+    if not (hasattr(pixels, "__array_interface__") and hasattr(pixels, "dtype")):
         raise InvalidFrame(f"A {type(pixels).__name__} is no array of pixels.")
     if order not in ("bgr", "rgb"):
         from placerec_client.pixel_formats import UnfitPixels, pixels_of_array

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from placerec_client import parameters
 from placerec_client.errors import InvalidOdometry
-from placerec_client.requests import number_of
+from placerec_client.requests import number_of, wrapped
 
 MOST = {"x": 1e8, "y": 1e8, "heading": 1e6, "forward": 1e5, "left": 1e5, "turn": 36000.0}
 """How large numbers may be that can have either sign, as at the service."""
@@ -55,7 +55,7 @@ class Odometry:
         return {
             "odometry_x": self.x,
             "odometry_y": self.y,
-            "odometry_heading": float(self.heading) % 360,
+            "odometry_heading": wrapped(float(self.heading)),
             "odometry_covariance": self.covariance,
             "odometry_origin": self.origin,
         }

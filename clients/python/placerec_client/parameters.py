@@ -31,7 +31,7 @@ class Query(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -39,11 +39,6 @@ class Query(TypedDict, total=False):
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
-    filter.
-    """
 
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
@@ -57,13 +52,10 @@ class Query(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    levels: str | None
-    """The place is on one of these storeys: names separated by commas, or a JSON array."""
-
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -72,13 +64,13 @@ class Query(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
-    places; separated by commas.
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
-    contradicts them are multiplied by at least 1 - prior_trust.
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -130,7 +122,7 @@ class QueryBatch(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -138,11 +130,6 @@ class QueryBatch(TypedDict, total=False):
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
-    filter.
-    """
 
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
@@ -156,13 +143,10 @@ class QueryBatch(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    levels: str | None
-    """The place is on one of these storeys: names separated by commas, or a JSON array."""
-
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -171,13 +155,13 @@ class QueryBatch(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
-    places; separated by commas.
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
-    contradicts them are multiplied by at least 1 - prior_trust.
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -235,7 +219,7 @@ class EnrolPlace(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -243,15 +227,6 @@ class EnrolPlace(TypedDict, total=False):
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which the frame was taken."""
-
-    accuracy_metres: float | None
-    """Standard deviation of each coordinate."""
-
-    accuracy_degrees: float | None
-    """Standard deviation of its heading; with accuracy_metres."""
 
     metadata: str | Mapping[str, Any] | None
     """A JSON object."""
@@ -272,13 +247,10 @@ class ListPlaces(TypedDict, total=False):
     camera: str | None
     """Only places that this camera took."""
 
-    level: str | int | None
-    """Only places on this storey."""
-
-    after: datetime | str | None
+    after: datetime | float | str | None
     """Only places with this timestamp or a later one."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """Only places with this timestamp or an earlier one."""
 
     where: str | Mapping[str, Any] | None
@@ -333,7 +305,7 @@ class UploadRecording(TypedDict, total=False):
 class AddLook(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/places/{place}/looks``."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     camera: str | None
@@ -359,10 +331,10 @@ class DeleteLearntLooks(TypedDict, total=False):
     run: str | None
     """Those that were learnt from this run."""
 
-    since: datetime | str | None
+    since: datetime | float | str | None
     """Those that were added to the map at this time or later (ISO 8601; UTC without a zone)."""
 
-    until: datetime | str | None
+    until: datetime | float | str | None
     """Those that were added before this time."""
 
 
@@ -446,7 +418,7 @@ class QueryOrEnrol(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -454,17 +426,6 @@ class QueryOrEnrol(TypedDict, total=False):
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
-    filter.
-    """
-
-    accuracy_metres: float | None
-    """Standard deviation of each coordinate."""
-
-    accuracy_degrees: float | None
-    """Standard deviation of its heading; with accuracy_metres."""
 
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
@@ -478,13 +439,10 @@ class QueryOrEnrol(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    levels: str | None
-    """The place is on one of these storeys: names separated by commas, or a JSON array."""
-
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -493,13 +451,13 @@ class QueryOrEnrol(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
-    places; separated by commas.
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
-    contradicts them are multiplied by at least 1 - prior_trust.
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -546,7 +504,7 @@ class QueryMaps(TypedDict, total=False):
     heading: float | None
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: str | None
@@ -554,11 +512,6 @@ class QueryMaps(TypedDict, total=False):
 
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
-    filter.
-    """
 
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
@@ -572,13 +525,10 @@ class QueryMaps(TypedDict, total=False):
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
 
-    levels: str | None
-    """The place is on one of these storeys: names separated by commas, or a JSON array."""
-
-    after: datetime | str | None
+    after: datetime | float | str | None
     """The place was enrolled with this timestamp or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """The place was enrolled with this timestamp or earlier."""
 
     where: str | Mapping[str, Any] | None
@@ -587,13 +537,13 @@ class QueryMaps(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
-    places; separated by commas.
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
-    contradicts them are multiplied by at least 1 - prior_trust.
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -640,7 +590,7 @@ class SendFrame(TypedDict, total=False):
     smaller by more than 1000, or the timestamp says that the robot counts anew.
     """
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
     """When the frame was taken. One up to a second before the last one is refused; where it goes back by more, or
     leaps ahead by more than a day, the robot's clock was set, and the run goes on by it.
     """
@@ -680,16 +630,6 @@ class SendFrame(TypedDict, total=False):
 
     odometry_origin: str | None
     """A name for where odometry began. If the frame before had another one, the motion between the two is not known."""
-
-    level: str | int | None
-    """The storey on which the robot is, as far as it knows: a prior, which holds until another one is stated. Where
-    another is, the robot has come there by a lift.
-    """
-
-    height: float | None
-    """Metres, by a barometer for example: where it leaps by more than the map's same_place_height, the robot is on
-    another storey; nothing else of it counts.
-    """
 
     k: int
     """How many matches to list."""
@@ -865,10 +805,10 @@ class ReadAudit(TypedDict, total=False):
     operation: str | None
     """Only this operation."""
 
-    after: datetime | str | None
+    after: datetime | float | str | None
     """Only lines of this time or later."""
 
-    before: datetime | str | None
+    before: datetime | float | str | None
     """Only lines of this time or earlier."""
 
 
@@ -888,12 +828,7 @@ class NewMap(TypedDict, total=False):
     """The picture that is stored of each frame. A change applies to frames enrolled from then on."""
 
     same_place_radius: float
-    """Places within this distance in metres along the ground are the same place."""
-
-    same_place_height: float
-    """Places whose heights differ by more metres are on different storeys, and never the same place; where both have
-    a level, that says it instead.
-    """
+    """Places within this distance in metres are the same place."""
 
     same_place_frames: int
     """Without poses: places this many frames apart in their sequence are the same place."""
@@ -933,8 +868,6 @@ class MapChanges(TypedDict, total=False):
 
     same_place_radius: float | None
 
-    same_place_height: float | None
-
     same_place_frames: int | None
 
     verification: bool | None
@@ -959,14 +892,9 @@ class PlaceChanges(TypedDict, total=False):
 
     pose: PoseChanges | None
 
-    timestamp: datetime | str | None
+    timestamp: datetime | float | str | None
 
     sequence: str | None
-
-    level: str | int | None
-    """Null: the one that the metadata states, if any."""
-
-    pose_accuracy: PoseAccuracy | None
 
     metadata: Mapping[str, Any] | None
 
@@ -1143,7 +1071,7 @@ class NewKey(TypedDict, total=False):
     learn: bool
     """Whether maps that learn do so from the runs of its holder. An option of the role enrol; admin includes it."""
 
-    expires_at: datetime | str | None
+    expires_at: datetime | float | str | None
     """When it expires; null or left out: never."""
 
     replaces: str | None
@@ -1164,7 +1092,7 @@ class KeyChanges(TypedDict, total=False):
     learn: bool | None
     """false: no map learns from its runs any more."""
 
-    expires_at: datetime | str | None
+    expires_at: datetime | float | str | None
     """Not later than now; null: never."""
 
 
@@ -1217,12 +1145,6 @@ class RecordingOrder(TypedDict, total=False):
 
     camera: str | None
     """Of the map; its mask is applied."""
-
-    level: str | int | None
-    """The storey on which its frames were taken."""
-
-    pose_accuracy: PoseAccuracy | None
-    """How exact its poses are."""
 
     topic: str | None
 
@@ -1345,13 +1267,10 @@ class PlaceConditions(TypedDict):
     camera: NotRequired[str | None]
     """This camera took its frame."""
 
-    level: NotRequired[str | int | None]
-    """It is on this storey."""
-
-    after: NotRequired[datetime | str | None]
+    after: NotRequired[datetime | float | str | None]
     """It has this timestamp or a later one."""
 
-    before: NotRequired[datetime | str | None]
+    before: NotRequired[datetime | float | str | None]
     """It has this timestamp or an earlier one."""
 
     where: NotRequired[Mapping[str, Any] | None]
@@ -1379,7 +1298,7 @@ class NewPlace(TypedDict):
     heading: NotRequired[float | None]
     """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
 
-    timestamp: NotRequired[datetime | str | None]
+    timestamp: NotRequired[datetime | float | str | None]
     """When the frame was taken (ISO 8601; UTC without a zone)."""
 
     sequence: NotRequired[str | None]
@@ -1387,15 +1306,6 @@ class NewPlace(TypedDict):
 
     camera: NotRequired[str | None]
     """The camera of the map that took the frame; its mask is applied."""
-
-    level: NotRequired[str | int | None]
-    """The storey on which the frame was taken."""
-
-    accuracy_metres: NotRequired[float | None]
-    """Standard deviation of each coordinate."""
-
-    accuracy_degrees: NotRequired[float | None]
-    """Standard deviation of its heading; with accuracy_metres."""
 
     id: str
     """Id of the place."""
@@ -1503,7 +1413,7 @@ class CalibrationChanges(TypedDict):
 
     margin: NotRequired[float | None]
 
-    measured_at: NotRequired[datetime | str | None]
+    measured_at: NotRequired[datetime | float | str | None]
     """Store, instead, the calibration that the latest calibrate has found, as after a dry run: the time at which it
     was measured, `measured.at` of the calibration. If it was measured again since, this is refused.
     """
@@ -1514,9 +1424,10 @@ class CalibrationChanges(TypedDict):
 
 class Pose(TypedDict):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``z`` is in metres: in
-    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. It tells storeys
-    apart; distances are those along the ground. ``heading`` is in degrees: counter-clockwise from +x beside x and y,
-    clockwise from north beside latitude and longitude. It is normalized to [0, 360).
+    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. There it is a
+    statement that is handed on; distances on the Earth are those along the ground. ``heading`` is in degrees:
+    counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is normalized to
+    [0, 360).
     """
 
     x: NotRequired[float | None]
@@ -1541,7 +1452,7 @@ class RejectedGround(TypedDict):
     run: str
     """The run that proposed it."""
 
-    at: datetime | str
+    at: datetime | float | str
     """When it was rejected."""
 
     poses: Sequence[Pose]
@@ -1639,18 +1550,6 @@ class ReviewSetting(TypedDict):
 
     most_bytes: NotRequired[int]
     """Most bytes of their files together; the oldest go first."""
-
-
-class PoseAccuracy(TypedDict):
-    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
-    degrees: of the heading; None: not stated.
-    """
-
-    metres: float
-    """Of each coordinate."""
-
-    degrees: NotRequired[float | None]
-    """Of the heading; null: not stated."""
 
 
 class PoseChanges(TypedDict):

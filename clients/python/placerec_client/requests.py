@@ -7,11 +7,20 @@ import math
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
-from typing import Any
+from datetime import UTC, date, datetime
+from typing import Any, TypeVar
 from urllib.parse import quote, urlencode
 
 from placerec_client.errors import InvalidName, InvalidParameter
+
+Item = TypeVar("Item")
+
+TIMES = frozenset({"timestamp", "after", "before", "since", "until", "at", "measured_at", "expires_at"})
+"""Names under which a number is a time, in seconds since 1970 by UTC, as ``time.time()`` has it."""
+FIRST_TIME, LAST_TIME = 946_684_800, 4_102_444_800
+"""2000 and 2100: a number before is no such time but one since the start of a machine; one after is in other units."""
+OF_THE_CALLER = frozenset({"metadata", "where"})
+"""Objects whose names are the caller's own."""
 
 BYTES = (bytes, bytearray, memoryview)
 """They are sequences of numbers, but what is meant by them is a text."""
@@ -55,6 +64,7 @@ def text_of(name: str, value: Any) -> str:
     Raises:
         InvalidParameter: it is nothing of these.
     """
+    value = as_meant(name, value)
     if isinstance(value, Mapping):
         return dumps(value, name)
     if not isinstance(value, Iterable) or isinstance(value, (str, *BYTES)) or getattr(value, "ndim", None) == 0:
@@ -83,6 +93,47 @@ def _single(name: str, value: Any) -> str:
     return repr(number)
 
 
+def as_meant(name: str, value: Any) -> Any:
+    """A value as the service takes it: a time in seconds as a datetime, a heading in [0, 360); also within a body.
+
+    Raises:
+        InvalidParameter: a number cannot be a time.
+    """
+    if isinstance(value, Mapping):
+        return value if name in OF_THE_CALLER else {key: as_meant(key, one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_meant(name, one) for one in value]
+    number = number_of(value) if name in TIMES or name == "heading" else None
+    if number is None:
+        return value
+    return wrapped(number) if name == "heading" else time_of(name, number)
+
+
+def time_of(name: str, seconds: float) -> datetime:
+    """The time so many seconds after 1970 began, by UTC.
+
+    Raises:
+        InvalidParameter: that is before 2000 or after 2100, so it was meant otherwise.
+    """
+    if FIRST_TIME <= seconds <= LAST_TIME:
+        return datetime.fromtimestamp(seconds, UTC)
+    why = "it has to be seconds since 1970, as time.time() has them, or a datetime"
+    if seconds < FIRST_TIME:
+        why += "; a clock that counts from the start of a machine, such as time.monotonic(), tells no time"
+    for unit, share in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        if FIRST_TIME <= seconds / share <= LAST_TIME:
+            why += f"; these seem to be {unit}: divide by {share:.0e}".replace("e+0", "e")
+    raise InvalidParameter(f"{name} cannot be {seconds!r}: {why}.")
+
+
+def wrapped(degrees: float) -> float:
+    """An angle in [0, 360); one that is not finite stays, and the service refuses it."""
+    if not math.isfinite(degrees):
+        return degrees
+    turned = degrees % 360
+    return 0.0 if turned == 360 else turned  # of a tiny one below zero the remainder is rounded up
+
+
 def number_of(value: Any) -> float | None:
     """A number of Python or NumPy; None if it is none."""
     if isinstance(value, (bool, str, *BYTES)) or getattr(value, "ndim", 0) != 0:
@@ -91,6 +142,17 @@ def number_of(value: Any) -> float | None:
         return float(value)
     except (TypeError, ValueError, OverflowError):
         return None
+
+
+def items_of(name: str, given: Iterable[Item]) -> Iterable[Item]:
+    """Return several things as they were given.
+
+    Raises:
+        InvalidParameter: it is no iterable, or a text or bytes.
+    """
+    if isinstance(given, (str, *BYTES)) or not isinstance(given, Iterable):
+        raise InvalidParameter(f"{name} has to be a list or another iterable, not a {type(given).__name__}.")
+    return given
 
 
 def seconds_of(name: str, value: Any) -> float:
@@ -115,7 +177,9 @@ def dumps(value: Any, name: str = "what is given") -> str:
         InvalidParameter: it has something that JSON has not.
     """
     try:
-        return json.dumps(value, default=_plain)
+        return json.dumps(as_meant(name, value), default=_plain)
+    except InvalidParameter:
+        raise
     except (TypeError, ValueError, RecursionError) as error:
         raise InvalidParameter(f"JSON cannot have {name}: {error}.") from error
 

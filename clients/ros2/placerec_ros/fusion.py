@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from placerec_ros.planar import Planar, map_to_odom
 from placerec_ros.pose import UNKNOWN_ANGLE, PoseEstimate
-from placerec_ros.track import Array, Track
+from placerec_ros.track import NO_HEADING, Array, Track
 
 BEGINS = 3
 """Localizations that agree with each other before a track is believed."""
@@ -17,8 +18,10 @@ CHANGES, CHANGE_METRES = 5, 5.0
 """Localizations in a row that contradict a track, and agree over so many metres, before it is given up."""
 FLAT = np.ix_((0, 1, 5), (0, 1, 5))
 """Where a covariance of ROS, 6 x 6, has those of x, y and the turn about z."""
-NO_HEADING = 1e6
-"""The variance in rad² by which a heading that is not known has no weight."""
+CONTRADICTED = 0.9
+"""The probability that odometry is wrong, at least, where the session finds that it contradicts the frames."""
+WAY = 10
+"""Localizations over which the ways by odometry and by themselves are compared for a person."""
 STANDING = Planar(0.0, 0.0, 0.0)
 
 
@@ -29,11 +32,15 @@ class Fix:
     odom: the robot's pose by odometry at the frame.
     origin: a name for where that odometry began.
     track: as it was after the frame; it is not changed any more.
+    moment: of the frame, in seconds.
+    confirmed: the moment of the last localization that agreed.
     """
 
     odom: Planar
     origin: str
     track: Track
+    moment: float
+    confirmed: float
 
     @property
     def correction(self) -> Planar:
@@ -52,11 +59,16 @@ class Fix:
         found = self.deviations
         return found[0] <= position and math.degrees(found[1]) <= heading
 
-    def at(self, odom: Planar) -> Fix:
-        """The fix after the robot has gone on to a pose by odometry, without another localization."""
+    @property
+    def unconfirmed(self) -> float:
+        """Seconds since the last localization that agreed."""
+        return self.moment - self.confirmed
+
+    def at(self, odom: Planar, moment: float) -> Fix:
+        """The fix at a later moment, at another pose by odometry, without another localization."""
         track = self.track.copy()
-        track.move(self.odom.inverse().then(odom))
-        return Fix(odom, self.origin, track)
+        track.move(self.odom.inverse().then(odom), max(0.0, moment - self.moment))
+        return Fix(odom, self.origin, track, max(moment, self.moment), self.confirmed)
 
 
 @dataclass
@@ -86,46 +98,70 @@ class Fusion:
         self._rival: Rival | None = None
         self._odom: Planar | None = None
         self._origin = ""
+        self._moment = self._confirmed = 0.0
+        self._way: deque[tuple[Planar, Planar]] = deque(maxlen=WAY)
 
-    def add(self, odom: Planar, origin: str, found: PoseEstimate | None) -> Fix | None:
+    def add(
+        self, odom: Planar, origin: str, found: PoseEstimate | None, moment: float, contradicted: bool = False
+    ) -> Fix | None:
         """Take in a frame, and return where the robot is by all that came; None if that is not known.
 
         Args:
             odom: the robot's pose by odometry.
             origin: a name for where that odometry began; with another one everything before is forgotten.
             found: the robot's pose in the map by this frame; None if it was not localized.
+            moment: of the frame, in seconds.
+            contradicted: whether the session finds that odometry contradicts its frames.
         """
         if origin != self._origin:
             self.clear()
             self._origin = origin
-        self._move(odom)
+        self._move(odom, moment)
+        for track in (self._believed, None if self._rival is None else self._rival.track):
+            if contradicted and track is not None:
+                track.distrust(CONTRADICTED)
         if found is not None:
             covariance = np.reshape(np.array(found.covariance), (6, 6))[FLAT]
             if covariance[2, 2] >= 0.99 * UNKNOWN_ANGLE:
                 covariance[2, :] = covariance[:, 2] = 0.0
                 covariance[2, 2] = NO_HEADING
             self._weigh(found.planar, covariance)
-        return None if self._believed is None else Fix(odom, origin, self._believed.copy())
+        return None if self._believed is None else self._fix(self._believed, odom)
 
-    def place(self, robot: Planar, covariance: Array, odom: Planar, origin: str) -> Fix:
-        """Believe a pose that somebody gives, with the covariance of its x, y and yaw, [3, 3]."""
+    def place(self, robot: Planar, covariance: Array, odom: Planar, origin: str, moment: float) -> Fix:
+        """Believe a pose that somebody gives at a moment, with the covariance of its x, y and yaw, [3, 3]."""
         self.clear()
-        self._believed, self._odom, self._origin = Track(robot, covariance, given=True), odom, origin
-        return Fix(odom, origin, self._believed.copy())
+        self._odom, self._origin, self._moment = odom, origin, moment
+        self._believed, self._confirmed = Track(robot, covariance, given=True), moment
+        return self._fix(self._believed, odom)
 
-    def _move(self, odom: Planar) -> None:
+    def _fix(self, track: Track, odom: Planar) -> Fix:
+        return Fix(odom, self._origin, track.copy(), self._moment, self._confirmed)
+
+    @property
+    def way(self) -> str:
+        """The way of the last localizations that agreed, by odometry and by themselves, for a person."""
+        if len(self._way) < 2:
+            return "there are too few localizations"
+        (odom, robot), (last_odom, last_robot) = self._way[0], self._way[-1]
+        return f"odometry went {_shown(odom, last_odom)}, the localizations {_shown(robot, last_robot)}"
+
+    def _move(self, odom: Planar, moment: float) -> None:
+        seconds = 0.0 if self._odom is None else max(0.0, moment - self._moment)
+        self._moment = moment if self._odom is None else max(moment, self._moment)
         step = STANDING if self._odom is None else self._odom.inverse().then(odom)
         self._odom = odom
         if self._believed is not None:
-            self._believed.move(step)
+            self._believed.move(step, seconds)
         if self._rival is not None:
-            self._rival.track.move(step)
+            self._rival.track.move(step, seconds)
             self._rival.driven += math.hypot(step.x, step.y)
 
     def _weigh(self, robot: Planar, covariance: Array) -> None:
         if self._believed is not None and self._believed.allows(robot, covariance):
             self._believed.correct(robot, covariance)
             self._rival = None
+            self._confirm(robot)
             return
         self.refused += self._believed is not None
         if self._rival is not None and self._rival.track.allows(robot, covariance):
@@ -144,3 +180,18 @@ class Fusion:
         if earned:
             self.replaced += self._believed is not None
             self._believed, self._rival = rival.track, None
+            self._way.clear()
+            self._confirm(rival.track.robot)
+
+    def _confirm(self, robot: Planar) -> None:
+        """Note a localization that agreed."""
+        self._confirmed = self._moment
+        if self._odom is not None:
+            self._way.append((self._odom, robot))
+
+
+def _shown(before: Planar, after: Planar) -> str:
+    """A way in words: how far, in which direction, and how far it turned."""
+    step = before.inverse().then(after)
+    ahead, turned = math.degrees(math.atan2(step.y, step.x)), math.degrees(step.yaw)
+    return f"{math.hypot(step.x, step.y):.1f} m at {ahead:.0f}° from its front and turned by {turned:.0f}°"

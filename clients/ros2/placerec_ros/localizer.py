@@ -466,9 +466,12 @@ class Localizer:
         self, frame: Frame, answer: Mapping[str, Any], of_robot: PoseEstimate | None, revision: int | None, took: float
     ) -> None:
         """Take in the robot's pose by an answer, None if it gives none, and hand everything to the outlet."""
-        fix = self._fuse(frame, of_robot)
-        if fix is not None and fix.is_within(self._settings.position_limit, self._settings.heading_limit):
+        contradicted = answer.get("motion") == "contradicted"
+        fix = self._fuse(frame, of_robot, contradicted)
+        limits = self._settings.position_limit, self._settings.heading_limit
+        if fix is not None and fix.is_within(*limits) and not fix.unconfirmed:
             self._wanted = False
+        self._judge_odometry(answer, fix)
         self._health.fact("verdict", answer["verdict"])
         self._health.answered(took, None if of_robot is None else str(moment_of(frame.stamp) or "no stamp"))
         report = {
@@ -488,12 +491,28 @@ class Localizer:
         }
         self._outlet.answered(Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix))
 
-    def _fuse(self, frame: Frame, found: PoseEstimate | None) -> Fix | None:
+    def _judge_odometry(self, answer: Mapping[str, Any], fix: Fix | None) -> None:
+        """Say so if odometry contradicts the frames, by the session or by the filter."""
+        if answer.get("motion") is not None:
+            self._health.fact("motion", answer["motion"])
+        if answer.get("motion") == "contradicted":
+            kind = answer.get("contradiction") or "inconsistent"
+            why = answer.get("contradiction_note") or "its motion and the frames do not agree"
+            self._health.fact("contradiction", kind)
+            self._health.begins("contradiction", f"Odometry contradicts the frames ({kind}): {why}.")
+        elif fix is not None and fix.track.doubt > 0.5:
+            self._health.fact("contradiction", "inconsistent")
+            self._health.begins("contradiction", f"Odometry contradicts the localizations: {self._fusion.way}.")
+        else:
+            self._health.fact("contradiction", "none")
+            self._health.over("contradiction")
+
+    def _fuse(self, frame: Frame, found: PoseEstimate | None, contradicted: bool) -> Fix | None:
         """Take in where the robot is by one answer; where it was at its frame, None if odometry has nothing of then."""
         odom = self.odometer.at(frame.stamp) if frame.stamp else None
         if odom is None:
             return None
-        self.fix = self._fusion.add(odom, self.odometer.origin, found)
+        self.fix = self._fusion.add(odom, self.odometer.origin, found, frame.stamp / NANOSECONDS, contradicted)
         self._health.counts["localizations refused"] = self._fusion.refused
         self._health.counts["tracks replaced"] = self._fusion.replaced
         return self.fix
@@ -509,6 +528,7 @@ class Localizer:
         """Forget where the robot is."""
         self._wanted = True
         self._fusion.clear()
+        self._health.over("contradiction")
         self.fix = None
 
     def _annotate(self, frame: Frame, picture: Any, run: Run) -> None:
@@ -576,12 +596,14 @@ class Localizer:
     def _place(self, robot: Planar, covariance: Array, stamp: int) -> Done:
         if not self._active:
             return Done(False, "The node is not active.")
-        odom = self.odometer.at(stamp) or self.odometer.latest
+        odom = self.odometer.at(stamp)
+        if odom is None:
+            stamp, odom = self.odometer.latest
         if odom is None:
             return Done(False, "There is no odometry, so the pose cannot be followed.")
         self._forget()
         self._end_runs()
-        self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin)
+        self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin, stamp / NANOSECONDS)
         return Done(True, f"The robot is believed to be at x {robot.x:.2f}, y {robot.y:.2f}.")
 
     def _enrol_here(self) -> Done:

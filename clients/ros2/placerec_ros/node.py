@@ -39,7 +39,7 @@ from placerec_ros.fusion import Fix
 from placerec_ros.health import ERROR, OK, WARN, Health
 from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
 from placerec_ros.localizer import ALTERNATES, Answered, Done, Localizer
-from placerec_ros.odometry import stamp_of
+from placerec_ros.odometry import NANOSECONDS, stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
 from placerec_ros.repetition import Repetition
 
@@ -57,6 +57,8 @@ SILENCE_SECONDS = 5.0
 """Seconds without an image after which the node says so."""
 STOP_SECONDS = 1.0
 """Seconds for which a clean-up waits for a request under way."""
+UNCONFIRMED_SHARE = 0.5
+"""The share of confirmation_limit after which images on demand are wanted again, so that the transform goes on."""
 QUEUED = 5
 """Messages of a sensor that wait in the middleware."""
 
@@ -442,7 +444,15 @@ class PlacerecNode(LifecycleNode):
             return
         if (ahead := self._repetition.due(stamp)) is None:
             return
-        present = fix.at(odom)
+        present = fix.at(odom, stamp / NANOSECONDS)
+        if present.unconfirmed > UNCONFIRMED_SHARE * chosen.confirmation_limit:
+            localizer.want()
+        if present.unconfirmed > chosen.confirmation_limit:
+            self._health.begins(
+                "transform",
+                f"The transform is not sent: no localization has confirmed it for {chosen.confirmation_limit:g} s.",
+            )
+            return
         if not present.is_within(chosen.position_limit, chosen.heading_limit):
             localizer.want()
             position, heading = present.deviations
@@ -453,7 +463,9 @@ class PlacerecNode(LifecycleNode):
             )
             return
         self._health.over("transform")
-        transform = messages.transform_message(fix.correction, messages.time_message(ahead), chosen.map_frame, frame)
+        transform = messages.transform_message(
+            present.correction, messages.time_message(ahead), chosen.map_frame, frame
+        )
         with self._outlet_lock:
             if self._publishing:
                 self._transform.publish(transform)

@@ -199,10 +199,10 @@ class Odometer:
         return None if reading is None else reading.pose
 
     @property
-    def latest(self) -> Planar | None:
-        """The last pose; None if there is none."""
+    def latest(self) -> tuple[int, Planar | None]:
+        """The last stamp in nanoseconds and its pose; 0 and None if there is none."""
         with self._lock:
-            return self._poses[-1].pose if self._poses else None
+            return (self._poses[-1].stamp, self._poses[-1].pose) if self._poses else (0, None)
 
     def odometry(self, stamp: int, camera_yaw: float = 0.0) -> Odometry | None:
         """The odometry to send with a frame of a moment, in nanoseconds; None if none is near it.

@@ -157,6 +157,14 @@ PARAMETERS = (
         live=True,
     ),
     Parameter(
+        "confirmation_limit",
+        20.0,
+        "Seconds: where no localization has confirmed the place for longer, no transform is sent.",
+        0.5,
+        3600.0,
+        live=True,
+    ),
+    Parameter(
         "send_initial_pose",
         False,
         "Publish the pose on initialpose once it is known, as AMCL takes it.",
@@ -259,6 +267,7 @@ class Settings:
     transform_tolerance: float
     position_limit: float
     heading_limit: float
+    confirmation_limit: float
     send_initial_pose: bool
     take_initial_pose: bool
     on_demand: bool

@@ -53,19 +53,25 @@ class PoseEstimate:
 def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimate | None:
     """The pose of a session's answer; None unless the session recognizes a place that has a pose in metres.
 
+    Where the session finds that odometry contradicts the frames, a frame that is recognized by itself counts, whatever
+    the session believes.
+
     Args:
         answer: ``SessionAnswer`` as JSON.
         same_place_radius: metres, of the map: places within it count as one.
     """
+    single = answer["single"]
+    measured = single.get("pose")
+    is_measured = single["verdict"] == "recognized" and metric(measured) and measured.get("covariance")
+    if is_measured and answer.get("motion") == "contradicted":
+        return _of_frame(measured)
     if answer["verdict"] != "recognized" or answer["place"] is None or not metric(answer["place"]["pose"]):
         return None
     believed = answer["place"]["pose"]
-    single = answer["single"]
-    measured = single.get("pose")
-    if single["verdict"] == "recognized" and metric(measured) and measured.get("covariance"):
+    if is_measured:
         reach = same_place_radius + min(3 * (measured.get("spread") or 0.0), MOST_BESIDE)
         if math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"]) <= reach:
-            return PoseEstimate(_planar(measured), tuple(map(float, measured["covariance"])), "frame")
+            return _of_frame(measured)
     return _of_belief(answer["candidates"], same_place_radius)
 
 
@@ -157,6 +163,10 @@ def _seen_by(
             known = yaw  # of several that it may have been, the one that turns the robot least
             return heading, min(named or mounts.values(), key=lambda mount: abs(wrapped(heading - mount.yaw - known)))
     return None
+
+
+def _of_frame(measured: Mapping[str, Any]) -> PoseEstimate:
+    return PoseEstimate(_planar(measured), tuple(map(float, measured["covariance"])), "frame")
 
 
 def metric(pose: Mapping[str, Any] | None) -> bool:

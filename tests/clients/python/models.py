@@ -67,7 +67,9 @@ def annotation(schema: Mapping[str, Any], sent: bool) -> str:
         return f"{'Mapping' if sent else 'dict'}[str, {inner}]"
     if "format" in schema and schema["format"] in FORMATS:
         made = FORMATS[schema["format"]]
-        return f"{made} | str" if sent else made
+        if not sent:
+            return made
+        return f"{made} | float | str" if made == "datetime" else f"{made} | str"
     return SCALARS.get(schema.get("type", ""), "Any")
 
 

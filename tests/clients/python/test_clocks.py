@@ -152,7 +152,8 @@ BACK, FORWARD, COUNTER, NO_DATE = "clock went back", "clock went ahead", "number
                 ({"timestamp": float("inf")}, BAD),
                 ({"timestamp": -1}, BAD),
                 ({"timestamp": 1e300}, BAD),
-                ({"timestamp": 1795168800}, BAD),
+                ({"timestamp": "1795168800"}, BAD),  # a number is a time to the client
+                ({"timestamp": 1795168800_000}, BAD),
                 ({"timestamp": "yesterday"}, BAD),
                 ({"timestamp": "99999-01-01T00:00:00Z"}, BAD),
                 ({"timestamp": "0001-01-01T00:00:00+14:00"}, BAD),

@@ -17,7 +17,7 @@ from placerec_client.answers import problem_of
 from placerec_client.batches import BATCH_BYTES, OF_THE_FRAME, TOO_SLOW, Located, Pace, too_large
 from placerec_client.errors import InvalidFrame, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import Part, form
+from placerec_client.requests import Part, form, items_of
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -93,7 +93,7 @@ class AsyncQueries(AsyncBatches[tuple[Frame, bytes], Located]):
     ) -> None:
         super().__init__()
         self._connection, self._path, self._options = connection, path, options
-        self._frames = iter(frames)
+        self._frames = iter(items_of("frames", frames))
 
     async def read(self) -> AsyncBatch[tuple[Frame, bytes], Located] | None:
         """Read frames until the batch is full; one that cannot be read ends it."""

@@ -262,12 +262,19 @@ class AsyncConnection:
         return exceeded
 
     def url_of(self, path: str) -> httpx.URL:
-        """The URL of a path with its query string; parsing one takes time, so they are cached."""
+        """The URL of a path with its query string; parsing one takes time, so they are cached.
+
+        Raises:
+            InvalidParameter: the parameters are too long for one.
+        """
         found = self._urls.get(path)
         if found is None:
             if len(self._urls) >= KNOWN_URLS:
                 self._urls.clear()
-            found = self._urls[path] = httpx.URL(self.url + path)
+            try:
+                found = self._urls[path] = httpx.URL(self.url + path)
+            except httpx.InvalidURL as error:
+                raise InvalidParameter(f"The parameters make no URL: {error}.") from error
         return found
 
     async def ask(self, model: type[Answer], method: str, path: str, **options: Any) -> Answer:

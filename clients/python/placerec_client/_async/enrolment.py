@@ -32,7 +32,7 @@ from placerec_client.batches import (
 )
 from placerec_client.errors import PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import media_type
-from placerec_client.requests import Part, dumps, form, form_type, part_end, part_head
+from placerec_client.requests import Part, dumps, form, form_type, items_of, part_end, part_head
 
 Answered = list[tuple[Read, models.BatchResult | None, PlacerecError | None]]
 """The service's answer for each frame; None for one that could not be read and was not sent."""
@@ -58,7 +58,7 @@ class AsyncEnrolment(AsyncBatches[Read, Enrolled]):
     ) -> None:
         super().__init__()
         self._connection, self._path, self._options, self._known = connection, path, options, known
-        self._places = iter(places)
+        self._places = iter(items_of("places", places))
         self._waiting: deque[NewPlace] = deque()  # read from the places, but not dealt with yet
         self._needed: deque[NewPlace] = deque()  # known, but to be sent all the same
 
@@ -186,6 +186,7 @@ async def enrol_by_job(
 ) -> AsyncJob:
     """Send frames in one long form, which is never in memory as a whole, and return the job that enrols them."""
     boundary = secrets.token_hex(16)
+    items_of("places", places)
     entries = await in_thread(lambda: [_usable(place).entry for place in places])
 
     async def pieces() -> AsyncIterator[bytes]:

@@ -21,7 +21,7 @@ from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
 from placerec_client.odometry import Odometry, with_motion
-from placerec_client.requests import dumps, text_of
+from placerec_client.requests import as_meant, dumps, text_of
 from placerec_client.retry import LEAVE_SECONDS, Clock
 
 CONNECT_SECONDS = 5.0
@@ -188,4 +188,5 @@ def _denied(error: InvalidStatus) -> PlacerecError:
 
 
 def _field(name: str, value: Any) -> Any:
+    value = as_meant(name, value)
     return value if isinstance(value, bool | int | float | str) else text_of(name, value)

@@ -37,8 +37,8 @@ async def export(
     progress: Progress | None = None,
 ) -> str | None:
     """Download a map to a file; see ``AsyncMap.export``."""
-    file = _file(path)
-    if file.exists() and not overwrite:
+    file = file_of(path)
+    if os.path.exists(file) and not overwrite:
         raise TransferFailed(f"{file} already exists.")
     partial = file.with_name(file.name + PARTIAL)
     tag = await download(connection, map_path, partial, known, progress)
@@ -81,9 +81,7 @@ async def _pieces(
     connection: AsyncConnection, path: str, partial: Path, known: str | None, progress: Progress | None
 ) -> str | None:
     tag = await in_thread(partial_tag, partial)
-    if tag is None:
-        partial.unlink(missing_ok=True)
-    with _opened(partial) as file:
+    with _opened(partial, anew=tag is None) as file:
         position, size = file.seek(0, os.SEEK_END), None
         while size is None or position < size:
             response = await _piece(connection, path, position, tag, known)
@@ -128,7 +126,7 @@ async def upload(
     progress: Progress | None,
 ) -> AsyncJob:
     """Upload the file of a map; see ``AsyncMaps.import_``."""
-    file = _file(path)
+    file = file_of(path)
     await _check_free(connection, map_id or await in_thread(map_id_of, file))
     try:
         size = file.stat().st_size
@@ -191,11 +189,22 @@ def settle(partial: Path, path: Path) -> None:
         raise TransferFailed(f"{path} cannot be written: {error.strerror}.") from error
 
 
-def _file(path: str | os.PathLike[str]) -> Path:
+def file_of(path: str | os.PathLike[str]) -> Path:
+    """The path of a file.
+
+    Raises:
+        TransferFailed: it is none.
+    """
     try:
-        return Path(path)
+        found = Path(path)
+        is_one = b"\0" not in os.fsencode(found)
     except TypeError as error:
         raise TransferFailed(f"A {type(path).__name__} is no path of a file.") from error
+    except UnicodeEncodeError:
+        is_one = False
+    if not is_one:
+        raise TransferFailed(f"{ascii(str(found))[:140]} is no path of a file: it has a character that none has.")
+    return found
 
 
 def _size_of(headers: Mapping[str, str]) -> int:
@@ -203,8 +212,10 @@ def _size_of(headers: Mapping[str, str]) -> int:
     return int(whole) if whole else int(headers["content-length"])
 
 
-def _opened(path: Path) -> BinaryIO:
+def _opened(path: Path, anew: bool) -> BinaryIO:
     try:
+        if anew:
+            path.unlink(missing_ok=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         return open(path, "ab" if path.exists() else "wb", opener=_open_private)
     except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Unpack
 
@@ -12,6 +13,8 @@ from placerec_client import models, parameters, problems
 from placerec_client._sync.concurrency import in_thread
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.jobs import Job
+from placerec_client._sync.transfers import file_of
+from placerec_client.errors import UnreadableFile
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.renamed import OldNames
 from placerec_client.requests import fields, path_of
@@ -222,10 +225,10 @@ class Recordings:
 
         Raises:
             RecordingOffset: another upload of this name is under way.
-            OSError: the file cannot be read.
+            UnreadableFile: the file cannot be read.
         """
-        path = Path(file)
-        name, total = path.name if name is None else name, (in_thread(path.stat)).st_size
+        path = file_of(file)
+        name, total = path.name if name is None else name, in_thread(_size, path)
         at = self.size(name)
         while at < total:
             piece = in_thread(_piece, path, at)
@@ -261,7 +264,21 @@ class Recordings:
         self._connection.request("DELETE", self._of(name))
 
 
+def _size(path: Path) -> int:
+    with _readable(path):
+        return path.stat().st_size
+
+
 def _piece(path: Path, at: int) -> bytes:
-    with path.open("rb") as opened:
+    with _readable(path), path.open("rb") as opened:
         opened.seek(at)
         return opened.read(PIECE_BYTES)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Have the errors of reading a file become UnreadableFile."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreadableFile(f"{path} cannot be read: {error.strerror}.") from error

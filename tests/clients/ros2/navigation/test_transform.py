@@ -49,9 +49,10 @@ def test_it_is_repeated_ahead_of_odometry_and_changes_by_localizations_alone(mov
     # Map = R(90°) * odometry + t, with the odometry at (-2, 5 - FOUND): t = pose - (FOUND - 5, -2).
     assert (found[-1]["x"], found[-1]["y"]) == pytest.approx((pose["x"] + 5 - FOUND, pose["y"] + 2.0), abs=1.0)
     assert all(before["stamp"] < after["stamp"] for before, after in pairwise(found))
-    assert {(one["x"], one["y"], one["heading"]) for one in found} == {
-        (found[0]["x"], found[0]["y"], found[0]["heading"])
-    }
+    for one in found:
+        assert [one[name] for name in ("x", "y", "heading")] == pytest.approx(
+            [found[0][name] for name in ("x", "y", "heading")], abs=1e-4
+        )
     newest = robot.BASE + 0.1 * robot.frame
     assert newest < found[-1]["stamp"] <= newest + 0.5 + 1e-6
 
@@ -105,4 +106,22 @@ def test_it_ends_with_what_it_rests_on(moving: Robot) -> None:
     robot.frame += 1
     robot.odometry(103.0, 50.0, 0.0)
     robot.asked(FOUND + 5)
+    assert robot.peer.take("map_to_odom") == []
+
+
+@pytest.mark.thorough
+def test_it_ends_when_no_localization_has_confirmed_it_for_a_while(moving: Robot) -> None:
+    """Odometry stands still from then on, as one does that has failed, and goes on to come."""
+    robot = moving
+    begin(robot, confirmation_limit=3.0, **SURE)
+    go(robot, 0, FOUND + 1)
+    assert sent(robot), "a second is not too long"
+    robot.frame += 30
+    robot.odometry(-2.0, 5.0 - FOUND, -90.0)
+    robot.says("no localization has confirmed it for 3 s")
+    robot.peer.take("map_to_odom")
+    for _ in range(10):
+        robot.frame += 1
+        robot.odometry(-2.0, 5.0 - FOUND, -90.0, settle=0.0)
+    robot.says("no localization has confirmed it for 3 s")
     assert robot.peer.take("map_to_odom") == []
