@@ -27,7 +27,7 @@ SENT = (
 )
 """Schemas of bodies. They lose their required fields, which the calls take by position."""
 
-LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str"}
+LISTS = {"sequences": "str", "levels": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str"}
 LISTS |= {"bbox": "float", "odometry_covariance": "float"}
 OBJECTS = {"where", "metadata", "cameras"}
 """Parameters of the query string that hold lists and JSON objects; the client takes them as such, too."""
