@@ -188,9 +188,9 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     found = values.max(axis=0)[order].astype(np.float32)
     of_best = evidence[:, near[best]]
     best_evidence = None if np.isnan(of_best).all() else float(np.nanmax(of_best))
-    known = {int(rows[head]) for head, one in zip(heads, judgements, strict=True) if one.verdict == "recognized"}
-    known |= {view.recognized for view in views if view.recognized is not None}
-    contradicting = np.flatnonzero(np.isin(rows[order], list(known)) & ~near[best, order]).tolist()
+    believed = {int(rows[head]) for head, one in zip(heads, judgements, strict=True) if one.verdict == "recognized"}
+    believed |= {view.recognized for view in views if view.recognized is not None}
+    contradicting = np.flatnonzero(np.isin(rows[order], list(believed)) & ~near[best, order]).tolist()
     imagined = judgements[int(surest.argmax())].imagined
     judgement = _judged(
         total[order], found, near[np.ix_(order, order)], contradicting, calibration, steepness, best_evidence, imagined

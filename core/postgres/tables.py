@@ -88,7 +88,7 @@ ERASED_TABLES = ("places", "tokens", "pictures", "keypoints", "descriptors", "re
 """The tables with what a frame shows, which are vacuumed when deleted places are erased."""
 
 TABLES = (
-    Tables("maps", 4, schema.METADATA),
+    Tables("maps", 4, schema.METADATA, migrations={3: schema.LEVELS}),
     Tables("review", 1, review.METADATA),
     Tables("vectors", 1, _METADATA, more={"postgresql": _MORE}),
 )

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
+from benchmarks.day.rigs import KINDS, RigAnswer, answers, apart
 from benchmarks.day.robots import Asking, Mode, Verify
 from benchmarks.day.situations import SITUATIONS, Moment, moments
 from benchmarks.day.walks import WalkPair, drawn
@@ -37,13 +38,22 @@ class Day:
         assert self.server.stop() == 0
         self.server = Server(self._folder, reservation=port).wait()
 
+    def _make(self, client: Client, change: Change) -> None:
+        if change not in self._made:
+            self._made.add(change)
+            make_map(client, change, self._walk, change, "small", ())
+
+    def rigs(self, kind: str, numbers: range) -> list[tuple[frozenset[int], RigAnswer, list[RigAnswer]]]:
+        """The answers to rigs of one kind at some frames of the walk."""
+        with Client(str(self.server.client.base_url)) as client:
+            self._make(client, "plain")
+            return list(answers(client, "plain", self._walk, kind, "auto", numbers))
+
     def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> DriveOutcomes:
         """What becomes of a robot in a situation."""
         url, change = str(self.server.client.base_url), SITUATIONS[situation].map
-        if change not in self._made:
-            self._made.add(change)
-            with Client(url) as client:
-                make_map(client, change, self._walk, change, "small", ())
+        with Client(url) as client:
+            self._make(client, change)
         way = moments(SITUATIONS[situation], self._walk, SHORT)
         return drive(url, change, Mode(asking, verify, "small"), way, self.restart)
 
@@ -101,6 +111,24 @@ def test_a_session_goes_on_after_a_restart(day: Day) -> None:
     told = day.drive("odometry", "restart")
     assert told.again == 0
     assert told.count("right") == len(told.outcomes)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_camera_takes_nothing_away_and_hides_no_contradiction(day: Day, walk: WalkPair, kind: str) -> None:
+    found = day.rigs(kind, range(2, 20, 5))
+    if kind == "contradicting":
+        found = [one for one in found if apart(*one[2])]
+        assert {answer.verdict for _, answer, _ in found} == {"ambiguous"}
+        assert all({one.shown for one in alone} <= answer.named for _, answer, alone in found)
+        assert all((answer.probability or 0) <= 0.5 for _, answer, _ in found)
+        return
+    singly = [[one.outcome(right) == "right" for one in alone] for right, _, alone in found]
+    assert sum(answer.outcome(right) == "right" for right, answer, _ in found) >= max(np.sum(singly, axis=0)) > 0
+    if kind != "honest":
+        both = [(answer, alone[0]) for _, answer, alone in found]
+        assert [one.verdict for one, _ in both] == [one.verdict for _, one in both]
+        assert [one.probability for one, _ in both] == pytest.approx([one.probability for _, one in both])
 
 
 @pytest.mark.thorough

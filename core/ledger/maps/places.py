@@ -47,6 +47,7 @@ LONGEST_TEXT = 512
 
 _P, _S, _T = PLACES.c, SEQUENCES.c, TOKENS.c
 _COLUMNS = sealed_columns(PLACES)
+_LEAST = _COLUMNS.index("revision") + 1  # those behind it are of later versions than 1.0
 # A join might begin with the sequences of the map, and so read all its places.
 _NAME = select(_S.name).where(_S.map == _P.map, _S.code == _P.sequence).scalar_subquery()
 _WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
@@ -226,7 +227,7 @@ class StoredPlace:
 
 def _stored(values: Sequence[Any]) -> StoredPlace:
     *columns, seal, sequence = values
-    if not is_sound(columns, seal):
+    if not is_sound(columns, seal, _LEAST):
         raise DamagedRow(f"the row of place {columns[1]!r} does not match its checksum")
     return _from_columns(dict(zip(_COLUMNS, columns, strict=True)), sequence)
 
@@ -513,7 +514,7 @@ def unsound(connection: MapConnection) -> list[str]:
     """The ids of the places whose row does not match its checksum."""
     found, after = [], -1
     while page := connection.execute(_SEALS, after=after, most=_AT_ONCE):
-        found += [str(columns[1]) for *columns, seal in page if not is_sound(columns, seal)]
+        found += [str(columns[1]) for *columns, seal in page if not is_sound(columns, seal, _LEAST)]
         after = page[-1][0]
     return found
 
@@ -562,7 +563,7 @@ def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:
 
 def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
     """Store new places."""
-    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored)) for stored in new])
+    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored), _LEAST) for stored in new])
     tokens = [{"token": token, "row": one.row} for one in new for token in _tokens(one.place.metadata)]
     if tokens:
         connection.execute_many(_PUT_TOKEN, tokens)
@@ -570,7 +571,7 @@ def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
 
 def put(connection: MapConnection, stored: StoredPlace, before: StoredPlace) -> None:
     """Store a changed place in the place of its former state."""
-    values = sealed(_COLUMNS, _columns_of(stored))
+    values = sealed(_COLUMNS, _columns_of(stored), _LEAST)
     del values["number"]
     connection.execute(_UPDATE, which=stored.number, **{f"new_{name}": value for name, value in values.items()})
     if (stored.row, stored.place.metadata) != (before.row, before.place.metadata):

@@ -12,6 +12,18 @@ from core.ledger.statements import binary, integer, real, text
 
 METADATA = MetaData()
 
+LEVELS = {
+    "sqlite": [
+        f"ALTER TABLE places ADD COLUMN {one}"
+        for one in ("level TEXT", "accuracy_metres REAL", "accuracy_degrees REAL")
+    ],
+    "postgresql": [
+        'ALTER TABLE places ADD COLUMN level TEXT COLLATE "C", ADD COLUMN accuracy_metres FLOAT(53),'
+        " ADD COLUMN accuracy_degrees FLOAT(53)"
+    ],
+}
+"""The statements that bring tables of 1.0 up to date."""
+
 
 def _column(name: str, kind: Any, optional: bool = False, **more: Any) -> Column[Any]:
     return Column(name, kind, nullable=optional, **more)
@@ -80,8 +92,6 @@ PLACES = _table(
     _column("sequence", integer()),
     _column("ordinal", integer()),
     _column("camera", text(), optional=True),
-    _column("level", text(), optional=True),
-    *(_column(name, real(), optional=True) for name in ("accuracy_metres", "accuracy_degrees")),
     _column("track", integer(), optional=True),
     _column("station", integer(), optional=True),
     _column("pose_of", text(), optional=True),
@@ -97,6 +107,9 @@ PLACES = _table(
     _column("key", integer(), optional=True),  # of its entity in Milvus
     _column("revision", integer()),  # of the map's write that changed it last
     _column("seal", integer()),
+    # Behind all that tables of 1.0 have, so that the checksums of its rows hold.
+    _column("level", text(), optional=True),
+    *(_column(name, real(), optional=True) for name in ("accuracy_metres", "accuracy_degrees")),
     Unique("map", "id"), Unique("map", "row"), CheckConstraint("length(digest) = 32"),
     CheckConstraint("picture IN ('none', 'thumbnail', 'image')"), CheckConstraint("row >= 0"),
     clustered=True,

@@ -40,8 +40,10 @@ _MORE = [
         for (table, index), numbers in _STATISTICS.items()
     ),
 ]
-TABLES = Tables("map", 13, schema.METADATA, APPLICATION_ID, more={"sqlite": _MORE})
-SCHEMA = Schema(APPLICATION_ID, TABLES.version, TABLES.create("sqlite"))
+TABLES = Tables("map", 13, schema.METADATA, APPLICATION_ID, {12: schema.LEVELS}, {"sqlite": _MORE})
+SCHEMA = Schema(
+    APPLICATION_ID, TABLES.version, TABLES.create("sqlite"), lambda version: TABLES.migrate("sqlite", version)
+)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
