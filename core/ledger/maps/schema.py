@@ -8,11 +8,11 @@ from sqlalchemy import CheckConstraint, Column, ForeignKeyConstraint, Index, Met
 from sqlalchemy import UniqueConstraint as Unique
 from sqlalchemy.schema import SchemaItem
 
-from core.ledger.statements import binary, integer, real, text
+from core.ledger.statements import DialectName, binary, integer, real, text
 
 METADATA = MetaData()
 
-LEVELS = {
+LEVELS: dict[DialectName, list[str]] = {
     "sqlite": [
         f"ALTER TABLE places ADD COLUMN {one}"
         for one in ("level TEXT", "accuracy_metres REAL", "accuracy_degrees REAL")
