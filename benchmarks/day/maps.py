@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.day.pictures import another_look, file
 from benchmarks.day.walks import PlanarPose, WalkPair, pixels
-from placerec_client import Client, NewPlace
+from placerec_client import Client, NewPlace, parameters
 
 Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike", "cameras"]
 Size: TypeAlias = Literal["small", "large", "bare"]
@@ -74,7 +74,7 @@ def shown_by(place_id: str) -> int | None:
     return int(number) if number.isdigit() else None
 
 
-def _lens(width: int, height: int, share: float) -> dict[str, float]:
+def _lens(width: int, height: int, share: float) -> parameters.Intrinsics:
     """The intrinsics of a usual lens, of frames that are cut to a share of their sides."""
     sides = [side - 2 * round((1 - share) * side / 2) for side in (width, height)]
     focal = 0.75 * width

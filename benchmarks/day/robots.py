@@ -104,8 +104,10 @@ class Single:
 
     def ask(self, moment: Moment) -> RobotAnswer:
         """A query."""
-        camera: parameters.Query = {} if moment.camera is None else {"camera": moment.camera}
-        return _answer_of(self.client.maps[self.map_id].query(moment.picture, verify=self.verify, **camera))
+        options: parameters.Query = {"verify": self.verify}
+        if moment.camera is not None:
+            options["camera"] = moment.camera
+        return _answer_of(self.client.maps[self.map_id].query(moment.picture, **options))
 
 
 @dataclass

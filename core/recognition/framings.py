@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import UnfitIntrinsics
+from core.errors import UnfitIntrinsics, UnknownPlace
 from core.frames.framing import SAME_VIEW, Framing
 from core.frames.intrinsics import Intrinsics
 from core.geometry.detection import ScaledFrame, find_keypoints
@@ -203,8 +203,11 @@ def known_framing(map_: Map, query: Query, candidates: Candidates) -> Framing | 
 
 def _seen_by(ours: Intrinsics, theirs: Intrinsics) -> Framing:
     """The framing of one camera in the view of another."""
-    across, down = (ours.width / ours.fx, ours.height / ours.fy), (theirs.width / theirs.fx, theirs.height / theirs.fy)
-    return Framing(across[0] / down[0], across[1] / down[1])
+    across, down = (
+        (ours.width / ours.fx) / (theirs.width / theirs.fx),
+        (ours.height / ours.fy) / (theirs.height / theirs.fy),
+    )
+    return Framing(across, down)
 
 
 def _shape(map_: Map, query: Query, candidates: Candidates) -> Framing:
@@ -220,11 +223,15 @@ def _shape(map_: Map, query: Query, candidates: Candidates) -> Framing:
 
 
 def _may_be_narrower(map_: Map, encoder: Encoder, plain: FramedView) -> bool:
-    """Whether the best places fit the frame's cells better if these are shrunk."""
-    cells, share = shrunk(plain.query.encoding.local, encoder.grid, SHRUNK)
-    places = map_.snapshot().locals_at(plain.candidates.rows[:BESIDE])
+    """Whether the best places fit the frame's cells better if these are shrunk; not if one was deleted meanwhile."""
     stage = encoder.definition.agreement
-    assert stage is not None
+    try:
+        places = map_.snapshot().locals_at(plain.candidates.rows[:BESIDE])
+    except UnknownPlace:
+        return False
+    if stage is None:
+        return False
+    cells, share = shrunk(plain.query.encoding.local, encoder.grid, SHRUNK)
     fits = encoder.agreement(cells, places) / (stage.share * share)
     return bool(float(fits.max()) > plain.fit * (PROMISING + STEEPNESS * plain.fit))
 
