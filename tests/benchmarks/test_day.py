@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
+from benchmarks.day.odometry import FAULTS
 from benchmarks.day.robots import Asking, Mode, Verify
 from benchmarks.day.situations import SITUATIONS, Moment, moments
 from benchmarks.day.walks import WalkPair, drawn
@@ -37,14 +38,14 @@ class Day:
         assert self.server.stop() == 0
         self.server = Server(self._folder, reservation=port).wait()
 
-    def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> DriveOutcomes:
+    def drive(self, asking: Asking, situation: str, verify: Verify = "auto", seconds: float = SHORT) -> DriveOutcomes:
         """What becomes of a robot in a situation."""
         url, change = str(self.server.client.base_url), SITUATIONS[situation].map
         if change not in self._made:
             self._made.add(change)
             with Client(url) as client:
                 make_map(client, change, self._walk, change, "small", ())
-        way = moments(SITUATIONS[situation], self._walk, SHORT)
+        way = moments(SITUATIONS[situation], self._walk, seconds)
         return drive(url, change, Mode(asking, verify, "small"), way, self.restart)
 
 
@@ -101,6 +102,14 @@ def test_a_session_goes_on_after_a_restart(day: Day) -> None:
     told = day.drive("odometry", "restart")
     assert told.again == 0
     assert told.count("right") == len(told.outcomes)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("fault", FAULTS)
+def test_odometry_that_is_wrong_does_no_harm(day: Day, fault: str) -> None:
+    alone, led = (day.drive(asking, f"odometry {fault}", seconds=0.6) for asking in ("single", "odometry"))
+    assert led.count("right") >= 0.7 * alone.count("right"), "a few frames must show first that it is wrong"
+    assert led.outcomes[-6:] == alone.outcomes[-6:]
 
 
 @pytest.mark.thorough
