@@ -962,6 +962,7 @@ class FleetRobot(Model):
     pose: EstimatedPose | None = None
     recognized_at: datetime | None = None
     lost_since: datetime | None = None
+    contradiction_note: str | None = None
     verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]]
     answers: int
 
@@ -1787,7 +1788,9 @@ class SessionAnswer(Model):
     frames: int
     change: ChangeView | None = None
     earlier: EarlierBelief | None = None
-    motion: Known[Literal["first", "sequence", "speed-limit", "odometry"]]
+    motion: Known[Literal["first", "sequence", "speed-limit", "odometry", "contradicted"]]
+    contradiction: Known[Literal["frozen", "scale", "turned", "units", "inconsistent"]] | None = None
+    contradiction_note: str | None = None
     note: str | None = None
     view: Known[Literal["covered", "constant"]] | None = None
     repeated: bool = False
@@ -1819,6 +1822,9 @@ class SessionView(Model):
     key: str | None = None
     restored: bool
     frames_lost: int | None = None
+    contradiction: Known[Literal["frozen", "scale", "turned", "units", "inconsistent"]] | None = None
+    contradiction_note: str | None = None
+    teaches_nothing: str | None = None
 
 
 class SessionPage(Model):
@@ -1849,6 +1855,9 @@ class SessionReport(Model):
     key: str | None = None
     restored: bool
     frames_lost: int | None = None
+    contradiction: Known[Literal["frozen", "scale", "turned", "units", "inconsistent"]] | None = None
+    contradiction_note: str | None = None
+    teaches_nothing: str | None = None
     belief: BeliefView
 
 
