@@ -139,7 +139,7 @@ class Following:
 
     def ask(self, moment: Moment) -> RobotAnswer:
         """A frame of the session."""
-        x, y, heading = moment.wheels
+        x, y, heading = moment.stated
         odometry = Odometry(x, y, float(np.degrees(heading))) if self.odometry else None
         return _answer_of(self.session.send(moment.picture, odometry=odometry))
 

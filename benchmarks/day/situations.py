@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.day import pictures
 from benchmarks.day.maps import CUT, STOOD, Change
+from benchmarks.day.odometry import FAULTS, OdometryFault, StatedOdometry
 from benchmarks.day.pictures import UPRIGHT, Look, Random, another_look
 from benchmarks.day.walks import PlanarPose, WalkPair, pixels
 
@@ -44,6 +45,7 @@ class SteadyStretch:
     fate: of every second frame, of all if ``whole``.
     restart: the service is restarted before the first frame.
     again: the frames until the answer is right are counted from here.
+    odometry: what is wrong with it; None: nothing.
     """
 
     seconds: float
@@ -57,6 +59,7 @@ class SteadyStretch:
     whole: bool = True
     restart: bool = False
     again: bool = False
+    odometry: OdometryFault | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class Moment:
     second: when, from the beginning.
     at: where, in frames of the robot's walk.
     aside: metres beside the walk; the map shows nothing of it there.
-    pose: the true one, in the map's frame; ``wheels``: that of the odometry, in its own.
+    pose: the true one, in the map's frame; ``wheels``: that of the odometry, in its own; ``stated``: what it says.
     right: the references whose place the frame shows; none if it shows nothing of the map.
     again: it is the first after a disturbance.
     camera: that took it, if the map knows it.
@@ -96,6 +99,7 @@ class Moment:
     picture: bytes
     pose: PlanarPose
     wheels: PlanarPose
+    stated: PlanarPose
     right: frozenset[int]
     fate: Fate
     restart: bool
@@ -116,6 +120,7 @@ def moments(situation: Situation, walk: WalkPair, scale: float = 1.0) -> Iterato
     pose = walk.pose(walk.where(at))
     wheels = PlanarPose(0.0, 0.0, 0.0)
     before: tuple[float, float] | None = None
+    odometry = StatedOdometry()
     for stretch in situation.stretches:
         carried = stretch.start is not None
         if stretch.start is not None:
@@ -136,6 +141,7 @@ def moments(situation: Situation, walk: WalkPair, scale: float = 1.0) -> Iterato
                 shown,
                 pose,
                 wheels,
+                odometry.at(wheels, stretch.odometry),
                 frozenset() if out else walk.right(at),
                 stretch.fate if hit else "answered",
                 stretch.restart and number == 0,
@@ -238,6 +244,10 @@ SITUATIONS: dict[str, Situation] = {
         _throughout("cut to portrait", pictures.portrait),
         _throughout("shorter lens", pictures.wider),
         replace(_throughout("cut to 60 %, with intrinsics", pictures.cut(0.6, 0.6)), map="cameras", camera=CUT),
+        *(
+            Situation(f"odometry {name}", (SteadyStretch(12), SteadyStretch(36, odometry=fault), SteadyStretch(12)))
+            for name, fault in FAULTS.items()
+        ),
         Situation("5 frames a second", (SteadyStretch(12),), rate=5.0),
         Situation("60 frames a second", (SteadyStretch(2),), rate=60.0),
     )

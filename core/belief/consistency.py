@@ -275,7 +275,7 @@ def _against(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> NDArray[np.float
     step = graph.spacing or 1.0
     longest = float(np.abs(legs).max()) / (FARTHER * float(np.abs(way).max() + _deviation(graph)))
     along, across = np.outer(legs, legs.conj()) / max(1.0, longest) ** 2, np.outer(number, number)
-    explained = [noise + drift, noise + drift + vague]
+    explained: list[NDArray[np.inexact]] = [noise + drift, noise + drift + vague]
     explained += [noise + drift + spread**2 * along for spread in SPREADS]
     explained += [noise] + [noise + (spread * step) ** 2 * across for spread in SPREADS]
     rest = np.stack([way - legs] * 2 + [way] * (len(explained) - 2))

@@ -274,9 +274,8 @@ class Run:
         if self.sight != "constant":  # a view that stays shows what it has shown
             self._sighting = seen.sighting
         step = self._trusted(step, seen, share, change, pose)
-        guided = by_poses(self.graph, step)
-        self._guided = guided and (step.odometry is None or step.odometry.variance <= (0.5 * self.graph.spacing) ** 2)
-        stands = self.sight == "constant" and (step.odometry is None or not guided)
+        self._guided = by_poses(self.graph, step)
+        stands = self.sight == "constant" and (step.odometry is None or not self._guided)
         fitting = self._filter(seen, step, share, stands, change)
         if self.sight is None:
             expected = self.unlike > 0 or self.unrecognized == 0

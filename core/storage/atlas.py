@@ -37,7 +37,9 @@ from core.storage.verification import inspect_folder
 
 log = logging.getLogger(__name__)
 
-FORMAT = "placerec data 1\n"
+FORMAT = "placerec data 2\n"
+EARLIER = ("placerec data 1\n",)
+"""Of directories whose maps are brought up to date as they are opened, which earlier versions must not open any more."""
 _MAPS = "maps"
 # No map id begins with a dot, so these folders are never mistaken for maps.
 _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"
@@ -97,6 +99,9 @@ class Atlas:
             write_file(path, FORMAT.encode())
             return
         if found == FORMAT:
+            return
+        if found in EARLIER:
+            write_file(path, FORMAT.encode())
             return
         if found.startswith("placerec data "):
             raise DataDirectoryTooNew(

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
 from benchmarks.day.rigs import KINDS, RigAnswer, answers, apart
+from benchmarks.day.odometry import FAULTS
 from benchmarks.day.robots import Asking, Mode, Verify
 from benchmarks.day.situations import SITUATIONS, Moment, moments
 from benchmarks.day.walks import WalkPair, drawn
@@ -49,12 +50,12 @@ class Day:
             self._make(client, "plain")
             return list(answers(client, "plain", self._walk, kind, "auto", numbers))
 
-    def drive(self, asking: Asking, situation: str, verify: Verify = "auto") -> DriveOutcomes:
+    def drive(self, asking: Asking, situation: str, verify: Verify = "auto", seconds: float = SHORT) -> DriveOutcomes:
         """What becomes of a robot in a situation."""
         url, change = str(self.server.client.base_url), SITUATIONS[situation].map
         with Client(url) as client:
             self._make(client, change)
-        way = moments(SITUATIONS[situation], self._walk, SHORT)
+        way = moments(SITUATIONS[situation], self._walk, seconds)
         return drive(url, change, Mode(asking, verify, "small"), way, self.restart)
 
 
@@ -129,6 +130,14 @@ def test_a_second_camera_takes_nothing_away_and_hides_no_contradiction(day: Day,
         both = [(answer, alone[0]) for _, answer, alone in found]
         assert [one.verdict for one, _ in both] == [one.verdict for _, one in both]
         assert [one.probability for one, _ in both] == pytest.approx([one.probability for _, one in both])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("fault", FAULTS)
+def test_odometry_that_is_wrong_does_no_harm(day: Day, fault: str) -> None:
+    alone, led = (day.drive(asking, f"odometry {fault}", seconds=0.6) for asking in ("single", "odometry"))
+    assert led.count("right") >= 0.7 * alone.count("right"), "a few frames must show first that it is wrong"
+    assert led.outcomes[-6:] == alone.outcomes[-6:]
 
 
 @pytest.mark.thorough

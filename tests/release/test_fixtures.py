@@ -144,8 +144,8 @@ def test_what_an_interface_comes_to_demand_is_found() -> None:
 def test_a_changed_form_of_a_file_is_a_changed_form_of_the_directory() -> None:
     """So that every older version refuses the whole of it at once, instead of putting files aside that it cannot read.
 
-    A version that changes the schema of a file gives the directory another FORMAT, which it writes when it has brought
-    all files up to date.
+    A version that changes the schema of a file gives the directory another FORMAT, which it writes before it brings
+    the first file up to date.
     """
     for release in RELEASES:
         if about(release)["format"] == FORMAT:
@@ -168,10 +168,10 @@ def refusal(data: Path, folder: Path, key: str) -> str:
 @pytest.mark.thorough
 def test_the_data_of_a_later_version_is_refused_and_left_as_it_is(release: Path, tmp_path: Path) -> None:
     data = unpacked(release, tmp_path)
-    (data / "FORMAT").write_text("placerec data 2\n")
+    (data / "FORMAT").write_text("placerec data 3\n")
     before = contents(data)
     said = refusal(data, tmp_path / "service", about(release)["key"])
-    assert "was written by a later version of placerec (placerec data 2)" in said and "Traceback" not in said
+    assert "was written by a later version of placerec (placerec data 3)" in said and "Traceback" not in said
     assert contents(data) == before
 
 
@@ -181,12 +181,11 @@ def test_a_file_of_a_later_version_is_refused_and_left_as_it_is(file: str, tmp_p
     release = RELEASES[-1]
     data = unpacked(release, tmp_path)
     with closing(sqlite3.connect(data / file)) as connection:
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        connection.execute(f"PRAGMA user_version = {version + 1}")
+        connection.execute("PRAGMA user_version = 99")
         connection.execute("CREATE TABLE later (one INTEGER)")
     kept = (data / file).read_bytes()
     said = refusal(data, tmp_path / "service", about(release)["key"])
-    assert f"was written by a later version of placerec (schema {version + 1}, this one knows {version})" in said
+    assert "was written by a later version of placerec (schema 99, this one knows" in said
     assert (data / file).read_bytes() == kept and not list(data.rglob("*.damaged-*"))
 
 

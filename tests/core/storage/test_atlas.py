@@ -180,7 +180,10 @@ def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
 
 def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
     Atlas(directory).close()
-    (directory / "FORMAT").write_text("placerec data 2\n")
+    (directory / "FORMAT").write_text("placerec data 1\n")
+    Atlas(directory).close()
+    assert (directory / "FORMAT").read_text() == "placerec data 2\n"
+    (directory / "FORMAT").write_text("placerec data 3\n")
     with pytest.raises(DataDirectoryTooNew):
         Atlas(directory)
     (directory / "FORMAT").write_text("something else")

@@ -16,6 +16,7 @@ import pytest
 from core.frames.images import decode
 from service.access.keys import Keys
 from tests.service.commands.conftest import Placerec, placerec
+from tests.service.events.listening import listening
 from tests.service.map_jobs import finished
 from tests.service.scenes import encoded
 from tests.service.server import Server, typed
@@ -108,6 +109,43 @@ def lessons(server: Server, map_id: str) -> list[dict[str, Any]]:
 def proposals(server: Server, map_id: str) -> list[dict[str, Any]]:
     page = server.client.get(f"/v1/maps/{map_id}/review", params={"limit": 100}).json()
     return [frame for frame in page["items"] if "proposal" in frame["answer"]]
+
+
+def test_a_robot_with_wrong_odometry_is_told_so_and_teaches_nothing_by_it(running: Server) -> None:
+    client, path = running.client, "/v1/maps/hall/sessions"
+    session, answers = client.post(path, json={}).json()["id"], []
+    with listening(running, "hall") as ear:
+        for data in frames_of("query")[:25]:
+            odometry = {"odometry_x": "0", "odometry_y": "0", "odometry_heading": "0"}  # it stands still
+            sent = client.post(f"{path}/{session}/frames", params=odometry, content=data, headers=typed(data))
+            answers.append(sent.json())
+        events = [one.data for one in ear.some(len(answers), "session")]
+    last = answers[-1]
+    assert answers[1]["motion"] == "odometry" and answers[1]["contradiction"] is None
+    assert last["motion"] == "contradicted" and last["contradiction"] == "frozen"
+    assert last["contradiction_note"].startswith("odometry stands still while frames show")
+    assert last["verdict"] == "recognized" and last["place"]["id"] in ("p22", "p23", "p24", "p25")
+    for told in (client.get(f"{path}/{session}").json(), *client.get(path).json()["items"], events[-1]):
+        assert told["contradiction"] == "frozen" and told["contradiction_note"] == last["contradiction_note"]
+    report = client.get(f"{path}/{session}").json()
+    assert "teaches its map nothing: its frames have no odometry_x" in report["teaches_nothing"]
+    (robot,) = [one for one in client.get("/v1/fleet").json()["robots"] if one["session"] == session]
+    assert robot["contradiction_note"] == last["contradiction_note"]
+    assert 'placerec_contradicted_frames_total{kind="frozen"}' in client.get("/metrics").text
+    client.delete(f"{path}/{session}")
+    result = lessons(running, "hall")[0]
+    assert (result["proposals"], result["contradiction"]) == (0, "no odometry")
+
+
+def test_a_run_without_odometry_says_that_it_teaches_nothing_for_that_reason(running: Server) -> None:
+    client, path = running.client, "/v1/maps/hall/sessions"
+    session = client.post(path, json={}).json()["id"]
+    assert client.get(f"{path}/{session}").json()["teaches_nothing"] is None, "there is no frame yet"
+    for data in frames_of("query")[:8]:
+        client.post(f"{path}/{session}/frames", content=data, headers=typed(data))
+    assert "no odometry_x" in client.get(f"{path}/{session}").json()["teaches_nothing"]
+    client.delete(f"{path}/{session}")
+    assert lessons(running, "hall")[0]["contradiction"] == "no odometry"
 
 
 def test_a_run_teaches_what_it_saw_in_the_dark(running: Server, placerec: Placerec) -> None:

@@ -53,7 +53,7 @@ def test_a_later_file_is_refused_and_not_touched(connection: sqlite3.Connection)
     assert version(connection) == SCHEMA.version + 1
 
 
-@pytest.mark.parametrize("older", range(1, SCHEMA.version))
+@pytest.mark.parametrize("older", range(1, 12))
 def test_an_older_file_is_refused_and_not_touched(connection: sqlite3.Connection, older: int) -> None:
     prepare(connection, create=True)
     connection.execute("ALTER TABLE segments DROP COLUMN removed")
@@ -66,6 +66,18 @@ def test_an_older_file_is_refused_and_not_touched(connection: sqlite3.Connection
         "is left as it is: enrol again in a new data directory, or go on with the version that wrote it."
     )
     assert (version(connection), list(connection.iterdump())) == (older, before)
+
+
+def test_a_file_of_1_0_gets_what_it_lacks(connection: sqlite3.Connection) -> None:
+    prepare(connection, create=True)
+    for column in ("level", "accuracy_metres", "accuracy_degrees"):
+        connection.execute(f"ALTER TABLE places DROP COLUMN {column}")
+    connection.execute("PRAGMA user_version = 12")
+    with pytest.raises(Damage):
+        check_schema(connection)
+    prepare(connection)
+    assert version(connection) == 13
+    check_schema(connection)
 
 
 def test_what_is_not_ours_is_refused(connection: sqlite3.Connection) -> None:
