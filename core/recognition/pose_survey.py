@@ -50,7 +50,7 @@ USUAL, USUAL_DEVIATION = 0.1, 1.5
 """Metres that are usual, and the deviation of their logarithm: what few samples leave open."""
 LEAST_KNOWN = 0.12
 """Metres from which on an estimate is used; with less, pictures hardly tell it from nothing."""
-TAIL = 2.5
+TAIL = 4.0
 """Degrees of freedom of Student's t, by which misses are judged: some are of wrong matches."""
 LEAST_PAIRS, AGREED, WITHIN = 5, 0.7, 30.0
 """Directions that have to be known, and the share of them within so many degrees of their median for a turn."""
@@ -58,7 +58,7 @@ TURNED = 45.0
 """Degrees from which on headings are turned: less may be the camera's mounting, or noise."""
 CLEAR = np.radians(20)
 """Deviation up to which the direction of a shift is known."""
-LOOSE, FAR = np.radians(5), 1.0
+LOOSE, FAR = np.radians(3.5), 1.2
 """Deviation by which directions of shifts are off besides, and how far pairs are whose bearings tell the errors of
 positions, in medians: from far away shifts are often wrong, as on kitti_short from 14 m on."""
 SATELLITES = 3.0
