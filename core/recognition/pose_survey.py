@@ -131,7 +131,7 @@ class _Sample(NamedTuple):
 
 class _Surveyed(NamedTuple):
     state: object
-    count: int
+    places: int
     rows: NDArray[np.int64]
     poses: Array
     survey: PoseSurvey
@@ -157,7 +157,7 @@ def pose_survey(map_: Map, again: bool = False) -> PoseSurvey:
         if known.state is state:
             return known.survey
         snapshot = map_.snapshot()
-        same = known.count / GROWN < len(snapshot) < known.count * GROWN or len(snapshot) == known.count
+        same = known.places / GROWN < len(snapshot) < known.places * GROWN or len(snapshot) == known.places
         if same and np.array_equal(_poses(snapshot.whereabouts_at(known.rows)), known.poses, equal_nan=True):
             with _lock:
                 _surveys[map_] = known._replace(state=state)

@@ -26,19 +26,22 @@ Frame = tuple[Pixels, Encoding, Keypoints]
 PLACES = 11
 
 
-def views(encoder: Encoder, aside: float) -> tuple[list[Frame], Array]:
+def walk(aside: float) -> tuple[list[Pixels], Array]:
     """Frames every 2 m along a hall, and their poses, of a camera that looks so many degrees to the left of the way."""
     random = np.random.default_rng(7)
-    hall = Hall(
-        40, 9, 5, [np.hstack([scene(20 * side + n) for n in range(1 + 5 * (1 < side < 4))]) for side in range(6)]
-    )
-    network, frames, poses = load_xfeat(), [], []
+    sides = [np.hstack([scene(20 * side + n) for n in range(6 if 1 < side < 4 else 1)]) for side in range(6)]
+    hall, pictures, poses = Hall(40, 9, 5, sides), list[Pixels](), []
     for x in 4 + 2.0 * np.arange(PLACES):
         pose = np.array([x, random.normal(0, 0.1), aside + random.normal(0, 1)])
-        picture = hall.seen(np.array([*pose[:2], 2.5]), rotation(float(pose[2])))
-        frames.append((picture, encoder.encode(picture), find_keypoints(network, picture)))
+        pictures.append(hall.seen(np.array([*pose[:2], 2.5]), rotation(float(pose[2]))))
         poses.append(pose)
-    return frames, np.array(poses)
+    return pictures, np.array(poses)
+
+
+def views(encoder: Encoder, aside: float) -> tuple[list[Frame], Array]:
+    """The frames of such a walk as they are enrolled."""
+    network, (pictures, poses) = load_xfeat(), walk(aside)
+    return [(one, encoder.encode(one), find_keypoints(network, one)) for one in pictures], poses
 
 
 @pytest.fixture(scope="module")
