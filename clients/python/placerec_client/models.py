@@ -224,10 +224,9 @@ class EstimatedPose(Model):
 
 class Pose(Model):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``z`` is in metres: in
-    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. There it is a
-    statement that is handed on; distances on the Earth are those along the ground. ``heading`` is in degrees:
-    counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is normalized to
-    [0, 360).
+    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. It tells storeys
+    apart; distances are those along the ground. ``heading`` is in degrees: counter-clockwise from +x beside x and y,
+    clockwise from north beside latitude and longitude. It is normalized to [0, 360).
     """
 
     x: float | None = None
@@ -236,6 +235,15 @@ class Pose(Model):
     latitude: float | None = None
     longitude: float | None = None
     heading: float | None = None
+
+
+class PoseAccuracy(Model):
+    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
+    degrees: of the heading; None: not stated.
+    """
+
+    metres: float
+    degrees: float | None = None
 
 
 class PlaceView(Model):
@@ -247,6 +255,8 @@ class PlaceView(Model):
     timestamp: datetime | None = None
     sequence: str | None = None
     camera: str | None = None
+    level: str | None = None
+    pose_accuracy: PoseAccuracy | None = None
     metadata: dict[str, Any]
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
@@ -869,6 +879,8 @@ class EnrolledPlace(Model):
     timestamp: datetime | None = None
     sequence: str | None = None
     camera: str | None = None
+    level: str | None = None
+    pose_accuracy: PoseAccuracy | None = None
     metadata: dict[str, Any]
     regions: int
     picture: Known[Literal["none", "thumbnail", "image"]]
@@ -1308,6 +1320,17 @@ class MapAnswer(Model):
     problem: Problem | None = None
 
 
+class PoseHealth(Model):
+    """How exact the poses of one traverse are, by what pictures of places beside one another say of them."""
+
+    sequence: str
+    metres: float | None = None
+    degrees: float | None = None
+    turned: float
+    pairs: int
+    remark: str | None = None
+
+
 class SharedRouteView(Model):
     """Two traverses that seem to follow one route, which neither poses nor an alignment say: align them."""
 
@@ -1408,6 +1431,7 @@ class MapHealth(Model):
     retraverse_count: int
     trends: TrendsView
     shared_routes: list[SharedRouteView]
+    poses: list[PoseHealth]
 
 
 class MapMatch(Model):
@@ -1457,7 +1481,9 @@ class MapView(Model):
     description: str
     keep: Known[Literal["none", "thumbnail", "image"]]
     same_place_radius: float
+    same_place_height: float
     same_place_frames: int
+    pose_accuracy: PoseAccuracy | None = None
     verification: bool
     review: ReviewSetting | None = None
     learning: LearningSetting

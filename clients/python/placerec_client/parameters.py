@@ -40,6 +40,11 @@ class Query(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
+    filter.
+    """
+
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
 
@@ -51,6 +56,9 @@ class Query(TypedDict, total=False):
 
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    levels: str | None
+    """The place is on one of these storeys: names separated by commas, or a JSON array."""
 
     after: datetime | str | None
     """The place was enrolled with this timestamp or later."""
@@ -64,13 +72,13 @@ class Query(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
-    separated by commas.
+    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
+    places; separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
-    are multiplied by at least 1 - prior_trust.
+    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
+    contradicts them are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -131,6 +139,11 @@ class QueryBatch(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
+    filter.
+    """
+
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
 
@@ -142,6 +155,9 @@ class QueryBatch(TypedDict, total=False):
 
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    levels: str | None
+    """The place is on one of these storeys: names separated by commas, or a JSON array."""
 
     after: datetime | str | None
     """The place was enrolled with this timestamp or later."""
@@ -155,13 +171,13 @@ class QueryBatch(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
-    separated by commas.
+    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
+    places; separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
-    are multiplied by at least 1 - prior_trust.
+    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
+    contradicts them are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -228,6 +244,15 @@ class EnrolPlace(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which the frame was taken."""
+
+    accuracy_metres: float | None
+    """Standard deviation of each coordinate."""
+
+    accuracy_degrees: float | None
+    """Standard deviation of its heading; with accuracy_metres."""
+
     metadata: str | Mapping[str, Any] | None
     """A JSON object."""
 
@@ -246,6 +271,9 @@ class ListPlaces(TypedDict, total=False):
 
     camera: str | None
     """Only places that this camera took."""
+
+    level: str | int | None
+    """Only places on this storey."""
 
     after: datetime | str | None
     """Only places with this timestamp or a later one."""
@@ -427,6 +455,17 @@ class QueryOrEnrol(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
+    filter.
+    """
+
+    accuracy_metres: float | None
+    """Standard deviation of each coordinate."""
+
+    accuracy_degrees: float | None
+    """Standard deviation of its heading; with accuracy_metres."""
+
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
 
@@ -438,6 +477,9 @@ class QueryOrEnrol(TypedDict, total=False):
 
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    levels: str | None
+    """The place is on one of these storeys: names separated by commas, or a JSON array."""
 
     after: datetime | str | None
     """The place was enrolled with this timestamp or later."""
@@ -451,13 +493,13 @@ class QueryOrEnrol(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
-    separated by commas.
+    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
+    places; separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
-    are multiplied by at least 1 - prior_trust.
+    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
+    contradicts them are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -513,6 +555,11 @@ class QueryMaps(TypedDict, total=False):
     camera: str | None
     """The camera of the map that took the frame; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which the frame was taken: a prior, as places on others are less probable then; `levels` is a
+    filter.
+    """
+
     radius: float | None
     """Metres: the place lies within this distance of the given position."""
 
@@ -524,6 +571,9 @@ class QueryMaps(TypedDict, total=False):
 
     sequences: str | Sequence[str] | None
     """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    levels: str | None
+    """The place is on one of these storeys: names separated by commas, or a JSON array."""
 
     after: datetime | str | None
     """The place was enrolled with this timestamp or later."""
@@ -537,13 +587,13 @@ class QueryMaps(TypedDict, total=False):
     """
 
     soft: str | Sequence[str] | None
-    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
-    separated by commas.
+    """Which of position, bbox, heading, sequences, levels, time, where are not filters but priors, which weigh the
+    places; separated by commas.
     """
 
     prior_trust: float | None
-    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
-    are multiplied by at least 1 - prior_trust.
+    """The probability that level and the soft parameters are right; 0.9 if left out. The odds of a place that
+    contradicts them are multiplied by at least 1 - prior_trust.
     """
 
     exclude_frames: int | None
@@ -630,6 +680,16 @@ class SendFrame(TypedDict, total=False):
 
     odometry_origin: str | None
     """A name for where odometry began. If the frame before had another one, the motion between the two is not known."""
+
+    level: str | int | None
+    """The storey on which the robot is, as far as it knows: a prior, which holds until another one is stated. Where
+    another is, the robot has come there by a lift.
+    """
+
+    height: float | None
+    """Metres, by a barometer for example: where it leaps by more than the map's same_place_height, the robot is on
+    another storey; nothing else of it counts.
+    """
 
     k: int
     """How many matches to list."""
@@ -828,10 +888,20 @@ class NewMap(TypedDict, total=False):
     """The picture that is stored of each frame. A change applies to frames enrolled from then on."""
 
     same_place_radius: float
-    """Places within this distance in metres are the same place."""
+    """Places within this distance in metres along the ground are the same place."""
+
+    same_place_height: float
+    """Places whose heights differ by more metres are on different storeys, and never the same place; where both have
+    a level, that says it instead.
+    """
 
     same_place_frames: int
     """Without poses: places this many frames apart in their sequence are the same place."""
+
+    pose_accuracy: PoseAccuracy | None
+    """How exact the poses of places are that do not state it themselves; null: pictures of the map's places say it
+    as far as they can.
+    """
 
     verification: bool
     """Whether keypoints of each frame are stored, by which answers are verified. A change applies to frames enrolled
@@ -868,7 +938,12 @@ class MapChanges(TypedDict, total=False):
 
     same_place_radius: float | None
 
+    same_place_height: float | None
+
     same_place_frames: int | None
+
+    pose_accuracy: PoseAccuracy | None
+    """null: nobody states it."""
 
     verification: bool | None
 
@@ -895,6 +970,11 @@ class PlaceChanges(TypedDict, total=False):
     timestamp: datetime | str | None
 
     sequence: str | None
+
+    level: str | int | None
+    """Null: the one that the metadata states, if any."""
+
+    pose_accuracy: PoseAccuracy | None
 
     metadata: Mapping[str, Any] | None
 
@@ -1146,6 +1226,12 @@ class RecordingOrder(TypedDict, total=False):
     camera: str | None
     """Of the map; its mask is applied."""
 
+    level: str | int | None
+    """The storey on which its frames were taken."""
+
+    pose_accuracy: PoseAccuracy | None
+    """How exact its poses are."""
+
     topic: str | None
 
     pose_topic: str | None
@@ -1267,6 +1353,9 @@ class PlaceConditions(TypedDict):
     camera: NotRequired[str | None]
     """This camera took its frame."""
 
+    level: NotRequired[str | int | None]
+    """It is on this storey."""
+
     after: NotRequired[datetime | str | None]
     """It has this timestamp or a later one."""
 
@@ -1306,6 +1395,15 @@ class NewPlace(TypedDict):
 
     camera: NotRequired[str | None]
     """The camera of the map that took the frame; its mask is applied."""
+
+    level: NotRequired[str | int | None]
+    """The storey on which the frame was taken."""
+
+    accuracy_metres: NotRequired[float | None]
+    """Standard deviation of each coordinate."""
+
+    accuracy_degrees: NotRequired[float | None]
+    """Standard deviation of its heading; with accuracy_metres."""
 
     id: str
     """Id of the place."""
@@ -1424,10 +1522,9 @@ class CalibrationChanges(TypedDict):
 
 class Pose(TypedDict):
     """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``z`` is in metres: in
-    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. There it is a
-    statement that is handed on; distances on the Earth are those along the ground. ``heading`` is in degrees:
-    counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is normalized to
-    [0, 360).
+    the map's frame beside x and y, above the ellipsoid of WGS 84 beside latitude and longitude. It tells storeys
+    apart; distances are those along the ground. ``heading`` is in degrees: counter-clockwise from +x beside x and y,
+    clockwise from north beside latitude and longitude. It is normalized to [0, 360).
     """
 
     x: NotRequired[float | None]
@@ -1476,6 +1573,18 @@ class LearningChanges(TypedDict):
 
     rejected_ground: NotRequired[Sequence[RejectedGround] | None]
     """Those that stay rejected; null: none."""
+
+
+class PoseAccuracy(TypedDict):
+    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
+    degrees: of the heading; None: not stated.
+    """
+
+    metres: float
+    """Of each coordinate."""
+
+    degrees: NotRequired[float | None]
+    """Of the heading; null: not stated."""
 
 
 class ReviewChanges(TypedDict):
