@@ -272,7 +272,7 @@ def level_in(metadata: Mapping[str, Any]) -> str | None:
 def level_code(level: str | None) -> int:
     """The code of a level in :class:`Whereabouts`, the same in all maps: 31 bits of its CRC-32; NO_LEVEL for None.
 
-    Of a hundred levels two have one code with a probability of 2e-6; these two would then be compared by their heights.
+    Of a hundred levels two have one code with a probability of 2e-6, and would be one level then.
     """
     return NO_LEVEL if level is None else zlib.crc32(level.encode()) >> 1
 
@@ -474,8 +474,9 @@ class Whereabouts:
             one, other: integers that broadcast against each other.
             height: metres within which two places may be on one storey.
         """
-        ours, theirs = self.level[one], self.level[other]
-        apart = np.abs(self.height[one] - self.height[other]) > height
+        here, there = np.asarray(one), np.asarray(other)
+        ours, theirs = self.level[here], self.level[there]
+        apart = np.abs(np.asarray(self.height[here]) - self.height[there]) > height
         return np.where((ours != NO_LEVEL) & (theirs != NO_LEVEL), ours != theirs, apart)
 
     def on_level_of(self, row: int, height: float) -> Whereabouts:

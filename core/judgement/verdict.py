@@ -30,7 +30,7 @@ probability (``geometry.py``), which takes the threshold's place, and the lead i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -61,6 +61,13 @@ MOST_RIVALS = 8
 CLEAR_STOREY = 2 / 3
 """A match is recognized if it is twice as probable as any place on another storey that the query may as well show, as
 in a session.  Without a prior none is, and one with a trust of 0.5 is enough; it was chosen on nothing else."""
+
+HALFWAY = 0.5
+"""Of the lead that a query has over a twin which shows the best match alone: under this share it may show either.  It
+is the middle.  On corridor as two storeys, the upper one copies with noise, 0.25 and 0.75 change nothing for frames of
+the other traverse, or of this one in other light (1 of 37 and 0 on the wrong storey); of further copies with noise 12,
+4 and 1 of 37 are recognized with 0.25, 0.5 and 0.75, all rightly.  Cut into three storeys that differ, corridor has the
+same verdicts with each of them as without storeys."""
 
 MOSTLY_IMAGINED = 0.5
 """Imagined share of the background above which a map counts as one of few places."""
@@ -280,6 +287,7 @@ def judge(
     likeness: Likeness | None = None,
     geometry: Geometry | None = None,
     prior: Values | None = None,
+    alone: NDArray[np.float32] | None = None,
 ) -> Judgement:
     """Judge one query.
 
@@ -295,6 +303,7 @@ def judge(
             None: which rivals show the same place is not known, and they explain nothing.
         geometry: the results of verification for the n places, in the same order; None: none was verified.
         prior: float64 [n], the log weights of the places; None: there is no prior.
+        alone: float32 [n], the scores without it.
 
     Returns:
         ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
@@ -316,7 +325,7 @@ def judge(
     if not stands_out(decision, lead, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
-    twins = ranking.twins(likeness)
+    twins = (ranking if alone is None else replace(ranking, scores=alone)).twins(likeness)
     left = ranking.share_beside(twins, prior)
     if verdict == "recognized" and (lead < calibration.margin or left < CLEAR_STOREY):
         heads = ranking.heads()
@@ -409,15 +418,25 @@ class _Ranking:
     def twins(self, likeness: Likeness | None) -> Positions:
         """The places on other storeys that the query may as well show, best first; int64 [k].
 
-        A twin scores nearly as well, or is more like the best match than the query is: what tells the two apart is not
-        what the query shows then, whatever the lead.
+        A twin stands out beside the best match as well, and the lead over it is small: under the margin; or less than
+        half of s · (1 - likeness), the lead of a query that shares with the twin what the best match shares with it; or
+        of any size where the two are more alike than the query is like the best match, for then it differs from both by
+        more than they do from each other.
         """
         heads = self.heads()
         heads = heads[self.whereabouts.on_other_levels(heads, 0, self.neighborhood.height)]
-        alike = self.leads(heads) < self.calibration.margin
-        if len(heads) and likeness is not None:
-            alike |= likeness(heads) >= self.scores[0]
-        return heads[alike]
+        if not len(heads):
+            return heads
+        leads = self.leads(heads)
+        small = leads < self.calibration.margin
+        if likeness is not None:
+            alike, score = likeness(heads).astype(np.float64), float(self.scores[0])
+            small |= (leads < HALFWAY * score * (1 - alike)) | (alike >= score)
+        behind = self.background(
+            np.logical_or.reduce([self.whereabouts.near(head, self.neighborhood) for head in heads.tolist()])
+        )
+        found = np.array([behind.decision(float(self.scores[head])) for head in heads.tolist()])
+        return heads[small & (found >= self.calibration.threshold)]
 
     def share_beside(self, twins: Positions, prior: Values | None) -> float:
         """The probability that is left to the best match by its likeliest twin; only a prior tells it from them."""

@@ -301,6 +301,7 @@ def judgement_of(map_: Map, encoder: Encoder, candidates: Candidates) -> Judgeme
         lambda positions: likeness(map_, encoder, candidates, positions),
         candidates.geometry,
         candidates.weights,
+        candidates.scores,
     )
 
 

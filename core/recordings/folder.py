@@ -27,7 +27,7 @@ from core.recordings.pose_names import NamedPose, named_pose
 FILE_NAME = "places.csv"
 POSE = ("x", "y", "z", "heading", "latitude", "longitude")
 ACCURACY = ("accuracy_metres", "accuracy_degrees")
-COLUMNS = ("file", "id", *POSE, "timestamp", *ACCURACY, *LEVEL_KEYS)
+COLUMNS = ("file", "id", *POSE, "timestamp", "level", *ACCURACY)
 MOST_NAMED = 3
 """Files whose names say no pose that one remark names."""
 
@@ -250,8 +250,8 @@ def _listed_frames(path: Path, prefix: str) -> Iterator[_Found]:
 
 
 def _check_columns(path: Path, columns: list[str]) -> None:
-    unknown = [name for name in columns if name not in COLUMNS]
     named = ["level" if name in LEVEL_KEYS else name for name in columns]
+    unknown = [name for name in named if name not in COLUMNS]
     if unknown or "file" not in columns or len(set(named)) < len(columns):
         wrong = f"an unknown column {unknown[0]!r}" if unknown else "columns missing or given twice"
         raise InvalidTraverse(

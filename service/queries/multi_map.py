@@ -216,7 +216,7 @@ def _same_place(a: MapReport, b: MapReport) -> bool:
     assert a.answer is not None and b.answer is not None
     assert a.map_ is not None and b.map_ is not None
     both = Whereabouts.joined(report.answer.candidates.whereabouts.take([0]) for report in (a, b) if report.answer)
-    reach = max((neighborhood_of(report.map_) for report in (a, b)), key=lambda one: one.radius)
+    reach = max((neighborhood_of(map_) for map_ in (a.map_, b.map_)), key=lambda one: one.radius)
     return bool((both.kind == GEOGRAPHIC).all() and both.near(0, reach)[1])
 
 

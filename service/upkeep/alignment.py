@@ -249,7 +249,7 @@ def _change(
     for name in ("sequence", "ordinal"):
         still &= getattr(snapshot.whereabouts, name)[: then.rows] == getattr(before, name)
     pairs = _pairs(found, still)
-    pairs = pairs[~before.on_other_levels(*pairs.T, neighborhood_of(map_).height)]
+    pairs = pairs[~before.on_other_levels(pairs[:, 0], pairs[:, 1], neighborhood_of(map_).height)]
     if not len(pairs) and not forget:
         return Correspondence()
     rows = np.flatnonzero(snapshot.alive)

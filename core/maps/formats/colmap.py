@@ -83,10 +83,11 @@ def write_colmap(frames: ArchivedFrames, folder: Path) -> ColmapFolder:
 def _row(frame: ArchivedFrame, name: str) -> list[object]:
     """The row of places.csv."""
     pose = frame.place.pose
-    told = {"file": name, "id": frame.place.id}
+    told, exact = {"file": name, "id": frame.place.id, "level": frame.place.level or ""}, frame.place.pose_accuracy
     posed = {} if pose is None else pose.model_dump(exclude_none=True)
     taken = {} if frame.place.timestamp is None else {"timestamp": frame.place.timestamp.isoformat()}
-    fields: dict[str, object] = {**told, **posed, **taken}
+    accuracy = {} if exact is None else {f"accuracy_{name}": "" if value is None else value for name, value in exact}
+    fields: dict[str, object] = {**told, **posed, **taken, **accuracy}
     return [fields.get(column, "") for column in COLUMNS]
 
 

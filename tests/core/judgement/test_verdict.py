@@ -74,14 +74,22 @@ STOREYS = Whereabouts(
     height=np.array([0.0, 4.0] + [0.0] * 60),
 )
 """Two places one above the other, and others."""
+PRIOR = np.log(np.where(STOREYS.height, 0.1, 1.0))
 
 
 @pytest.mark.parametrize(
     ("lead", "alike", "verdict"),
-    [(0.005, 0.2, "ambiguous"), (0.1, 0.8, "ambiguous"), (0.1, 0.4, "recognized"), (0.1, None, "recognized")],
+    [
+        (0.005, 0.2, "ambiguous"),
+        (0.1, 0.8, "ambiguous"),
+        (0.2, 0.8, "ambiguous"),  # the storeys are more alike than the query is like either
+        (0.1, 0.4, "ambiguous"),  # less than half of 0.5 · (1 - 0.4)
+        (0.2, 0.4, "recognized"),
+        (0.47, 0.8, "recognized"),  # the frame does not show the other one at all
+        (0.1, None, "recognized"),
+    ],
 )
 def test_a_storey_is_told_by_what_the_query_shows_alone(lead: float, alike: float | None, verdict: str) -> None:
-    """However large the lead, of two storeys that are more alike than the query is like either none is recognized."""
     curve = CALIBRATION.model_copy(update={"curve": Curve(slope=40.0, intercept=-8.0)})
     rest = [0.03 - 0.0001 * i for i in range(60)]
     scores = falling(0.5, 0.5 - lead, *rest)
@@ -93,7 +101,7 @@ def test_a_storey_is_told_by_what_the_query_shows_alone(lead: float, alike: floa
     assert judgement.verdict == verdict and judgement.probability is not None
     assert (judgement.probability <= 0.5) == (verdict == "ambiguous")
     assert judgement.twins == ((1,) if verdict == "ambiguous" else ())
-    stated = judge(scores, STOREYS, curve, NEARBY, likeness=likeness, prior=np.log(np.where(STOREYS.height, 0.1, 1.0)))
+    stated = judge(scores, STOREYS, curve, NEARBY, likeness=likeness, prior=PRIOR, alone=scores)
     assert stated.verdict == ("recognized" if lead > 0.01 else "ambiguous")
     together = replace(STOREYS, level=np.zeros(62, np.int32))
     assert judge(scores, together, curve, NEARBY, likeness=likeness).verdict == "recognized", "one storey, by its level"

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration, judge
 from core.method.catalogue import EncoderCatalogue
 from core.places import Neighborhood, Whereabouts
-from core.recognition.stages import examine, score_matrix
+from core.recognition.stages import Candidates, examine, score_matrix
 from tests.core.judgement.test_verdict import in_sequence
 from tests.service.scenes import scene
 
@@ -27,6 +28,18 @@ def crowd() -> tuple[NDArray[np.float32], Whereabouts, NDArray[np.float32]]:
     gains = np.full(60, 0.05, np.float32)
     gains[0], gains[50] = 0.4, 0.48  # the twin is as good
     return scores, in_sequence(60, [*range(50), *range(1000, 2000, 100)]), gains
+
+
+def test_a_prior_takes_from_the_score_of_both_stages() -> None:
+    calibration = CALIBRATION.model_copy(update={"curve": Curve(slope=40.0, intercept=-3.0)})
+    first = np.array([0.05, 0.05], np.float32)  # a prior takes 0.058, but no more than what is above 0.02 of these
+    scores, weights = np.array([0.3, 0.27], np.float32), np.log([0.1, 1.0])
+    ordered = scores - np.array([0.03, 0.0], np.float32)
+    examined, rows = np.ones(2, np.bool_), np.array([7, 8])
+    found = Candidates(rows, scores, first, in_sequence(2), examined, weights, ordered, 2).weighed(calibration)
+    assert found.rows.tolist() == [8, 7]
+    assert found.ordered.tolist() == pytest.approx([0.27, 0.3 - np.log(10) / 40], abs=1e-6)
+    assert found.scores.tolist() == pytest.approx([0.27, 0.3])
 
 
 def test_a_similar_place_behind_many_neighbours_is_examined() -> None:

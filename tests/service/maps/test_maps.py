@@ -203,7 +203,9 @@ def test_editing_is_a_merge_patch(client: httpx.Client, map_id: str) -> None:
     headers = {"Content-Type": "application/merge-patch+json"}
     set_ = client.patch(path, content=json.dumps({"same_place_radius": 9, "description": "x"}), headers=headers).json()
     assert (set_["same_place_radius"], set_["description"], set_["same_place_frames"]) == (9, "x", 3)
-    reset = client.patch(path, json={"same_place_radius": None}).json()
+    assert client.patch(path, json={"same_place_height": 3}).json()["same_place_height"] == 3
+    reset = client.patch(path, json={"same_place_radius": None, "same_place_height": None}).json()
+    assert reset["same_place_height"] == 1.5
     assert (reset["same_place_radius"], reset["description"]) == (5, "x")
     assert client.patch(path, json={}).json()["revision"] == reset["revision"], "nothing changed"
 

@@ -183,6 +183,23 @@ def test_every_kind_may_be_soft(server: Server, islands: str) -> None:
     assert {match["weight"] for match in answer["matches"]} == {0.5}, "no place is in the box"
 
 
+def test_a_level_is_a_prior_and_levels_are_a_filter(server: Server, yard: str) -> None:
+    """The yard's levels are those of its metadata."""
+    stated = server.query(yard, jpeg(3), k=8, level=1)["matches"]
+    assert {match["place"]["id"]: match["weight"] for match in stated} == {
+        f"p{number}": pytest.approx(1.0 if number % 2 else 0.1) for number in range(PLACES)
+    }
+    assert {match["weight"] for match in server.query(yard, jpeg(3), k=8, level=1, prior_trust=0.5)["matches"]} == {
+        0.5,
+        1,
+    }
+    filtered = server.query(yard, jpeg(3), k=8, levels="1,roof")["matches"]
+    assert {match["place"]["id"] for match in filtered} == numbers(1, 3, 5, 7)
+    assert server.query(yard, jpeg(3), levels='["roof"]')["reason"] == "no-place-allowed"
+    soft = server.query(yard, jpeg(3), k=8, levels="1", soft="levels")["matches"]
+    assert [match["weight"] for match in soft] == [match["weight"] for match in stated]
+
+
 def test_a_batch_is_filtered_like_a_query(server: Server, yard: str) -> None:
     files = [("a", ("a", jpeg(3), "image/jpeg")), ("b", ("b", jpeg(5), "image/jpeg"))]
     response = server.client.post(
@@ -199,7 +216,7 @@ def test_the_pose_is_estimated_where_a_place_is_recognized(server: Server, yard:
     assert (pose["x"], pose["y"]) == (pytest.approx(30), pytest.approx(0))
     assert "z" not in pose and "latitude" not in pose
     assert pose["heading"] == pytest.approx(135, abs=0.1) and pose["heading_spread"] is None
-    assert pose["spread"] == pytest.approx(5) and pose["places"] == 1
+    assert pose["spread"] == pytest.approx(8) and pose["places"] == 1, "the next place of its floor is 20 m away"
     elsewhere = server.query(yard, encoded(seen_again(scene(3))), x=60, y=0, radius=15)
     assert elsewhere["verdict"] != "recognized" and elsewhere["pose"] is None
     pose = server.query(islands, encoded(seen_again(scene(1))), k=1)["pose"]
@@ -224,6 +241,9 @@ def test_the_pose_is_estimated_where_a_place_is_recognized(server: Server, yard:
         {"bbox": "-181,0,0,1"},
         {"bbox": "1e1,0,20,1"},
         {"sequences": ""},
+        {"levels": ""},
+        {"levels": "a/b"},
+        {"level": "x" * 33},
         {"sequences": "a,,b"},
         {"sequences": "[1]"},
         {"sequences": '["a"'},
