@@ -1661,18 +1661,6 @@ class ReviewSetting(TypedDict):
     """Most bytes of their files together; the oldest go first."""
 
 
-class PoseAccuracy(TypedDict):
-    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
-    degrees: of the heading; None: not stated.
-    """
-
-    metres: float
-    """Of each coordinate."""
-
-    degrees: NotRequired[float | None]
-    """Of the heading; null: not stated."""
-
-
 class PoseChanges(TypedDict):
     """Part of a pose; null removes a coordinate."""
 
