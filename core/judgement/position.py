@@ -30,7 +30,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.geometry.bundle import Stand, bundle_stand, decline_misses
+from core.geometry.bundle import Stand, bundle_stand, decline_misses, decline_variance
 from core.geometry.pose import RelativeView, SharedPoints, mixture_moments
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, NO_SEQUENCE, Pose, Whereabouts
 
@@ -74,6 +74,8 @@ APART = 0.2
 """Metres that they are apart at least: looks from one position say nothing of distances."""
 BUNDLE_HEADING = float(np.radians(0.5))
 """Deviation of the errors of places' headings, where several places show them."""
+FARTHEST = 2.0
+"""Factor of the distance from the nearest place that is likely, from which on an adjusted pose is refused."""
 HEIGHT_SLOPE = 0.2
 """Slope of the ground by which the height of a frame differs from that of its place on the Earth: few roads are
 steeper."""
@@ -83,6 +85,40 @@ SLOPE = float(np.radians(4))
 
 def _unknown() -> Vectors:
     return np.diag([UNKNOWN_HEIGHT] * 3 + [UNKNOWN_ANGLE] * 3)
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """How exact the poses of n places are.
+
+    metres: float64 [n], the deviation of a coordinate along the ground; NaN where it is not known.
+    radians: float64 [n], that of the heading; NaN where it is not known.
+    turned: float64 [n], by how much their cameras look to the left of their headings, in radians, as pictures show.
+    in_common: whether places that stand together may be off by the same, so that all are no surer than one.
+    """
+
+    metres: Vectors
+    radians: Vectors
+    turned: Vectors
+    in_common: bool = True
+
+    @classmethod
+    def unknown(cls, count: int) -> PlaceErrors:
+        """Those of places of which nothing is known."""
+        return cls(np.full(count, np.nan), np.full(count, np.nan), np.zeros(count))
+
+    def take(self, rows: ArrayLike) -> PlaceErrors:
+        """Those of some places."""
+        chosen = np.asarray(rows)
+        return replace(self, metres=self.metres[chosen], radians=self.radians[chosen], turned=self.turned[chosen])
+
+    def position(self) -> Vectors:
+        """The deviations of positions, [n], with the usual one where none is known."""
+        return np.where(np.isfinite(self.metres), self.metres, PLACE_POSITION)
+
+    def heading(self, usual: float) -> Vectors:
+        """The deviations of headings, [n], with a usual one where none is known; none is less."""
+        return np.fmax(self.radians, usual)
 
 
 @dataclass(frozen=True)
@@ -178,6 +214,7 @@ def estimate_pose(
     used: int = 20,
     views: Sequence[RelativeView | None] | None = None,
     sightings: Sequence[SharedPoints | None] | None = None,
+    errors: PlaceErrors | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose of a frame from its matches.
 
@@ -194,19 +231,25 @@ def estimate_pose(
             verified.  The heading of a place is taken for the direction in which its camera looks.
         sightings: the points that the query shares with the first places, however far they are from the best match, by
             the intrinsics of both cameras; None where these are not known or a place was not verified.
+        errors: how exact the poses of the places are; None: nothing is known.  An answer is no surer than its best
+            match, for places that stand together may all be off by the same.  Where cameras look aside of the headings,
+            shifts are taken in the directions in which they look, and the heading's variance has the square of that.
 
     Returns:
         None if there is no match, or the best one has no pose.
     """
     if len(places) == 0 or places.kind[0] == NO_POSE:
         return None
+    errors = errors or PlaceErrors.unknown(len(places))
+    if errors.turned.any():
+        return _turned_back(places, log_weights, reach, used, views, sightings, errors)
     distance = np.sqrt(np.square(places.position - places.position[0]).sum(axis=1))
     distance[places.kind != places.kind[0]] = np.inf
     part = np.flatnonzero(distance[:used] <= reach)
     odds = np.asarray(log_weights, np.float64)[part]
     weights = np.exp(np.minimum(odds - odds[0], 0.0))
     weights /= weights.sum()
-    chosen = places.take(part)
+    chosen, exact = places.take(part), errors.take(part)
     mean = weights @ chosen.position
     on_earth = bool(places.kind[0] == GEOGRAPHIC)
     if on_earth:
@@ -218,25 +261,74 @@ def estimate_pose(
     axes = _axes(mean) if on_earth else np.eye(3)
     local = (chosen.position - mean) @ axes.T
     covariance = _unknown()
-    covariance[:3, :3] = local.T @ (weights[:, np.newaxis] * local) + np.eye(3) * (gap**2 / 8 + PLACE_POSITION**2)
+    covariance[:3, :3] = local.T @ (weights[:, np.newaxis] * local) + np.eye(3) * (
+        gap**2 / 8 + exact.position()[0] ** 2
+    )
     if heading is not None:
-        covariance[5, 5] = np.radians(heading_spread or 0.0) ** 2 + TURN**2
+        covariance[5, 5] = np.radians(heading_spread or 0.0) ** 2 + TURN**2 + np.nan_to_num(exact.radians[0]) ** 2
     pose = _geographic(mean, heading) if on_earth else Pose(x=mean[0], y=mean[1], z=mean[2], heading=heading)
-    found = PoseEstimate(pose, float(np.sqrt(squares + (gap / 2) ** 2)), heading_spread, len(part), covariance)
+    off = 2 * np.nan_to_num(exact.metres[0]) ** 2
+    found = PoseEstimate(pose, float(np.sqrt(squares + (gap / 2) ** 2 + off)), heading_spread, len(part), covariance)
     seen = {row: view for row, view in enumerate(views or ()) if view is not None}
     if 0 in seen:
         sign = -1 if on_earth else 1
         found = replace(found, heading_offset=sign * seen[0].heading_offset, offset_spread=seen[0].heading_spread)
     directions = _directions(chosen, axes, on_earth)
     rows = [place for place, row in enumerate(part) if row in seen and np.isfinite(directions[place])]
-    shared = _points_of_places(places, mean, axes, on_earth, reach, sightings or ())
+    shared = _points_of_places(places, mean, axes, on_earth, reach, sightings or (), errors)
     if rows and heading is not None:
         yaw = float(np.radians(90 - heading if on_earth else heading))
-        place_views = _PlaceViews(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
+        place_views = _PlaceViews(
+            local[rows], directions[rows], [seen[int(part[row])] for row in rows], exact.take(rows)
+        )
         found = _fused(found, place_views, yaw, mean, axes, on_earth, shared)
     if heading is not None and shared is not None:
-        found = _bundled(found, covariance, mean, axes, on_earth, seen.get(0), shared)
+        likely = max(gap / 2, reach)
+        standing = (places.position[places.kind == places.kind[0]] - mean) @ axes.T
+        found = _bundled(found, covariance, mean, axes, on_earth, seen.get(0), shared, standing, likely)
+    found = _no_surer(found, exact) if exact.in_common else found
     return found.without_height() if on_earth else found
+
+
+def _turned_back(
+    places: Whereabouts,
+    log_weights: ArrayLike,
+    reach: float,
+    used: int,
+    views: Sequence[RelativeView | None] | None,
+    sightings: Sequence[SharedPoints | None] | None,
+    errors: PlaceErrors,
+) -> PoseEstimate | None:
+    """The estimate by the directions in which cameras look, with a heading as those of the places are."""
+    sign = -1 if places.kind[0] == GEOGRAPHIC else 1
+    heading = ((places.heading + sign * np.degrees(errors.turned)) % 360).astype(np.float32)
+    straight = replace(errors, turned=np.zeros(len(places)))
+    looking = replace(places, heading=heading)
+    found = estimate_pose(looking, log_weights, reach, used, views, sightings, straight)
+    if found is None or found.pose.heading is None:
+        return found
+    turn, covariance = float(errors.turned[0]), found.covariance.copy()
+    covariance[5, 5] += turn**2
+    return replace(
+        found,
+        pose=found.pose.model_copy(update={"heading": (found.pose.heading - sign * np.degrees(turn)) % 360}),
+        heading_spread=float(np.degrees(np.sqrt(covariance[5, 5]))),
+        covariance=covariance,
+    )
+
+
+def _no_surer(found: PoseEstimate, exact: PlaceErrors) -> PoseEstimate:
+    """The estimate with variances along the ground and of the heading that are no less than those of the best match."""
+    covariance = found.covariance.copy()
+    if np.isfinite(metres := exact.metres[0]):
+        values, vectors = np.linalg.eigh(covariance[:2, :2])
+        raised = np.maximum(values, metres**2)
+        covariance[:2, :2] = vectors @ np.diag(raised) @ vectors.T
+    covariance[5, 5] = np.fmax(covariance[5, 5], exact.radians[0] ** 2)
+    if found.source == "places":
+        return replace(found, covariance=covariance)
+    spread, heading_spread = np.sqrt(covariance[0, 0] + covariance[1, 1]), np.degrees(np.sqrt(covariance[5, 5]))
+    return replace(found, covariance=covariance, spread=float(spread), heading_spread=float(heading_spread))
 
 
 def gap_around(places: Whereabouts, reach: float) -> float:
@@ -272,11 +364,12 @@ def places_apart(places: Whereabouts, reach: float, order: Sequence[int], most: 
 
 @dataclass(frozen=True)
 class _PlaceViews:
-    """Positions of n places from the mean, [n, 3], headings counter-clockwise from x, [n], and the views of them."""
+    """Positions of n places from the mean, [n, 3], headings counter-clockwise from x, [n], their views and errors."""
 
     positions: Vectors
     directions: Vectors
     views: list[RelativeView]
+    errors: PlaceErrors
 
 
 def _fused(
@@ -324,7 +417,8 @@ def _fused(
     total = np.array(costs)
     if shared is not None:
         missed, _ = decline_misses(np.array(states)[:, :3], shared.positions, shared.counts)
-        total += np.square(missed / SHARING_DEVIATION).mean(axis=1)
+        variance = SHARING_DEVIATION**2 + decline_variance(shared.positions, shared.errors.position() ** 2)
+        total += (np.square(missed) / variance).mean(axis=1)
     weights = np.exp((total.min() - total) / 2)
     state, posterior = mixture_moments(weights / weights.sum(), np.array(states), np.array(covariances))
     # A wrong view, whose turn is mostly right all the same, leaves the position where the places put it.
@@ -366,6 +460,7 @@ class _PlacePoints:
     directions: Vectors
     counts: Vectors
     sightings: list[SharedPoints]
+    errors: PlaceErrors
 
 
 def _points_of_places(
@@ -375,6 +470,7 @@ def _points_of_places(
     on_earth: bool,
     reach: float,
     sightings: Sequence[SharedPoints | None],
+    errors: PlaceErrors,
 ) -> _PlacePoints | None:
     """The points of the places that share most with the query; None where these are not two that stand apart."""
     if not sightings or sightings[0] is None:
@@ -393,7 +489,8 @@ def _points_of_places(
     if len(rows) < 2:
         return None
     number = np.array([counts[row] for row in rows], np.float64)
-    return _PlacePoints(local[rows], directions[rows], number, [one for row in rows if (one := sightings[row])])
+    seen = [one for row in rows if (one := sightings[row])]
+    return _PlacePoints(local[rows], directions[rows], number, seen, errors.take(rows))
 
 
 def _bundled(
@@ -404,15 +501,25 @@ def _bundled(
     on_earth: bool,
     view: RelativeView | None,
     shared: _PlacePoints,
+    standing: Vectors,
+    likely: float,
 ) -> PoseEstimate:
-    """The estimate by the points of several places together; unchanged if they do not tell it."""
+    """The estimate by the points of several places together; unchanged if they do not tell it.
 
-    def stand_of(position: Vectors, direction: float) -> Stand:
+    Args:
+        standing: where places are, [k, 3].
+        likely: metres from the nearest of them within which a frame is recognized.  A pose that is farther away is
+            off by the rest, as far as anyone knows, and refused from FARTHEST times that on.
+    """
+
+    def stand_of(position: Vectors, direction: float, metres: float, heading: float, measured: bool) -> Stand:
         height = PLACE_POSITION + SLOPE * float(np.linalg.norm(position - shared.positions[0]))
-        covariance = np.diag(np.square([LEVEL, LEVEL, BUNDLE_HEADING, PLACE_POSITION, PLACE_POSITION, height]))
-        return Stand(position, _level(direction), covariance)
+        covariance = np.diag(np.square([LEVEL, LEVEL, heading, metres, metres, height]))
+        return Stand(position, _level(direction), covariance, measured)
 
-    stands = [stand_of(*one) for one in zip(shared.positions, shared.directions, strict=True)]
+    exact = shared.errors
+    columns = exact.position(), exact.heading(BUNDLE_HEADING), np.isfinite(exact.metres)
+    stands = [stand_of(*one) for one in zip(shared.positions, shared.directions, *columns, strict=True)]
     position, yaw = _of(found.pose, mean, axes, on_earth)
     attitude = _level(yaw) if view is None else stands[0].attitude @ view.turn
     loose = np.zeros((6, 6))
@@ -423,9 +530,13 @@ def _bundled(
     stand = bundle_stand(best, stands, shared.sightings, Stand(position, attitude, loose))
     if stand is None:
         return found
+    beyond = float(np.linalg.norm((standing - stand.position)[:, :2], axis=1).min()) - likely
+    if beyond > (FARTHEST - 1) * likely:
+        return found
     covariance = found.covariance.copy()
     which = [3, 4, 5, 2]
     covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = stand.covariance[np.ix_(which, which)]
+    covariance[:2, :2] += np.eye(2) * max(beyond, 0.0) ** 2
     ahead = stand.attitude[:, 0]
     made = _pose_at(mean + stand.position @ axes, float(np.degrees(np.arctan2(ahead[1], ahead[0]))), on_earth)
     return replace(
@@ -469,9 +580,16 @@ def _missed(state: Vectors, place_views: _PlaceViews, number: int) -> tuple[Vect
     jacobian[:3, :3], jacobian[:3, 4], jacobian[3, 3] = back * nearness, -shift, 1
     which = [3, 4, 5, 2]
     turned = np.r_[view.shift[1], -view.shift[0], 0, -1]  # by an error of the place's heading
-    noise = view.covariance[np.ix_(which, which)] + np.outer(turned, turned) * PLACE_HEADING**2
+    noise = (
+        view.covariance[np.ix_(which, which)]
+        + np.outer(turned, turned) * place_views.errors.heading(PLACE_HEADING)[number] ** 2
+    )
     level = np.square(view.shift).sum() * LEVEL**2
-    noise = noise + np.diag([0, 0, level, 0]) + np.diag([1, 1, 1, 0]) * (PLACE_POSITION * nearness) ** 2
+    noise = (
+        noise
+        + np.diag([0, 0, level, 0])
+        + np.diag([1, 1, 1, 0]) * (place_views.errors.position()[number] * nearness) ** 2
+    )
     if view.source == "field-of-view":
         noise = noise + np.diag([UNUSED, UNUSED, UNUSED, 0])
     return np.r_[shift - view.shift, turn], jacobian, noise
@@ -487,6 +605,14 @@ def _axes(at: Vectors) -> Vectors:
     """Unit vectors to the east, to the north and up at a point of the sphere, [3, 3]."""
     (north,), (east,) = _north_east(at[np.newaxis])
     return np.stack([east, north, np.cross(east, north)])
+
+
+def bearing_between(places: Whereabouts, one: int, other: int) -> float:
+    """The direction from a place to another counter-clockwise from the first axis, or from the east, in radians."""
+    away = places.position[other] - places.position[one]
+    if places.kind[one] == GEOGRAPHIC:
+        away = _axes(places.position[one]) @ away
+    return float(np.arctan2(away[1], away[0]))
 
 
 def _directions(places: Whereabouts, axes: Vectors, on_earth: bool) -> Vectors:

@@ -15,7 +15,7 @@ from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
 from core.names import texts
-from core.places import SAME_STOREY, PlaceFields, Pose, Timestamp, level_in, place_and_look
+from core.places import SAME_STOREY, PlaceFields, Pose, PoseAccuracy, Timestamp, level_in, place_and_look
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -167,6 +167,11 @@ class MapSettings(BaseModel):
     )
     same_place_frames: Annotated[int, Field(strict=True, ge=0, le=2**31)] = Field(
         default=3, description="Without poses: places this many frames apart in their sequence are the same place."
+    )
+    pose_accuracy: PoseAccuracy | None = Field(
+        default=None,
+        description="How exact the poses of places are that do not state it themselves; null: pictures of the map's "
+        "places say it as far as they can.",
     )
     verification: bool = Field(
         default=True,

@@ -35,6 +35,7 @@ from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
 from core.recognition.framings import FramedView, FrameReframing, doubted, framed, keypoints_in_frame
+from core.recognition.pose_survey import place_errors, turned_note
 from core.recognition.question import Query, Question
 from core.recognition.stages import (
     Candidates,
@@ -382,9 +383,13 @@ def _put_together(
         views, note = relative_views(map_, candidates, stage, query.verifier)
         shared = sightings(map_, candidates, stage, query.verifier)
     level = candidates.whereabouts.on_level_of(0, neighborhood.height)
-    pose = estimate_pose(level, log_odds, neighborhood.radius, views=views, sightings=shared)
+    seen = any(view is not None and view.source == "intrinsics" for view in views)
+    errors = place_errors(map_, candidates.rows.tolist(), level, surveyed=seen)
+    pose = estimate_pose(level, log_odds, neighborhood.radius, views=views, sightings=shared, errors=errors)
     if note is None and pose is not None and pose.source != "intrinsics":
         note = _why_without_intrinsics(map_, query.question.camera, places[0], stage)
+    if errors.turned[:1].any():
+        note = turned_note(map_, int(level.sequence[0])) or note
     rivals = rival_places(map_, candidates, judgement)
     if len(listed) < len(places):
         candidates = candidates.take(np.append(listed, np.arange(len(places), len(candidates.rows))))

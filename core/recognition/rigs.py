@@ -16,6 +16,7 @@ from core.judgement.priors import decision_slope
 from core.judgement.verdict import Judgement
 from core.maps import Map
 from core.method.encoder import Encoder
+from core.recognition.pose_survey import place_errors
 from core.recognition.question import Query
 from core.recognition.recognition import ATTEMPTS, Answer, first_looks, judgement_of, locate, places_of, rival_places
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
@@ -79,7 +80,8 @@ def locate_rig(
     candidates = _candidates_of_rig(fused, finals, decision_slope(calibration))
     weights = None if ranked[0].weights is None else np.exp(fused.weights[retained]).tolist()
     level = fused.whereabouts.on_level_of(0, neighborhood.height)
-    pose = estimate_pose(level, fused.log_odds, neighborhood.radius)
+    errors = place_errors(map_, fused.rows.tolist(), level, surveyed=False)
+    pose = estimate_pose(level, fused.log_odds, neighborhood.radius, errors=errors)
     rivals = rival_places(map_, candidates, judgement)
     if len(retained) < len(places):
         candidates = candidates.take(np.append(retained, np.arange(len(places), len(candidates.rows))))

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = "placerec data 2\n"
 EARLIER = ("placerec data 1\n",)
-"""Of directories whose maps are brought up to date as they are opened, which earlier versions must not open any more."""
+"""Of directories whose maps are brought up to date when they are opened, and which earlier versions then refuse."""
 _MAPS = "maps"
 # No map id begins with a dot, so these folders are never mistaken for maps.
 _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"

@@ -120,6 +120,8 @@ def enrol(
     accuracy: Annotated[
         float | None,
         typer.Option(
+            "--pose-accuracy",
+            "--accuracy",
             help="Metres: standard deviation of the coordinates of poses whose accuracy places.csv does not give.",
             min=0,
             max=1e6,

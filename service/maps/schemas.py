@@ -26,7 +26,7 @@ from core.maps import (
     TierSetting,
 )
 from core.maps.records import COMPACT_FROM, MOST_REJECTED, LearningMode, RejectedGround
-from core.places import Timestamp
+from core.places import PoseAccuracy, Timestamp
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 from service.queries.counts import VerdictCounts
 
@@ -38,6 +38,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "keep": "thumbnail",
     "same_place_radius": 5.0,
     "same_place_height": 1.5,
+    "pose_accuracy": None,
     "same_place_frames": 3,
     "verification": True,
     "review": None,
@@ -104,6 +105,10 @@ class MapView(BaseModel):
     )
     same_place_frames: int = Field(
         description="The same for places without poses: their distance in frames of one sequence."
+    )
+    pose_accuracy: PoseAccuracy | None = Field(
+        description="How exact the poses of places are that do not state it themselves, as its owner states it; null: "
+        "pictures of the map's places say it as far as they can."
     )
     verification: bool = Field(description="Whether keypoints of each frame are stored, by which answers are verified.")
     review: ReviewSetting | None = Field(description="Which frames are stored to be reviewed by people; null: none.")
@@ -251,6 +256,7 @@ class MapChanges(BaseModel):
     same_place_radius: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
     same_place_height: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
     same_place_frames: int | None = Field(strict=True, default=None, ge=0, le=2**31)
+    pose_accuracy: PoseAccuracy | None = Field(default=None, description="null: nobody states it.")
     verification: bool | None = Field(strict=True, default=None)
     index: TierSetting | None = Field(
         default=None,

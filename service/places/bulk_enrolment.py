@@ -33,7 +33,7 @@ from service.jobs.job import Job
 from service.jobs.jobs import Jobs
 from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
 from service.places.enrolment import Enrolled, FrameToEnrol, enrol
-from service.places.plausible import judge_entries
+from service.places.plausible import judge_entries, pose_remarks
 from service.places.staging import StagedForm, StagedPart, Staging
 from service.worker_threads import in_thread, to_its_end
 
@@ -143,7 +143,7 @@ def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobCon
     form = _Form(engine, staging, context)
     replace = bool(context.arguments.get("replace", True))
     made = EnrolmentInCommits(engine, context, form.entries, form.frame, replace=replace).run()
-    result = {**made, "remarks": form.remarks}
+    result = {**made, "remarks": [*form.remarks, *pose_remarks(context.map(engine.maps), form.sequences())]}
     if not context.arguments.get("align", False):
         return result
     return {**result, "aligned": align(engine, context, form.sequences())}

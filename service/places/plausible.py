@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from core.maps import Map
 from core.places import Pose, is_no_fix, microseconds
+from core.recognition.pose_survey import pose_survey
 from core.recordings.plausibility import Source, jitter_of, judge
 from service.errors.faults import ImplausiblePose, InvalidRequest
 from service.http.schemas import validated
@@ -95,3 +97,13 @@ def _judge(
             )
         refused[one.position] = ImplausiblePose(detail)
     return refused, judgement.remarks
+
+
+def pose_remarks(map_: Map, sequences: Collection[str]) -> list[str]:
+    """Remarks on the headings of some traverses that a map has now: what its pictures say against them.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    found = pose_survey(map_).traverses.values()
+    return [one.remark for one in found if one.remark is not None and one.sequence in sequences]

@@ -30,6 +30,7 @@ from service.places.bulk_enrolment import Align, EnrolmentInCommits
 from service.places.comparison import compare, expect_coordinates, taken_text
 from service.places.enrolment import FrameToEnrol
 from service.places.map_events import tell_map
+from service.places.plausible import pose_remarks
 from service.recordings.reader import Order, as_fields
 from service.recordings.readers import Readers, Turns
 from service.recordings.uploads import KIND, Recordings
@@ -184,6 +185,7 @@ def enrol_recording(
         traverses = list(dict.fromkeys(traverse_of(sequence, one) for one in chosen))
     if result["failed"]["count"]:
         remarks = [*remarks, KEPT]
+    remarks = [*remarks, *pose_remarks(context.map(engine.maps), traverses)]
     told = {**result, **facts, "sequences": traverses, "path": way_of(chosen), "remarks": remarks}
     return {**told, "aligned": align(engine, context, traverses)} if order.align else told
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from core.judgement.background import GUARD_FACTOR
 from core.maps import Map
 from core.method.encoder import Encoder
+from core.recognition.pose_survey import PoseSurvey, pose_survey
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
@@ -33,6 +34,7 @@ from service.upkeep.schemas import (
     GapView,
     HubView,
     MapHealth,
+    PoseHealth,
     SharedRouteView,
     SilentPlaces,
     StopView,
@@ -152,7 +154,13 @@ def examine_health(
         retraverse_count=len(again),
         trends=trends,
         shared_routes=_shared_routes(own, aliasing),
+        poses=_poses(pose_survey(map_)),
     )
+
+
+def _poses(survey: PoseSurvey) -> list[PoseHealth]:
+    ordered = sorted(survey.traverses.values(), key=lambda one: (not one.turned, one.sequence))
+    return [PoseHealth(**asdict(one), remark=one.remark) for one in ordered]
 
 
 def _answers(statistics: Statistics) -> AnswersView:

@@ -422,7 +422,21 @@ HEALTH_EXAMPLE: dict[str, Any] = {
     "retraverse_count": 1,
     "trends": TRENDS_EXAMPLE,
     "shared_routes": [{"sequence": "tuesday", "other": "monday", "frames": 42}],
+    "poses": [{"sequence": "monday", "metres": 0.4, "degrees": 1.2, "turned": 0.0, "pairs": 34, "remark": None}],
 }
+
+
+class PoseHealth(BaseModel):
+    """How exact the poses of one traverse are, by what pictures of places beside one another say of them."""
+
+    sequence: str
+    metres: float | None = Field(
+        description="Standard deviation of each coordinate; null: the pictures do not tell it, or it is small."
+    )
+    degrees: float | None = Field(description="Standard deviation of headings; null: intrinsics are not known.")
+    turned: float = Field(description="Degrees by which cameras look to the left of the headings; 0: as they say.")
+    pairs: int = Field(description="How many pairs of pictures `turned` rests on.")
+    remark: str | None = Field(description="What is to be done about headings that are turned; null: nothing.")
 
 
 class MapHealth(BaseModel):
@@ -448,6 +462,10 @@ class MapHealth(BaseModel):
     retraverse_count: int
     trends: TrendsView
     shared_routes: list[SharedRouteView] = Field(description="Traverses to align; those of most frames come first.")
+    poses: list[PoseHealth] = Field(
+        description="Of the traverses whose pictures tell how exact their poses are, by name; headings that are turned "
+        "come first."
+    )
 
 
 class ComparedTraverse(BaseModel):

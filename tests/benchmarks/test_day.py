@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks.day.drive import DriveOutcomes, drive
 from benchmarks.day.maps import Change, make_map
-from benchmarks.day.rigs import KINDS, RigAnswer, answers, apart
 from benchmarks.day.odometry import FAULTS
+from benchmarks.day.rigs import KINDS, RigAnswer, answers, apart
 from benchmarks.day.robots import Asking, Mode, Verify
 from benchmarks.day.situations import SITUATIONS, Moment, moments
 from benchmarks.day.walks import WalkPair, drawn

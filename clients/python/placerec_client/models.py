@@ -1321,6 +1321,17 @@ class MapAnswer(Model):
     problem: Problem | None = None
 
 
+class PoseHealth(Model):
+    """How exact the poses of one traverse are, by what pictures of places beside one another say of them."""
+
+    sequence: str
+    metres: float | None = None
+    degrees: float | None = None
+    turned: float
+    pairs: int
+    remark: str | None = None
+
+
 class SharedRouteView(Model):
     """Two traverses that seem to follow one route, which neither poses nor an alignment say: align them."""
 
@@ -1421,6 +1432,7 @@ class MapHealth(Model):
     retraverse_count: int
     trends: TrendsView
     shared_routes: list[SharedRouteView]
+    poses: list[PoseHealth]
 
 
 class MapMatch(Model):
@@ -1472,6 +1484,7 @@ class MapView(Model):
     same_place_radius: float
     same_place_height: float
     same_place_frames: int
+    pose_accuracy: PoseAccuracy | None = None
     verification: bool
     review: ReviewSetting | None = None
     learning: LearningSetting

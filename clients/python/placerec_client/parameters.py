@@ -898,6 +898,11 @@ class NewMap(TypedDict, total=False):
     same_place_frames: int
     """Without poses: places this many frames apart in their sequence are the same place."""
 
+    pose_accuracy: PoseAccuracy | None
+    """How exact the poses of places are that do not state it themselves; null: pictures of the map's places say it
+    as far as they can.
+    """
+
     verification: bool
     """Whether keypoints of each frame are stored, by which answers are verified. A change applies to frames enrolled
     from then on.
@@ -936,6 +941,9 @@ class MapChanges(TypedDict, total=False):
     same_place_height: float | None
 
     same_place_frames: int | None
+
+    pose_accuracy: PoseAccuracy | None
+    """null: nobody states it."""
 
     verification: bool | None
 
@@ -1567,6 +1575,18 @@ class LearningChanges(TypedDict):
     """Those that stay rejected; null: none."""
 
 
+class PoseAccuracy(TypedDict):
+    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
+    degrees: of the heading; None: not stated.
+    """
+
+    metres: float
+    """Of each coordinate."""
+
+    degrees: NotRequired[float | None]
+    """Of the heading; null: not stated."""
+
+
 class ReviewChanges(TypedDict):
     """Which frames to keep for review; null restores a default."""
 
@@ -1639,18 +1659,6 @@ class ReviewSetting(TypedDict):
 
     most_bytes: NotRequired[int]
     """Most bytes of their files together; the oldest go first."""
-
-
-class PoseAccuracy(TypedDict):
-    """Standard deviations of a pose, as whoever states it knows them. metres: of each coordinate along the ground.
-    degrees: of the heading; None: not stated.
-    """
-
-    metres: float
-    """Of each coordinate."""
-
-    degrees: NotRequired[float | None]
-    """Of the heading; null: not stated."""
 
 
 class PoseChanges(TypedDict):

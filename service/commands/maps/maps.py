@@ -55,6 +55,12 @@ Frames = Annotated[
     int | None,
     typer.Option(min=0, help="Without poses: places within N frames of a sequence count as the same place."),
 ]
+Accuracy = Annotated[
+    float | None,
+    typer.Option(
+        help="Metres: standard deviation of the coordinates of poses, where places do not state it.", min=1e-3, max=1e6
+    ),
+]
 Verification = Annotated[
     bool | None,
     typer.Option(
@@ -121,6 +127,7 @@ def create_map(
     same_place_radius: Radius = None,
     same_place_height: Height = None,
     same_place_frames: Frames = None,
+    pose_accuracy: Accuracy = None,
     verification: Verification = None,
     learning: Learning = None,
     url: Url = None,
@@ -128,7 +135,16 @@ def create_map(
     as_json: AsJson = False,
 ) -> None:
     """Create a map. Its encoder cannot be changed later."""
-    given = _given(description, keep, same_place_radius, same_place_height, same_place_frames, verification, learning)
+    given = _given(
+        description,
+        keep,
+        same_place_radius,
+        same_place_height,
+        same_place_frames,
+        pose_accuracy,
+        verification,
+        learning,
+    )
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
     _show_map(ask(CommandTarget(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
 
@@ -141,6 +157,7 @@ def edit_map(
     same_place_radius: Radius = None,
     same_place_height: Height = None,
     same_place_frames: Frames = None,
+    pose_accuracy: Accuracy = None,
     verification: Verification = None,
     learning: Learning = None,
     threshold: Annotated[float | None, typer.Option(help="Least decision value of a recognized place.")] = None,
@@ -153,7 +170,16 @@ def edit_map(
     as_json: AsJson = False,
 ) -> None:
     """Change settings of a map; the others stay as they are."""
-    changes = _given(description, keep, same_place_radius, same_place_height, same_place_frames, verification, learning)
+    changes = _given(
+        description,
+        keep,
+        same_place_radius,
+        same_place_height,
+        same_place_frames,
+        pose_accuracy,
+        verification,
+        learning,
+    )
     calibration = {"threshold": threshold, "margin": margin}
     calibration = {name: value for name, value in calibration.items() if value is not None}
     if calibration and default_calibration:
@@ -206,6 +232,7 @@ def _given(
     radius: float | None,
     height: float | None,
     frames: int | None,
+    accuracy: float | None,
     verification: bool | None,
     learning: str | None,
 ) -> dict[str, Any]:
@@ -215,6 +242,7 @@ def _given(
         "same_place_radius": radius,
         "same_place_height": height,
         "same_place_frames": frames,
+        "pose_accuracy": None if accuracy is None else {"metres": accuracy},
         "verification": verification,
         "learning": None if learning is None else {"mode": learning},
     }

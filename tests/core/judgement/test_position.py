@@ -11,13 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from core.geometry.bundle import DECLINE
+from core.geometry.bundle import DECLINE, Stand
 from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import (
     BUNDLE_REACH,
+    TURN,
     UNKNOWN_ANGLE,
     UNKNOWN_HEIGHT,
     WIDEST_GAP,
+    PlaceErrors,
     PoseEstimate,
     circular_mean,
     estimate_pose,
@@ -377,3 +379,52 @@ def test_points_say_nothing_where_the_best_match_has_none_or_places_coincide() -
     for poses, seen in ((apart, [None, shared[1]]), (together, shared), (apart, [shared[0]])):
         found = estimate_pose(places(poses), [0, 0], REACH, sightings=seen)
         assert found is not None and found.source == "places"
+
+
+def among(query: Stand, errors: PlaceErrors | None, random: np.random.Generator, noise: float = 0.0) -> PoseEstimate:
+    """The estimate of a query among three places 9 m apart on one line, whose stated poses have errors."""
+    stands = [stand((x, 0, 0)) for x in (0.0, 9.0, -9.0)]
+    shared = sightings(query, stands, random)
+    poses = [Pose(x=x + random.normal(0, noise), y=random.normal(0, noise), heading=0) for x in (0.0, 9.0, -9.0)]
+    view = RelativeView(query.attitude, query.position / 9, np.diag([1e-4] * 3 + [1e-2] * 3), 100, "intrinsics")
+    found = estimate_pose(places(list(poses)), [0] * 3, REACH, views=[view], sightings=shared, errors=errors)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0])
+def test_errors_of_places_that_are_known_are_covered_and_not_by_absurd_widths(noise: float) -> None:
+    random, within, errors, stated = np.random.default_rng(8), [], [], []
+    exact = PlaceErrors(np.full(3, noise), np.full(3, np.nan), np.zeros(3))
+    for _ in range(30):
+        query = stand((random.uniform(-3, 3), random.normal(0, 0.3), 0), random.normal(0, 3))
+        found = among(query, exact, random, noise)
+        missed = np.array([found.pose.x, found.pose.y]) - query.position[:2]
+        within.append(missed @ np.linalg.solve(found.covariance[:2, :2], missed) < 5.99)
+        errors.append(np.linalg.norm(missed))
+        stated.append(found.spread)
+        assert np.linalg.eigvalsh(found.covariance[:2, :2]).min() >= noise**2 - 1e-9, "no surer than its places"
+    assert np.mean(within) >= 0.93 and np.median(stated) < 3 * np.median(errors)
+
+
+def test_a_pose_far_from_all_places_is_widened_or_refused() -> None:
+    """A frame is recognized within half the gap of 9 m, or the radius of 5 m: from there on something is wrong."""
+    near, beyond, far = (among(stand((2, y, 0)), None, np.random.default_rng(9)) for y in (0.5, 8.0, 14.0))
+    assert near.source == "intrinsics" and near.spread < 1
+    assert beyond.source == "intrinsics" and beyond.covariance[0, 0] > 2.5**2 and beyond.covariance[1, 1] > 2.5**2
+    assert far.places != 3 or far.spread > 5
+
+
+@pytest.mark.parametrize("kind", ["metres", "degrees"])
+def test_headings_that_are_turned_shift_rightly_and_are_not_sure(kind: str) -> None:
+    """The camera looks to the north, 90° to the left of what the heading says, and the query is a metre ahead."""
+    turned = PlaceErrors(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.pi / 2))
+    heading = 0 if kind == "metres" else 90
+    place = Pose(x=0, y=0, heading=heading) if kind == "metres" else Pose(latitude=0, longitude=0, heading=heading)
+    view = view_from(Pose(x=0, y=0, heading=90), 0, 1.5, 95, 8)
+    found = estimate_pose(places([place]), [0], REACH, views=[view], errors=turned)
+    assert found is not None and found.pose.heading is not None
+    assert found.pose.heading == pytest.approx(5 if kind == "metres" else 85, abs=1)
+    assert math.radians(90) < math.sqrt(found.covariance[5, 5]) < math.radians(90) + TURN
+    north = found.pose.y if kind == "metres" else math.radians(found.pose.latitude or 0) * EARTH_RADIUS
+    assert north is not None and north > 0.3

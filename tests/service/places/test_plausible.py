@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 
+from benchmarks.geometry.pose import CAMERA
 from core.recordings.plausibility import MOST_SPEED
 from service.places.plausible import judge_entries
+from tests.core.recognition.test_pose_survey import walk
 from tests.service.encoders import COARSE
 from tests.service.map_jobs import finished
 from tests.service.places.test_bulk_enrolment import form, frames, sent
+from tests.service.scenes import encoded
 from tests.service.server import Server
 
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -85,3 +88,42 @@ def test_a_job_refuses_what_cannot_be_and_enrols_the_rest(server: Server) -> Non
     assert (item["id"], item["status"]) == ("p2", 422) and item["problem"]["type"].endswith(":implausible-pose")
     alone = server.client.post("/v1/maps/plausible/places?most_speed=90", **form(pictures, entries))
     assert alone.status_code == 422 and "most_speed needs background" in alone.text
+
+
+def test_headings_that_are_turned_are_remarked_by_the_job_and_by_the_health_report(server: Server) -> None:
+    """A camera that looks ahead, with headings 90° to the left of that: camera axes."""
+    server.create_map("turned", encoder=COARSE)
+    lens = {"intrinsics": CAMERA.model_dump(mode="json")}
+    assert server.client.put("/v1/maps/turned/cameras/front", json=lens).status_code in (200, 201)
+    pictures, poses = walk(0.0)
+    entries = [
+        {
+            "id": f"p{n}",
+            "file": f"p{n}",
+            "x": x,
+            "y": y,
+            "heading": (heading + 90) % 360,
+            "sequence": "a",
+            "camera": "front",
+        }
+        for n, (x, y, heading) in enumerate(poses.tolist())
+    ]
+    sending = form({f"p{n}": encoded(one) for n, one in enumerate(pictures)}, entries)
+    (remark,) = finished(server, sent(server, "turned", **sending).json())["result"]["remarks"]
+    assert "The headings of the traverse 'a' are turned by" in remark and "Camera axes?" in remark
+    (found,) = server.client.get("/v1/maps/turned/health").json()["poses"]
+    assert found["sequence"] == "a" and found["remark"] == remark and found["turned"] == pytest.approx(-90, abs=8)
+
+
+def test_a_map_states_how_exact_its_poses_are(server: Server) -> None:
+    server.create_map("stated", encoder=COARSE, pose_accuracy={"metres": 0.5, "degrees": 2})
+    found = server.client.get("/v1/maps/stated")
+    assert found.json()["pose_accuracy"] == {"metres": 0.5, "degrees": 2}
+    headers = {"If-Match": found.headers["ETag"]}
+    edited = server.client.patch("/v1/maps/stated", json={"pose_accuracy": {"metres": 2}}, headers=headers)
+    assert edited.status_code == 200 and edited.json()["pose_accuracy"]["metres"] == 2
+    wrong = {"pose_accuracy": {"metres": -1}}
+    assert server.client.patch("/v1/maps/stated", json=wrong, headers={"If-Match": "*"}).status_code == 422
+    server.enrol("stated", "p0", frames(1)[0], x=0, y=0)
+    pose = server.query("stated", frames(1)[0])["pose"]
+    assert pose is None or pose["covariance"][0] >= 2**2
