@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import zlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal, Self
@@ -508,6 +508,13 @@ class Whereabouts:
         near &= ~self.on_other_levels(np.arange(len(self)), row, neighborhood.height)
         near[row] = True
         return near
+
+    def walks(self) -> Iterator[NDArray[np.int64]]:
+        """The rows of the places of each sequence, in their order; places without one are in none."""
+        members = np.flatnonzero(self.sequence != NO_SEQUENCE)
+        order = members[np.lexsort((self.ordinal[members], self.sequence[members]))]
+        if len(order):
+            yield from np.split(order, np.flatnonzero(np.diff(self.sequence[order])) + 1)
 
     def others(self, row: int, neighborhood: Neighborhood, across: bool = True) -> NDArray[np.bool_]:
         """Which of the places are other places than ``row``, each counted once; bool [n].

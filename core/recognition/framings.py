@@ -46,6 +46,10 @@ FIRST, FURTHER, GAIN = 0.7, (0.6, 0.84), 1.05
 """The framing that is tried first, and those that are tried if the frame fits better in it by a factor of GAIN.  Of
 cut frames (60 %) it gains 1.08 at least on corridor and lip6, and 1.3 and 1.6 mostly; plain ones, if tried, 1.0."""
 
+HOPEFUL = 0.2
+"""Further ones are tried if the frame is as probable as this in the first: of frames from elsewhere 0 and 0.12 are, on
+corridor and lip6, and of those cut to 60 % 0.88 and all."""
+
 SHARPNESS, BETWEEN, LEAST_SHARE = 4.0, 0.6, 0.7
 """Of two framings that show places apart, the one that fits better is right with odds of the ratio of their fits to the
 power of SHARPNESS; where no other shows a place apart, one between those that were tried may, as if it had a ratio of
@@ -101,11 +105,14 @@ class FramedView:
     fit: float
 
 
-def framed(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -> tuple[FramedView, list[FramedView]]:
+def framed(
+    map_: Map, encoder: Encoder, query: Query, candidates: Candidates, judged: Callable[[Candidates], Judgement]
+) -> tuple[FramedView, list[FramedView]]:
     """The framing in which a query fits a place best, and all that were tried.
 
     Args:
         candidates: of the query as it is, after two stages.
+        judged: judges candidates.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -136,7 +143,9 @@ def framed(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) ->
     else:
         look(shape)
     before = look()
-    if look(shape.zoomed(FIRST)).fit > GAIN * before.fit:
+    first = look(shape.zoomed(FIRST))
+    probability = judged(first.candidates).probability
+    if first.fit > GAIN * before.fit and (probability is None or probability >= HOPEFUL):
         look(*(shape.zoomed(factor) for factor in FURTHER))
         return look(), views
     return before, views

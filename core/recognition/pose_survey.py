@@ -15,17 +15,18 @@ What somebody has stated of a place or of the map goes before what is found.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from threading import Lock
+from threading import Lock, Thread
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.errors import UnfitIntrinsics
+from core.errors import PlacerecError, UnfitIntrinsics
 from core.geometry.pose import RelativeView, SharedPoints, relative_view, sighting_of
 from core.geometry.verification import verify
 from core.judgement.position import APART, BUNDLE_REACH, PlaceErrors, bearing_between, estimate_pose, places_apart
@@ -33,7 +34,8 @@ from core.maps import Map, own_poses
 from core.places import GEOGRAPHIC, NO_POSE, Whereabouts
 from core.recognition.self_queries import spread_order
 from core.recognition.stages import neighborhood_of
-from core.upkeep.coverage import walks
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -138,7 +140,8 @@ class _Surveyed(NamedTuple):
 
 
 _surveys: WeakKeyDictionary[Map, _Surveyed] = WeakKeyDictionary()
-_lock = Lock()
+_begun: WeakSet[Map] = WeakSet()
+_lock, _surveying = Lock(), Lock()
 
 
 def pose_survey(map_: Map, again: bool = False) -> PoseSurvey:
@@ -150,24 +153,60 @@ def pose_survey(map_: Map, again: bool = False) -> PoseSurvey:
     Raises:
         StorageFailure: the map's files cannot be read.
     """
+    with _surveying:
+        known, holds = _at_hand(map_)
+        if known is not None and holds and not again:
+            return known
+        state = map_.state
+        survey, rows = _survey(map_)
+        snapshot = map_.snapshot()
+        made = _Surveyed(state, len(snapshot), rows, _poses(snapshot.whereabouts_at(rows)), survey)
+        with _lock:
+            _surveys[map_] = made
+        return survey
+
+
+def survey_at_hand(map_: Map) -> PoseSurvey:
+    """The last survey of a map, an empty one before the first; a thread makes one that is wanting or does not hold.
+
+    So no answer waits for it: it takes some seconds.
+    """
+    known, holds = _at_hand(map_)
+    if not holds:
+        with _lock:
+            begins = map_ not in _begun
+            _begun.add(map_)
+        if begins:
+            Thread(target=_survey_later, args=(map_,), name="pose survey", daemon=True).start()
+    return known or PoseSurvey()
+
+
+def _survey_later(map_: Map) -> None:
+    try:
+        pose_survey(map_)
+    except PlacerecError as error:  # the map was closed or deleted meanwhile, or its files cannot be read
+        log.info("The poses of map %r are not surveyed: %s", map_.record.id, error)
+    except Exception:
+        log.exception("The poses of map %r are not surveyed", map_.record.id)
+    finally:
+        with _lock:
+            _begun.discard(map_)
+
+
+def _at_hand(map_: Map) -> tuple[PoseSurvey | None, bool]:
+    """The last survey, None before the first, and whether it still holds."""
     state = map_.state
     with _lock:
         known = _surveys.get(map_)
-    if known is not None and not again:
-        if known.state is state:
-            return known.survey
-        snapshot = map_.snapshot()
-        same = known.places / GROWN < len(snapshot) < known.places * GROWN or len(snapshot) == known.places
-        if same and np.array_equal(_poses(snapshot.whereabouts_at(known.rows)), known.poses, equal_nan=True):
-            with _lock:
-                _surveys[map_] = known._replace(state=state)
-            return known.survey
-    survey, rows = _survey(map_)
+    if known is None or known.state == state:
+        return (None, False) if known is None else (known.survey, True)
     snapshot = map_.snapshot()
-    made = _Surveyed(state, len(snapshot), rows, _poses(snapshot.whereabouts_at(rows)), survey)
+    same = known.places / GROWN < len(snapshot) < known.places * GROWN or len(snapshot) == known.places
+    if not same or not np.array_equal(_poses(snapshot.whereabouts_at(known.rows)), known.poses, equal_nan=True):
+        return known.survey, False
     with _lock:
-        _surveys[map_] = made
-    return survey
+        _surveys[map_] = known._replace(state=state)
+    return known.survey, True
 
 
 def place_errors(map_: Map, rows: Sequence[int], where: Whereabouts, surveyed: bool) -> PlaceErrors:
@@ -190,7 +229,7 @@ def place_errors(map_: Map, rows: Sequence[int], where: Whereabouts, surveyed: b
             radians[np.isnan(radians)] = np.radians(stated.degrees)
     unstated = np.isnan(metres)
     if surveyed:
-        for code, one in pose_survey(map_).traverses.items():
+        for code, one in survey_at_hand(map_).traverses.items():
             of_it = where.sequence == code
             if one.metres is not None:
                 metres[of_it & unstated] = one.metres
@@ -204,7 +243,7 @@ def place_errors(map_: Map, rows: Sequence[int], where: Whereabouts, surveyed: b
 
 def turned_note(map_: Map, code: int) -> str | None:
     """What is to be said of the headings of a traverse, by the code of it; None: nothing."""
-    one = pose_survey(map_).traverses.get(code)
+    one = survey_at_hand(map_).traverses.get(code)
     return None if one is None else one.remark
 
 
@@ -214,7 +253,7 @@ def _survey(map_: Map) -> tuple[PoseSurvey, NDArray[np.int64]]:
     rows = np.flatnonzero(snapshot.alive)
     where = own_poses(map_.counterparts, snapshot.whereabouts_at(rows), rows)
     found, asked = {}, list[int]()
-    ways = [walk for walk in walks(where) if (where.kind[walk] != NO_POSE).any()]
+    ways = [walk for walk in where.walks() if (where.kind[walk] != NO_POSE).any()]
     each = max(LEAST_PAIRS, min(SAMPLES, MOST_SAMPLES // max(1, len(ways))))
     for walk in ways[: MOST_SAMPLES // LEAST_PAIRS]:
         usable = walk[(where.kind[walk] != NO_POSE) & np.isfinite(where.heading[walk])]

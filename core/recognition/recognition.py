@@ -311,7 +311,7 @@ def _answer(map_: Map, encoder: Encoder, query: Query, candidates: Candidates) -
     """Verify and judge the candidates, and look up the best places; again if one was deleted since the search."""
 
     k, judged = query.question.k, partial(judgement_of, map_, encoder)
-    best, views = framed(map_, encoder, query, candidates)
+    best, views = framed(map_, encoder, query, candidates, judged)
     ranked, judgement, stage = third_stage(map_, encoder, best.candidates, judged, best.query)
     attempt = 1
     while None in (places := places_of(map_, ranked.rows, k)) and attempt < ATTEMPTS:

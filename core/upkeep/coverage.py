@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.places import NO_POSE, NO_SEQUENCE, NO_TIME, Whereabouts
+from core.places import NO_POSE, NO_TIME, Whereabouts
 
 Measure = Literal["distance", "time", "similarity"]
 
@@ -80,14 +79,6 @@ def long_steps(steps: NDArray[np.float64], measure: Measure) -> list[Gap]:
         return []
     least = max(LONG * median, median + DEVIATIONS * deviation)
     return [Gap(int(i), measure, float(steps[i]), median) for i in np.flatnonzero(steps > least)]
-
-
-def walks(where: Whereabouts) -> Iterator[NDArray[np.int64]]:
-    """The positions of the places of each sequence of n places, in their order; places without one are in none."""
-    members = np.flatnonzero(where.sequence != NO_SEQUENCE)
-    order = members[np.lexsort((where.ordinal[members], where.sequence[members]))]
-    if len(order):
-        yield from np.split(order, np.flatnonzero(np.diff(where.sequence[order])) + 1)
 
 
 def long_ways(where: Whereabouts, walk: NDArray[np.int64], first: NDArray[np.int64]) -> list[Gap]:

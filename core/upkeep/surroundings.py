@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.places import GEOGRAPHIC, METRIC, SAME_STOREY, Pose, Whereabouts
-from core.upkeep.coverage import walks
 
 FACING = 45.0
 """Degrees from its own direction up to which a camera sees what another one saw, mostly."""
@@ -101,7 +100,7 @@ def _between(
     where: Whereabouts, kind: int, here: NDArray[np.float64], there: NDArray[np.float64], radius: float
 ) -> Between | None:
     """The closest pair of successive frames of one traverse between which a position is, within the radius."""
-    pairs = [np.stack([walk[:-1], walk[1:]]) for walk in walks(where)]
+    pairs = [np.stack([walk[:-1], walk[1:]]) for walk in where.walks()]
     if not pairs:
         return None
     before, after = np.concatenate(pairs, axis=1)

@@ -125,7 +125,7 @@ def gaps_of(map_: Map) -> tuple[list[dict[str, object]], int]:
     if not (where.kind != NO_POSE).any():
         return [], 0
     first = first_looks(where, neighborhood_of(map_))
-    found = [(walk, gap) for walk in coverage.walks(where) for gap in coverage.long_ways(where, walk, first)]
+    found = [(walk, gap) for walk in where.walks() for gap in coverage.long_ways(where, walk, first)]
     found.sort(key=lambda one: -one[1].value)
     ends = [int(rows[walk[gap.before + end]]) for walk, gap in found[:MOST_GAPS] for end in (0, 1)]
     names = ["" if place is None else place.id for place in map_.places_at(ends)]

@@ -292,7 +292,7 @@ def _walks(own: SelfQueries, first: NDArray[np.int64], until: float) -> tuple[li
     From one frame of a stop to the next is no step.
     """
     walks, complete = [], True
-    for ordered in coverage.walks(own.where):
+    for ordered in own.where.walks():
         where = own.where.take(ordered)
         stood = first[ordered[1:]] == first[ordered[:-1]]
         gaps = coverage.long_ways(own.where, ordered, first)

@@ -58,7 +58,8 @@ def test_nothing_is_said_while_not_localized(fields: dict[str, Any]) -> None:
 def test_where_odometry_is_contradicted_a_frame_that_is_recognized_counts_whatever_the_session_believes() -> None:
     measured = {"x": 40.0, "y": 2.0, "heading": 0.0, "spread": 0.3, "covariance": [0.5] * 36}
     single = {"verdict": "recognized", "pose": measured}
-    for fields in ({}, {"verdict": "unknown", "place": None, "candidates": []}):
+    believing: tuple[dict[str, Any], ...] = ({}, {"verdict": "unknown", "place": None, "candidates": []})
+    for fields in believing:
         found = estimate(answer(single=single, motion="contradicted", **fields), 2.0)
         assert found is not None and found.source == "frame" and found.planar.x == 40.0
     assert estimate(answer(single={"verdict": "unknown"}, motion="contradicted", verdict="unknown"), 2.0) is None

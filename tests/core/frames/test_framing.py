@@ -57,5 +57,5 @@ def test_too_little_of_a_view_is_not_compared() -> None:
 
 def test_positions_are_those_of_the_frame() -> None:
     shares = Framing(0.6, 0.5).in_frame(np.array([[0.5, 0.5], [0.2, 0.25], [0.8, 0.75]]))
-    assert np.allclose(shares, [[0.5, 0.5], [0, 0], [1, 1]])
+    assert np.allclose(shares, np.array([[0.5, 0.5], [0, 0], [1, 1]]))
     assert SAME_VIEW.zoomed(0.98).is_like(SAME_VIEW) and not SAME_VIEW.zoomed(0.9).is_like(SAME_VIEW)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from benchmarks.day import pictures
-from benchmarks.day.maps import fields
 from benchmarks.day.walks import WalkPair, corridor, pixels
 from core.frames.framing import SAME_VIEW, Framing
 from core.frames.intrinsics import Intrinsics
@@ -66,8 +65,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
     map_.cameras.put("whole", None, lens(160, 120))
     map_.cameras.put("cut", None, lens(96, 72))
     for number, data in enumerate(pair.references[:PLACES]):
-        made = fields(pair.pose(number * pair.spacing), "walk")
-        pose = Pose(x=made["x"], y=made["y"], heading=made["heading"])
+        x, y, heading = pair.pose(number * pair.spacing)
+        pose = Pose(x=x, y=y, heading=float(np.degrees(heading)) % 360)
         enrol(map_, f"{number}", data, encoder, PlaceFields(sequence="walk", pose=pose, camera="whole"))
     yield Walk(pair, map_, encoder)
     atlas.close()
@@ -133,7 +132,7 @@ def test_another_framing_that_fits_as_well_makes_an_answer_doubtful(walk: Walk) 
 def test_shrunk_cells_lie_in_the_middle() -> None:
     cells = np.random.default_rng(1).integers(-40, 40, (169, 8)).astype(np.int8)
     made, share = shrunk(cells, (13, 13), 0.6)
-    grid = made.reshape(13, 13, 8).any(axis=2)
+    grid = np.asarray(made.reshape(13, 13, 8).any(axis=2))
     size = int(np.sqrt(grid.sum()))
     assert grid.sum() == size**2 and share == size**2 / 169 and 0.2 < share < 0.5
     assert grid[6, 6] and not grid[0].any() and not grid[:, 12].any()

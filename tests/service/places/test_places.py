@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import cv2
 import httpx
@@ -187,7 +188,7 @@ def test_a_level_and_the_accuracy_of_a_pose(server: Server, map_id: str) -> None
     assert (made["level"], made["pose_accuracy"]) == ("2", exact)
     path, places = f"/v1/maps/{map_id}/places/p", f"/v1/maps/{map_id}/places"
     batch = [{"id": "q", "file": "q", "level": -1, "accuracy_metres": 3}, {"id": "r", "file": "r", "level": "EG"}]
-    form = {"places": (None, json.dumps(batch)), **{name: (name, jpeg(2)) for name in "qr"}}
+    form: dict[str, Any] = {"places": (None, json.dumps(batch)), **{name: (name, jpeg(2)) for name in "qr"}}
     sent = server.client.post(f"{places}", files=form).json()["items"]
     assert [item["place"]["level"] for item in sent] == ["-1", "EG"]
     assert sent[0]["place"]["pose_accuracy"] == {"metres": 3.0, "degrees": None}
