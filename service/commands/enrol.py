@@ -121,7 +121,6 @@ def enrol(
         float | None,
         typer.Option(
             "--pose-accuracy",
-            "--accuracy",
             help="Metres: standard deviation of the coordinates of poses whose accuracy places.csv does not give.",
             min=0,
             max=1e6,

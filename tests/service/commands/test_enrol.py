@@ -104,7 +104,7 @@ def test_a_level_and_an_accuracy_for_all_frames_that_have_none(
     placerec: Placerec, monday: Path, server: Server, map_id: str
 ) -> None:
     (monday / "places.csv").write_text("file,x,y,floor,accuracy_metres\n9.jpg,1,2,-1,0.5\n1.jpg,1,2,,\n")
-    given = ("--level", "EG", "--accuracy", 2, "--url", server.client.base_url)
+    given = ("--level", "EG", "--pose-accuracy", 2, "--url", server.client.base_url)
     placerec("enrol", monday, "--map", map_id, *given)
     found = {name: (place["level"], place["pose_accuracy"]["metres"]) for name, place in server.places(map_id).items()}
     assert found == {"9": ("-1", 0.5), "1": ("EG", 2.0)}
