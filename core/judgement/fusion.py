@@ -14,6 +14,7 @@ witness.  A rig of one camera, or of one twice, is a plain query.
 
 Rivals are judged as those of a plain query are, by the difference of the log odds from those of the best place.
 Cameras that each recognize places apart contradict each other: the answer is ambiguous, however sure one of them is.
+So it is where each camera that sees the place may as well see one on another storey.
 
 *Maps.*  Each map's best match has the log odds x_m of being right.  At most one of the maps' matches can be right, and
 perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
@@ -22,7 +23,7 @@ perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 from core.judgement.geometry import Geometry
 from core.judgement.priors import decision_slope, log_odds
 from core.judgement.probability import FARTHEST, sigmoid
-from core.judgement.verdict import EVEN, MOST_RIVALS, Calibration, Judgement, Rivals, Verdict, judge
+from core.judgement.verdict import CLEAR_STOREY, EVEN, MOST_RIVALS, Calibration, Judgement, Rivals, Verdict, judge
 from core.judgement.verdict import log_odds_of as log_odds_of_stages
 from core.places import Neighborhood, Whereabouts
 
@@ -68,6 +69,7 @@ class CameraRanking:
     geometry: the results of verification for the n places; None: none was verified.
     descriptor: of the frame, float32 [D]; None: not known, and the frame is like none of the others.
     recognized: the row that the camera recognizes as a plain query, which may have needed fewer stages; None: none.
+    twins: rows of places on other storeys that the camera may as well see.
     """
 
     rows: NDArray[np.int64]
@@ -78,6 +80,7 @@ class CameraRanking:
     geometry: Geometry | None = None
     descriptor: NDArray[np.float32] | None = None
     recognized: int | None = None
+    twins: tuple[int, ...] = ()
 
     @property
     def values(self) -> Values:
@@ -191,10 +194,20 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     believed = {int(rows[head]) for head, one in zip(heads, judgements, strict=True) if one.verdict == "recognized"}
     believed |= {view.recognized for view in views if view.recognized is not None}
     contradicting = np.flatnonzero(np.isin(rows[order], list(believed)) & ~near[best, order]).tolist()
+    seeing = [view.twins for view, head in zip(views, heads, strict=True) if near[best, head]]
+    twins = [row for one in seeing for row in one] if all(seeing) else []
+    doubles = np.flatnonzero(np.isin(rows[order], twins))
+    left = 1 / (1 + float(np.exp(prior[order][doubles] - prior[best]).max(initial=0.0)))
     imagined = judgements[int(surest.argmax())].imagined
     judgement = _judged(
         total[order], found, near[np.ix_(order, order)], contradicting, calibration, steepness, best_evidence, imagined
     )
+    if judgement.verdict == "recognized" and left < CLEAR_STOREY:
+        named = tuple(Rivals((head,), False) for head in _heads(doubles, near[np.ix_(order, order)]))
+        judgement = replace(judgement, verdict="ambiguous", rivals=named)
+    if judgement.probability is not None:
+        judgement = replace(judgement, probability=min(judgement.probability, left))
+    judgement = replace(judgement, twins=tuple(doubles.tolist()))
     return Fused(judgement, rows[order], places.take(order), found, total[order], prior[order])
 
 

@@ -64,7 +64,8 @@ def locate_rig(
                 for one, candidates, query in zip(verified, ranked, map(_all_of, queries), strict=True)
             ]
         finals, stage = [candidates for candidates, _, _ in verified], _joint_stage([stage for *_, stage in verified])
-        views = [_ranking(*one) for one in zip(finals, queries, alone, strict=True)]
+        twins = [tuple(one.rows[list(found.twins)].tolist()) for one, found, _ in verified]
+        views = [_ranking(*one) for one in zip(finals, queries, alone, twins, strict=True)]
         fused = fuse(views, calibration, neighborhood)
         places = places_of(map_, fused.rows, question.k)
         if None not in places:
@@ -92,14 +93,17 @@ def locate_rig(
 Verified = tuple[Candidates, Judgement, ThirdStage]
 
 
-def _ranking(one: Candidates, query: Query, recognized: int | None = None) -> CameraRanking:
+def _ranking(
+    one: Candidates, query: Query, recognized: int | None = None, twins: tuple[int, ...] = ()
+) -> CameraRanking:
     """The candidates of one camera as the fusion sees them.
 
     Args:
         recognized: the row that the camera recognizes as a plain query.
+        twins: rows of places on other storeys that it may as well see.
     """
     ranked = one.rows, one.scores, one.whereabouts, one.examined, one.weights, one.geometry
-    return CameraRanking(*ranked, query.encoding.descriptor, recognized)
+    return CameraRanking(*ranked, query.encoding.descriptor, recognized, twins)
 
 
 def _all_of(query: Query) -> Query:

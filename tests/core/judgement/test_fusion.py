@@ -69,6 +69,19 @@ def test_a_camera_that_sees_nothing_spoils_nothing() -> None:
     assert found.log_odds[0] > fused(clear).log_odds[0] + np.log(BLIND) + np.log(1 - BLIND)
 
 
+def test_twins_of_storeys_that_all_cameras_see_are_ambiguous_until_a_prior_tells_them() -> None:
+    scores = {3: 0.5, 5: 0.45, **BACKGROUND}
+    one = replace(view(scores), twins=(5,))
+    other = view({3: 0.52, 5: 0.4, **BACKGROUND})
+    found = fused(one, replace(other, twins=(5,))).judgement
+    assert found.verdict == "ambiguous" and found.probability == 0.5
+    assert [list(rival.positions) for rival in found.rivals] == [list(found.twins)]
+    assert fused(one, other).judgement.verdict == "recognized", "the second camera tells them apart"
+    weights = dict.fromkeys(scores, 0.0) | {5: -2.0}
+    stated = [replace(view(seen, weights), twins=(5,)) for seen in (scores, {3: 0.52, 5: 0.4, **BACKGROUND})]
+    assert fused(*stated).judgement.verdict == "recognized"
+
+
 def test_two_that_contradict_each_other_are_ambiguous() -> None:
     found = fused(view({3: 0.5, **BACKGROUND}), view({5: 0.5, **BACKGROUND}))
     assert found.judgement.verdict == "ambiguous" and set(found.rows[:2].tolist()) == {3, 5}
