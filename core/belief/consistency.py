@@ -303,7 +303,7 @@ def _legs(seen: tuple[SeenPlace, ...]) -> tuple[NDArray[np.complex128], NDArray[
 
 
 def described(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> Contradiction:
-    """What odometry looks like beside some sightings; where it stands still by now, what it did before is nothing."""
+    """What odometry looks like beside some sightings: frozen where it stands still by now, whatever it did before."""
     way = _way(graph, list(seen[::-1]))
     legs, by_degrees = _legs(seen)
     for count in (len(seen), LEAST):
