@@ -303,14 +303,16 @@ def _legs(seen: tuple[SeenPlace, ...]) -> tuple[NDArray[np.complex128], NDArray[
 
 
 def described(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> Contradiction:
-    """What odometry looks like beside some sightings."""
+    """What odometry looks like beside some sightings: frozen where it stands still by now, whatever it did before."""
     way = _way(graph, list(seen[::-1]))
     legs, by_degrees = _legs(seen)
-    extent = float(np.abs(way).max())
+    for count in (len(seen), LEAST):
+        shown, gone = (float(np.linalg.norm(one[:count] - one[:count].mean())) for one in (way, legs))
+        if gone < STILL * shown:
+            extent = float(np.abs(way[:count]).max())
+            return Contradiction("frozen", f"odometry stands still while frames show {extent:.0f} m of motion")
     way, legs, by_degrees = way - way.mean(), legs - legs.mean(), by_degrees - by_degrees.mean()
     shown, gone = float(np.linalg.norm(way)), float(np.linalg.norm(legs))
-    if gone < STILL * shown:
-        return Contradiction("frozen", f"odometry stands still while frames show {extent:.0f} m of motion")
     missed = [float(np.linalg.norm(way - one)) for one in (legs, by_degrees)]
     ratio = complex(np.vdot(legs, way)) / gone**2
     left = float(np.linalg.norm(way - ratio * legs))

@@ -16,11 +16,12 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 from placerec_client import Client, DeadlineExceeded, InvalidOdometry, PlacerecError, Problem
+from placerec_ros.answers import Answered, Following, Outlet, filtered
 from placerec_ros.frame_queue import Frame, FrameQueue, Moments
-from placerec_ros.fusion import Fix, Fusion
+from placerec_ros.fusion import Fix
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Odometer
 from placerec_ros.parameters import Settings
@@ -43,32 +44,6 @@ ALTERNATES = (
     "Odometry leaps and returns again and again, as if two publishers alternate on its topic: nobody can know which is "
     "right."
 )
-
-
-@dataclass(frozen=True)
-class Answered:
-    """An answer with what follows from it.
-
-    report: the answer that is published as JSON.
-    robot: the robot's pose in the map by this answer; None while it is not localized.
-    fix: where it is by all answers and odometry; None without odometry of the frame, or if that is not known.
-    """
-
-    frame: Frame
-    report: dict[str, Any]
-    estimate: PoseEstimate | None
-    robot: Planar | None
-    fix: Fix | None
-
-
-class Outlet(Protocol):
-    """Where results go; the worker's thread calls it."""
-
-    def answered(self, answered: Answered) -> None: ...
-
-    def wants_picture(self) -> bool: ...
-
-    def picture(self, frame: Frame, png: bytes) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -111,6 +86,7 @@ class Localizer:
         self._settings, self._outlet, self._health = settings, outlet, health
         self.queue = FrameQueue(settings.queue_length)
         self.odometer = Odometer(settings.speed_limit)
+        self._following = Following(self.odometer, health)
         self._moments: Moments | None = None
         if settings.rig_query:
             self._moments = Moments(settings.camera_names, round(settings.rig_tolerance * NANOSECONDS))
@@ -131,9 +107,6 @@ class Localizer:
         self._run_generation = 0
         self._sent: dict[str, Frame] = {}
         self._camera = ""  # that of the frame under way
-        self._fusion = Fusion()
-        self.fix: Fix | None = None
-        """Where the robot is by all answers so far; None if that is not known. The worker sets it, others read it."""
         self._mapping = ""  # the origin of the odometry whose frame is that of the map that is made; empty if none is
         self._driving: Drive | None = None
         self._paused_until = 0.0
@@ -145,6 +118,11 @@ class Localizer:
         self._thread.start()
 
     # ---- for the node's callbacks; none of these waits
+
+    @property
+    def fix(self) -> Fix | None:
+        """Where the robot is by all answers so far; None if that is not known."""
+        return self._following.fix
 
     def add(self, frame: Frame) -> None:
         """Take in a frame; it is sent if frames are wanted, and not more often than they may be."""
@@ -466,12 +444,10 @@ class Localizer:
         self, frame: Frame, answer: Mapping[str, Any], of_robot: PoseEstimate | None, revision: int | None, took: float
     ) -> None:
         """Take in the robot's pose by an answer, None if it gives none, and hand everything to the outlet."""
-        contradicted = answer.get("motion") == "contradicted"
-        fix = self._fuse(frame, of_robot, contradicted)
+        fix = self._following.take(frame, answer, of_robot)
         limits = self._settings.position_limit, self._settings.heading_limit
         if fix is not None and fix.is_within(*limits) and not fix.unconfirmed:
             self._wanted = False
-        self._judge_odometry(answer, fix)
         self._health.fact("verdict", answer["verdict"])
         self._health.answered(took, None if of_robot is None else str(moment_of(frame.stamp) or "no stamp"))
         report = {
@@ -485,37 +461,11 @@ class Localizer:
             "probability": answer["probability"],
             "place": None if answer["place"] is None else answer["place"]["id"],
             "pose_source": None if of_robot is None else of_robot.source,
-            "filtered": None if fix is None else _filtered(fix),
+            "filtered": None if fix is None else filtered(fix),
             "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
         self._outlet.answered(Answered(frame, report, of_robot, None if of_robot is None else of_robot.planar, fix))
-
-    def _judge_odometry(self, answer: Mapping[str, Any], fix: Fix | None) -> None:
-        """Say so if odometry contradicts the frames, by the session or by the filter."""
-        if answer.get("motion") is not None:
-            self._health.fact("motion", answer["motion"])
-        if answer.get("motion") == "contradicted":
-            kind = answer.get("contradiction") or "inconsistent"
-            why = answer.get("contradiction_note") or "its motion and the frames do not agree"
-            self._health.fact("contradiction", kind)
-            self._health.begins("contradiction", f"Odometry contradicts the frames ({kind}): {why}.")
-        elif fix is not None and fix.track.doubt > 0.5:
-            self._health.fact("contradiction", "inconsistent")
-            self._health.begins("contradiction", f"Odometry contradicts the localizations: {self._fusion.way}.")
-        else:
-            self._health.fact("contradiction", "none")
-            self._health.over("contradiction")
-
-    def _fuse(self, frame: Frame, found: PoseEstimate | None, contradicted: bool) -> Fix | None:
-        """Take in where the robot is by one answer; where it was at its frame, None if odometry has nothing of then."""
-        odom = self.odometer.at(frame.stamp) if frame.stamp else None
-        if odom is None:
-            return None
-        self.fix = self._fusion.add(odom, self.odometer.origin, found, frame.stamp / NANOSECONDS, contradicted)
-        self._health.counts["localizations refused"] = self._fusion.refused
-        self._health.counts["tracks replaced"] = self._fusion.replaced
-        return self.fix
 
     def _mount(self, camera: str) -> Planar:
         """Where a camera is on the robot, or only where it looks if the map has positions of the robot."""
@@ -527,9 +477,7 @@ class Localizer:
     def _forget(self) -> None:
         """Forget where the robot is."""
         self._wanted = True
-        self._fusion.clear()
-        self._health.over("contradiction")
-        self.fix = None
+        self._following.forget()
 
     def _annotate(self, frame: Frame, picture: Any, run: Run) -> None:
         """Send the frame again for a picture, if somebody looks on; the answer of the session is out already."""
@@ -603,7 +551,7 @@ class Localizer:
             return Done(False, "There is no odometry, so the pose cannot be followed.")
         self._forget()
         self._end_runs()
-        self.fix = self._fusion.place(robot, covariance, odom, self.odometer.origin, stamp / NANOSECONDS)
+        self._following.place(robot, covariance, odom, stamp)
         return Done(True, f"The robot is believed to be at x {robot.x:.2f}, y {robot.y:.2f}.")
 
     def _enrol_here(self) -> Done:
@@ -724,13 +672,6 @@ class Localizer:
         now, several = time.monotonic(), bool(self._settings.camera_names)
         fresh = [frame for _, frame in sorted(self._latest.items()) if now - frame.arrived <= FRESH]
         return [frame for frame in fresh if not several or frame.camera in self.mounts]
-
-
-def _filtered(fix: Fix) -> dict[str, Any]:
-    """Where the robot is by all answers, for the JSON: metres, degrees, and the covariance of x, y and yaw, in rad."""
-    robot = fix.track.robot
-    covariance = fix.track.covariance.ravel().tolist()
-    return {"x": robot.x, "y": robot.y, "heading": math.degrees(robot.yaw) % 360, "covariance": covariance}
 
 
 def reason_of(error: PlacerecError) -> PlacerecError:

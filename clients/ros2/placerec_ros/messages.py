@@ -14,9 +14,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from sensor_msgs.msg import CompressedImage, NavSatFix, NavSatStatus
 from std_msgs.msg import String
 
+from placerec_ros.answers import Answered
 from placerec_ros.frame_queue import Frame
 from placerec_ros.fusion import FLAT, Fix
-from placerec_ros.localizer import Answered
 from placerec_ros.odometry import NANOSECONDS
 from placerec_ros.planar import Datum, Planar, quaternion, yaw_of
 from placerec_ros.pose import UNKNOWN_ANGLE, UNKNOWN_HEIGHT, PoseEstimate

@@ -33,12 +33,13 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from placerec_ros import messages
+from placerec_ros.answers import Answered
 from placerec_ros.frame_queue import Frame
 from placerec_ros.frames import StaticFrames, UnfitMount, mount_of
 from placerec_ros.fusion import Fix
 from placerec_ros.health import ERROR, OK, WARN, Health
 from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
-from placerec_ros.localizer import ALTERNATES, Answered, Done, Localizer
+from placerec_ros.localizer import ALTERNATES, Done, Localizer
 from placerec_ros.odometry import NANOSECONDS, stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, refusal, settings
 from placerec_ros.repetition import Repetition

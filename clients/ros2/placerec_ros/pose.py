@@ -54,7 +54,8 @@ def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimat
     """The pose of a session's answer; None unless the session recognizes a place that has a pose in metres.
 
     Where the session finds that odometry contradicts the frames, a frame that is recognized by itself counts, whatever
-    the session believes.
+    the session believes.  Before that, a frame that is recognized far from what the session believes says nothing: the
+    belief may then rest on odometry alone, which must not count twice.
 
     Args:
         answer: ``SessionAnswer`` as JSON.
@@ -70,8 +71,8 @@ def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimat
     believed = answer["place"]["pose"]
     if is_measured:
         reach = same_place_radius + min(3 * (measured.get("spread") or 0.0), MOST_BESIDE)
-        if math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"]) <= reach:
-            return _of_frame(measured)
+        apart = math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"])
+        return _of_frame(measured) if apart <= reach else None
     return _of_belief(answer["candidates"], same_place_radius)
 
 

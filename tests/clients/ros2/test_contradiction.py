@@ -8,9 +8,10 @@ from typing import Any, cast
 
 import pytest
 
+from placerec_ros.answers import Answered
 from placerec_ros.frame_queue import Frame
 from placerec_ros.health import WARN, Health
-from placerec_ros.localizer import Answered, Localizer
+from placerec_ros.localizer import Localizer
 from placerec_ros.parameters import PARAMETERS, settings
 from placerec_ros.planar import Planar
 from placerec_ros.pose import PoseEstimate

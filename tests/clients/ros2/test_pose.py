@@ -63,20 +63,19 @@ def test_where_odometry_is_contradicted_a_frame_that_is_recognized_counts_whatev
         found = estimate(answer(single=single, motion="contradicted", **fields), 2.0)
         assert found is not None and found.source == "frame" and found.planar.x == 40.0
     assert estimate(answer(single={"verdict": "unknown"}, motion="contradicted", verdict="unknown"), 2.0) is None
-    believed = estimate(answer(single=single, motion="odometry"), 2.0)
-    assert believed is not None and believed.source == "belief"
 
 
 @pytest.mark.parametrize(
-    "single",
-    [
-        {"verdict": "ambiguous", "pose": None},
-        {"verdict": "recognized", "pose": {"x": 40.0, "y": 2.0, "spread": 0.3, "covariance": [0.0] * 36}},
-        {"verdict": "recognized", "pose": {"x": 15.0, "y": 2.0, "spread": 8.0, "covariance": [0.0] * 36}},
-    ],
-    ids=["the frame alone is not", "the frame alone is elsewhere", "is elsewhere in a map of places far apart"],
+    ("x", "spread"), [(40.0, 0.3), (15.0, 8.0)], ids=["in a dense map", "in a map of places far apart"]
 )
-def test_the_belief_gives_the_pose_where_the_frame_alone_does_not(single: dict[str, Any]) -> None:
+def test_a_frame_that_is_recognized_far_from_the_belief_says_nothing(x: float, spread: float) -> None:
+    """The belief may rest on odometry alone, and the frame may be wrong."""
+    measured = {"x": x, "y": 2.0, "heading": 0.0, "spread": spread, "covariance": [0.5] * 36}
+    assert estimate(answer(single={"verdict": "recognized", "pose": measured}, motion="odometry"), 2.0) is None
+
+
+def test_the_belief_gives_the_pose_where_the_frame_alone_does_not() -> None:
+    single = {"verdict": "ambiguous", "pose": None}
     near = {"id": "p1", "pose": {"x": 1.0, "y": 2.0, "heading": 10.0}}
     far = {"id": "p9", "pose": {"x": 11.0, "y": 2.0, "heading": 350.0}}
     candidates = [{"probability": 0.6, "place": near}, {"probability": 0.2, "place": far}]

@@ -198,6 +198,13 @@ def test_a_detour_out_of_the_map_is_no_fault_of_odometry(graph: PlaceGraph) -> N
         assert run.contradiction is None
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_odometry_that_stands_still_by_now_is_frozen_whatever_it_did_before(graph: PlaceGraph, seed: int) -> None:
+    rows = range(20, 90)
+    told = follow(graph, rows, poses(rows, FAULTS["frozen"][0], range(40, 70)), seed=seed)
+    assert set(told.kinds[40:]) == {None, "frozen"}
+
+
 def test_a_map_without_poses_checks_nothing() -> None:
     graph = graph_of(walk(PLACES), Neighborhood(5.0, 2))
     rows = range(20, 60)

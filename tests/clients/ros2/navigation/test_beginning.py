@@ -113,12 +113,12 @@ def test_the_camera_is_found_on_the_robot(moving: Robot) -> None:
     robot.peer.do("publish", topic="/tf_static", kind="TFMessage", **fields)
     begin(robot, poses_of="camera", odom_frame="robot1/odom", **SURE)
     robot.connected("/tf_static")
-    robot.odometry(-2.0, 5.0, -90.0)
+    robot.odometry(-3.0 - FOUND, 5.0, -90.0)
     until(lambda: (robot.look(number=0), robot.says("")["values"].get("camera on the robot"))[1])
     robot.answers_settled()
     robot.peer.take("pose")
     for number in range(1, FOUND + 2):
-        robot.odometry(-2.0, 5.0, -90.0)
+        robot.odometry(number - 3.0 - FOUND, 5.0, -90.0)
         answer = robot.asked(number)
     pose = until(lambda: robot.peer.take("pose"))[-1]
     camera = answer["answer"]["single"]["pose"]
