@@ -126,7 +126,9 @@ def test_another_framing_that_fits_as_well_makes_an_answer_doubtful(walk: Walk) 
     assert doubtful.verdict == "ambiguous" and (doubtful.probability or 1) < 0.5
     (rival,) = doubtful.rivals
     assert walk.map_.places_at([int(here.candidates.rows[rival.positions[0]])])[0].id == "30"  # type: ignore[union-attr]
-    assert doubted(sure, plain.candidates, plain, [plain, here], near) == sure
+    whole, beside = view(30, SAME_VIEW, 0.3), view(31, Framing(0.7, 0.7), 0.29)
+    assert doubted(sure, whole.candidates, whole, [whole, beside], near) == sure
+    assert doubted(sure, whole.candidates, whole, [whole, here], near).verdict == "ambiguous"
 
 
 def test_shrunk_cells_lie_in_the_middle() -> None:
