@@ -1,11 +1,15 @@
 """The errors of poses where the places of a map are far apart, and whether their covariance covers them.
 
-    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--spacings 2,4,6,8,12] [--starts 2] [--noise 0]
-        [--auto]
+    python -m benchmarks.geometry.spacing [--data ../shared/datasets] [--scene kitti] [--spacings 2,4,6,8,12]
+        [--starts 2] [--noise 0,0.5] [--stated no,yes] [--auto]
 
 The frames of kitti_short stand about 1.2 m apart, with measured poses.  Every second, fourth, … of them is a place of a
 map, with its x, y and heading and the camera's intrinsics.  The others are asked with ``verify`` ``always``, or
-``auto``.  Maps that begin at other frames give more cases.
+``auto``.  Maps that begin at other frames give more cases.  ``--scene street`` is a rendered street with two bends
+(:mod:`benchmarks.geometry.street`), a frame a metre, and queries aside of it.
+
+Each ``--noise`` of the poses of places makes rows.  Where it is ``--stated``, the map has it as its accuracy (what is
+usual, where there is none); else pictures estimate it, before the first question.
 
 Only recognized frames have a pose.  The normalized estimation error squared, e^T P^-1 e over the number of its values,
 is 1 on average if a covariance P is right, and less if it is careful (Bar-Shalom, Li and Kirubarajan, 2001, section
@@ -16,16 +20,19 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
+import time
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.geometry.pose import OPTICAL, Errors, add_pose
+from benchmarks.geometry.pose import JUDGED, OPTICAL, PICTURES, Errors, add_pose, photographs
+from benchmarks.geometry.street import street_traverse
 from benchmarks.report import report
 from core.frames.images import decode
 from core.frames.intrinsics import Intrinsics
@@ -33,11 +40,13 @@ from core.frames.preprocessing import Pixels
 from core.frames.traverses import find_images
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
+from core.judgement.position import PLACE_POSITION
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import load_xfeat
-from core.places import PlaceFields, Pose
+from core.places import PlaceFields, Pose, PoseAccuracy
+from core.recognition.pose_survey import pose_survey
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import describe, locate
 from core.storage import Atlas
@@ -45,13 +54,16 @@ from core.storage import Atlas
 Array = NDArray[np.float64]
 SPACINGS = "2,4,6,8,12"
 CAMERA = "front"
+INSIDE = 5.991
+"""The squared Mahalanobis distance within which 95 % of errors of two values are."""
 
 
 @dataclass(frozen=True)
 class MeasuredTraverse:
-    """Frames whose poses were measured.
+    """Frames whose poses are known.
 
     poses: x, y and heading in degrees, float64 [n, 3], of the camera.
+    mapped: how many of the first frames may be places; where there are no others, those between places are asked.
     """
 
     frames: list[Pixels]
@@ -59,6 +71,7 @@ class MeasuredTraverse:
     keypoints: list[Keypoints]
     poses: Array
     camera: Intrinsics
+    mapped: int
 
 
 @dataclass(frozen=True)
@@ -66,6 +79,7 @@ class SpacingOutcome:
     """The answers at one spacing: for each recognized frame the distance to the best place in metres, and more.
 
     places: how many places the pose rests on.
+    surveys: seconds of a core that each map took to say how exact its poses are, and the metres that it found.
     """
 
     asked: list[int] = field(default_factory=list)
@@ -74,6 +88,7 @@ class SpacingOutcome:
     headings: Errors = field(default_factory=lambda: Errors([], [], []))
     sources: list[str] = field(default_factory=list)
     places: list[int] = field(default_factory=list)
+    surveys: list[tuple[float, float | None]] = field(default_factory=list)
 
     def row(self) -> dict[str, float]:
         """The figures by the names of the table's columns."""
@@ -82,13 +97,15 @@ class SpacingOutcome:
             "recognized": len(self.distances),
             "to the best place (m)": float(np.median(self.distances)),
             "position (m)": float(np.median(self.positions.errors)),
+            "stated (m)": float(np.median(self.positions.deviations)),
+            "inside 95 %": float(np.mean(2 * np.array(self.positions.normalized) < INSIDE)),
             "normalized, position": float(np.mean(self.positions.normalized)),
             "heading (°)": float(np.median(np.abs(self.headings.errors))),
             "normalized, heading": float(np.mean(self.headings.normalized)),
-            "stated (m)": float(np.median(self.positions.deviations)),
             "stated (°)": float(np.median(self.headings.deviations)),
             "by geometry": float(np.mean([source == "intrinsics" for source in self.sources])),
             "places": float(np.mean(self.places)),
+            "survey (s)": float(np.mean([seconds for seconds, _ in self.surveys])),
         }
 
 
@@ -109,31 +126,53 @@ def measured_traverse(encoder: Encoder, folder: Path) -> MeasuredTraverse:
     attitudes = OPTICAL @ matrices[:, :, :3] @ OPTICAL.T
     positions = matrices[:, :, 3] @ OPTICAL.T
     headings = np.degrees(np.arctan2(attitudes[:, 1, 0], attitudes[:, 0, 0]))
+    poses = np.column_stack([positions[:, :2], headings])
+    return described(encoder, frames, poses, camera, len(frames))
+
+
+def rendered_traverse(encoder: Encoder, data: Path, asked: int) -> MeasuredTraverse:
+    """The rendered street with photographs of eval/, and frames that are only asked."""
+    pictures = [picture for name in JUDGED for picture in photographs(data / name, PICTURES)]
+    made = street_traverse(pictures, np.random.default_rng(4), asked)
+    assert made.camera is not None
+    poses = np.vstack([made.poses, made.true])
+    return described(encoder, [*made.places, *made.queries], poses, made.camera, len(made.places))
+
+
+def described(
+    encoder: Encoder, frames: list[Pixels], poses: Array, camera: Intrinsics, mapped: int
+) -> MeasuredTraverse:
+    """The traverse of frames, with their descriptors and keypoints."""
     network = load_xfeat()
+    encodings = [encoder.encode(frame) for frame in frames]
     return MeasuredTraverse(
-        frames,
-        [encoder.encode(frame) for frame in frames],
-        [find_keypoints(network, frame) for frame in frames],
-        np.column_stack([positions[:, :2], headings]),
-        camera,
+        frames, encodings, [find_keypoints(network, frame) for frame in frames], poses, camera, mapped
     )
 
 
 def outcome(
-    encoder: Encoder, traverse: MeasuredTraverse, spacing: int, starts: int, when: Verify, noise: float = 0.0
+    encoder: Encoder,
+    traverse: MeasuredTraverse,
+    spacing: int,
+    starts: int,
+    when: Verify,
+    noise: float = 0.0,
+    states: bool = False,
 ) -> SpacingOutcome:
     """The answers with every ``spacing``-th frame as a place, in maps that begin at several frames.
 
     Args:
         noise: metres, the deviation of errors of the places' x and of their y.
+        states: whether the map states it.
     """
+    exact = PoseAccuracy(metres=max(noise, PLACE_POSITION)) if states else None
     found = SpacingOutcome()
     errors = np.random.default_rng(1).normal(0, noise, (len(traverse.poses), 2))
     stated = traverse.poses + np.pad(errors, ((0, 0), (0, 1)))
     for start in np.unique(np.linspace(0, spacing, starts, endpoint=False).astype(int)).tolist():
         with tempfile.TemporaryDirectory() as folder:
-            places = list(range(start, len(traverse.frames), spacing))
-            ask(encoder, traverse, places, stated, Path(folder), when, found)
+            places = list(range(start, traverse.mapped, spacing))
+            ask(encoder, traverse, places, stated, exact, Path(folder), when, found)
     return found
 
 
@@ -142,6 +181,7 @@ def ask(
     traverse: MeasuredTraverse,
     places: list[int],
     stated: Array,
+    exact: PoseAccuracy | None,
     folder: Path,
     when: Verify,
     found: SpacingOutcome,
@@ -150,9 +190,10 @@ def ask(
 
     Args:
         stated: the poses that the places are enrolled with, as those of the traverse.
+        exact: how exact the map states them to be.
     """
     atlas = Atlas(folder)
-    settings = MapSettings(keep="none")
+    settings = MapSettings(keep="none", pose_accuracy=exact)
     map_ = atlas.create("spaced", encoder.identity, encoder.dimension, settings, encoder.local_shape)
     map_.cameras.put(CAMERA, None, traverse.camera)
     map_.enrol(
@@ -170,7 +211,11 @@ def ask(
             for number in places
         ]
     )
-    queries = sorted(set(range(places[0], places[-1])) - set(places))
+    began = time.process_time()
+    survey = pose_survey(map_).traverses.values()
+    found.surveys.append((time.process_time() - began, next((one.metres for one in survey), None)))
+    between = sorted(set(range(places[0], places[-1])) - set(places))
+    queries = list(range(traverse.mapped, len(traverse.frames))) or between
     question = Question(k=1, verify=when, camera=CAMERA)
     keypoints = traverse.keypoints
     asked = [Query(traverse.encodings[number], question, partial(keypoints.__getitem__, number)) for number in queries]
@@ -194,36 +239,47 @@ def pose(values: Array) -> Pose:
 
 def main(
     data: Annotated[Path, typer.Option(help="Folder of eval/.")] = Path("../shared/datasets"),
+    scene: Annotated[Literal["kitti", "street"], typer.Option(help="Measured, or rendered with bends.")] = "kitti",
+    asked: Annotated[int, typer.Option(min=1, help="Frames that are asked on the rendered street.")] = 60,
     spacings: Annotated[str, typer.Option(help="Frames from place to place, separated by commas.")] = SPACINGS,
     starts: Annotated[int, typer.Option(min=1, help="Maps of each spacing, which begin at different frames.")] = 2,
-    noise: Annotated[float, typer.Option(help="Metres, the deviation of errors of places' x and y.")] = 0.0,
+    noise: Annotated[str, typer.Option(help="Metres, deviations of errors of places' x and y, by commas.")] = "0",
+    stated: Annotated[str, typer.Option(help="Whether maps state how exact poses are: no, yes or no,yes.")] = "no",
     auto: Annotated[bool, typer.Option(help="Verify where the scores leave doubt or a pose is wanted.")] = False,
 ) -> None:
     """Measure, print a table and write JSON."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    traverse = measured_traverse(encoder, data / "eval" / "kitti_short")
+    folder = data / "eval" / "kitti_short"
+    traverse = measured_traverse(encoder, folder) if scene == "kitti" else rendered_traverse(encoder, data, asked)
     when: Verify = "auto" if auto else "always"
-    apart = [int(spacing) for spacing in spacings.split(",")]
-    found = {spacing: outcome(encoder, traverse, spacing, starts, when, noise) for spacing in apart}
-    rows = [{"frames apart": spacing, **one.row()} for spacing, one in found.items() if one.distances]
+    cases = list(product(map(int, spacings.split(",")), map(float, noise.split(",")), stated.split(",")))
+    found = {
+        (apart, off, says): outcome(encoder, traverse, apart, starts, when, off, says == "yes")
+        for apart, off, says in cases
+    }
+    rows = [
+        {"frames apart": apart, "noise (m)": off, "accuracy stated": says, **one.row()}
+        for (apart, off, says), one in found.items()
+        if one.distances
+    ]
     columns = list(rows[0]) if rows else []
     figures = {
         "rows": rows,
         "cases": {
-            str(spacing): {
+            ", ".join(map(str, case)): {
                 "distance": one.distances,
                 "error": one.positions.errors,
                 "normalized": one.positions.normalized,
                 "turn": one.headings.errors,
                 "source": one.sources,
+                "surveys": one.surveys,
             }
-            for spacing, one in found.items()
+            for case, one in found.items()
         },
     }
-    title = "Poses in maps of kitti_short with places far apart"
-    report(
-        "pose_spacing_auto" if auto else "pose_spacing", title, columns, [list(row.values()) for row in rows], figures
-    )
+    title = f"Poses in maps of {scene} with places far apart"
+    name = "_".join(["pose_spacing", scene, *["auto"] * auto])
+    report(name, title, columns, [list(row.values()) for row in rows], figures)
 
 
 if __name__ == "__main__":

@@ -63,6 +63,9 @@ CLEAR = np.radians(20)
 LOOSE, FAR = np.radians(3.5), 1.2
 """Deviation by which directions of shifts are off besides, and how far pairs are whose bearings tell the errors of
 positions, in medians: from far away shifts are often wrong, as on kitti_short from 14 m on."""
+BACKWARDS = 0.1
+"""Share of shifts that point backwards: from some 10 m away wrong matches may say on which side of the camera the scene
+is, which has nothing to do with errors of positions."""
 SATELLITES = 3.0
 """Metres: poses on the Earth, of which nobody states more, are by a receiver without corrections.  All places around
 are off by the same, which no picture shows (GPS Standard Positioning Service, 2020: 95 % within 8 m at worst)."""
@@ -346,7 +349,11 @@ def _likeliest(
     for at, metres in enumerate(TRIED.tolist()):
         for pair in across:
             variance = pair.variance + LOOSE**2 + np.nan_to_num(heading) ** 2 + 2 * (metres / pair.metres) ** 2
-            costs[at] += _surprise(_wrapped(pair.bearing - turned) ** 2 / variance, np.log(variance), 1)
+            either = [
+                _surprise(_wrapped(pair.bearing - turned + about) ** 2 / variance, np.log(variance), 1)
+                for about in (0, np.pi)
+            ]
+            costs[at] -= np.logaddexp(np.log1p(-BACKWARDS) - either[0], np.log(BACKWARDS) - either[1])
         for sample in seen:
             count = len(sample.places)
             errors = PlaceErrors(
