@@ -249,7 +249,10 @@ Camera = Annotated[str, CAMERAS]
 
 
 def _level_text(value: Any) -> Any:
-    """The text of a level; a whole number becomes its digits."""
+    """The text of a level; a whole number becomes its digits, also if it is written as ``2.0`` or `` 02``."""
+    if isinstance(value, str):
+        stripped = value.strip()
+        return str(int(stripped.split(".")[0])) if re.fullmatch(r"[+-]?\d{1,20}(\.0+)?", stripped) else stripped
     whole = isinstance(value, int | float) and not isinstance(value, bool) and value == value // 1
     return str(int(value)) if whole else value
 

@@ -324,10 +324,10 @@ def described(seen: tuple[SeenPlace, ...], graph: PlaceGraph) -> Contradiction:
     for unit, name in UNITS.items():
         if 0.7 < scale / unit < 1.4:
             return Contradiction("units", f"odometry goes {scale:.3g} m for each metre of the map: {name}?")
-    length = f"odometry goes {scale:.2g} m for each metre of the map"
+    length = f"goes {scale:.2g} m for each metre of the map"
     if abs(math.radians(turn)) >= TURNED:
-        more = "" if 1 / SCALED < scale < SCALED else f", and {length.removeprefix('odometry ')}"
+        more = "" if 1 / SCALED < scale < SCALED else f", and it {length}"
         return Contradiction("turned", f"the headings of odometry are turned by {turn:.0f}° against the map{more}")
     if not 1 / SCALED < scale < SCALED:
-        return Contradiction("scale", length)
+        return Contradiction("scale", f"odometry {length}")
     return Contradiction("inconsistent", "odometry goes another way than frames show, by no one scale or turn")

@@ -50,7 +50,7 @@ def to_bytes(state: RunState) -> bytes:
         "pending_reach": state.pending_reach,
         "pose": _pose_fields(pose),
         "sighting": None if sighting is None else [sighting.row, sighting.probability],
-        "storey": [state.storey.level, state.storey.height],
+        "storey": [state.storey.level, state.storey.height, state.storey.last],
         "check": _check_fields(state.check),
         "looks": [
             [len(one.seen.rows), one.seen.unknown, one.share, one.frames, one.constant, one.change]

@@ -44,6 +44,7 @@ from core.belief.odometry import FASTEST, OdometryPose, motion_between
 from core.belief.speeds import PRIOR, SPEEDS, TRACKED, UNKNOWN, Speeds, mixture, news, plausible
 from core.belief.storeys import UNSTATED, Storey, after_lift, later, undecided, weighed
 from core.belief.view import HEIGHT, WIDTH, View, novelty
+from core.places import NO_LEVEL
 
 Sight = Literal["covered", "constant"]
 """Why a frame does not count: it shows hardly anything, or what the last frame that counted shows."""
@@ -103,6 +104,15 @@ class CountedLook:
     frames: int
     constant: int
     change: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Below:
+    """The belief on the storey from which a robot climbs, what it stated there, and the metres that count so far."""
+
+    belief: Belief
+    storey: Storey
+    climb: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +199,7 @@ class Run:
         self.unlike = 0.0
         self.pose: OdometryPose | None = None
         self.storey = UNSTATED
+        self._below: _Below | None = None
         self._view: View | None = None
         self._sighting: Sighting | None = None
         self._guided = False
@@ -218,7 +229,7 @@ class Run:
     def place_on(self, graph: PlaceGraph) -> None:
         """Continue on another graph, after the map's places have changed."""
         if graph is not self.graph:
-            self.belief = reindexed(self.belief, self.graph, graph)
+            self.belief, self._below = reindexed(self.belief, self.graph, graph), None
             self._smoother.clear()
             self.graph = graph
 
@@ -254,13 +265,10 @@ class Run:
             pose: where odometry says that the robot is, from which the motion to the next frame is computed.
             storey: what the robot states of its storey.
         """
-        before, (self.storey, climb) = self.storey, later(self.storey, storey, self.graph.neighborhood.height)
-        if climb is not None and self.frames:
-            self.belief = after_lift(self.belief, self.graph, before, self.storey, climb)
-            self._smoother.clear()
+        self._climb(storey)
         change = None if view is None or self._view is None else view.change(self._view)
         new = 1.0 if change is None else novelty(change)
-        fitting = fits(self.belief, seen, self.graph) or self._confirms(seen.sighting)
+        fitting = fits(self.belief, seen, self.graph) or (self._confirms(seen.sighting) and not self._moves_on(step))
         shows_nothing = seen is NOTHING and len(self.graph) > 0
         if shows_nothing or (view is not None and view.uniform and not fitting):
             self.sight, seen, share, change = "covered", NOTHING, 1.0, None
@@ -284,6 +292,31 @@ class Run:
         self.constant = self.constant + 1 if stands else 0
         self.pose = pose
         self.frames += 1
+
+    def _climb(self, storey: Storey) -> None:
+        """Take in what the robot states of its storey; one that the map does not have says nothing."""
+        if storey.level != NO_LEVEL and not (self.graph.whereabouts.level == storey.level).any():
+            storey = replace(storey, level=NO_LEVEL)
+        limit, before = self.graph.neighborhood.height, self.storey
+        self.storey, climb = later(before, storey, limit)
+        if climb is None or not self.frames:
+            if self._below is not None:  # it has come back
+                self.belief = self._below.belief
+            self._below = None
+            return
+        below = self._below or _Below(self.belief, before, math.nan)
+        if not abs(climb - below.climb) <= limit / 3:
+            self.belief = after_lift(below.belief, self.graph, below.storey, self.storey, climb)
+            self._smoother.clear()
+            below = replace(below, climb=climb)
+        self._below = below if self.storey.climbs(limit) else None
+
+    def _moves_on(self, step: Step) -> bool:
+        """Whether odometry that nothing contradicts has left the place of the last frame that was recognized."""
+        if step.odometry is None or self.contradiction is not None:
+            return False
+        moved = self._check.path + step.odometry.distance
+        return moved > max(self.graph.neighborhood.radius, self.graph.spacing)
 
     def _trusted(
         self, step: Step, seen: Evidence, share: float, change: float | None, pose: OdometryPose | None
@@ -478,7 +511,7 @@ class Run:
         run._pending = Pending(state.odometry, state.reach)
         run._view, run.blind, run.constant = state.view, state.blind, state.constant
         run._pending_reach, run.pose, run._sighting = state.pending_reach, state.pose, state.sighting
-        run.storey = state.storey
+        run.storey = state.storey.arrived() if state.storey.climbs(graph.neighborhood.height) else state.storey
         run._check, run._looks, run.unlike = state.check, deque(state.looks, REPLAYED), state.unlike
         if state.frames and len(graph):
             rest = max(0.0, 1 - float(state.masses.sum(dtype=np.float64)))

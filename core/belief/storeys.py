@@ -8,7 +8,7 @@ storeys that fit, and the frames say where.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,25 @@ from core.places import NO_LEVEL
 
 @dataclass(frozen=True)
 class Storey:
-    """What is stated of a robot's storey: the code of its level, or NO_LEVEL; its height in metres, by a barometer for
-    example, of which differences alone count; None: not stated."""
+    """What is stated of a robot's storey.
+
+    level: its code, or NO_LEVEL.
+    height: metres, by a barometer for example, on the storey where the robot is or, while it climbs, was last;
+        differences alone count.  None: not stated.
+    last: the height that was stated last.
+    """
 
     level: int = NO_LEVEL
     height: float | None = None
+    last: float | None = field(default=None, compare=False)
+
+    def climbs(self, limit: float) -> bool:
+        """Whether the robot is on the way from its storey, more than so many metres from it."""
+        return self.height is not None and self.last is not None and abs(self.last - self.height) > limit
+
+    def arrived(self) -> Storey:
+        """The same on the storey whose height was stated last."""
+        return Storey(self.level, self.height if self.last is None else self.last, self.last)
 
 
 UNSTATED = Storey()
@@ -34,9 +48,16 @@ UNSTATED = Storey()
 LIKELY = 512
 """At most this many of the likeliest places are those from which a robot may have come."""
 
+FOLLOWS = 0.1
+"""Share by which the height of a storey follows each height that is stated on it: a barometer that drifts by 0.1 m from
+frame to frame climbs no storey, and stairs of 0.25 m from frame to frame do."""
+
+SETTLED = 0.1
+"""Metres between two heights from which on a robot climbs on."""
+
 
 def later(before: Storey, now: Storey, limit: float) -> tuple[Storey, float | None]:
-    """What is stated after a frame, and by how many metres the robot has climbed since the last storey.
+    """What is stated after a frame, and by how many metres the robot has climbed from the last storey.
 
     Args:
         limit: metres within which two heights may be on one storey.
@@ -44,19 +65,22 @@ def later(before: Storey, now: Storey, limit: float) -> tuple[Storey, float | No
     Returns:
         The statements that hold now; and NaN for a height that is not known, None where the robot stays on its storey.
     """
-    climb = None if now.height is None or before.height is None else now.height - before.height
-    leaps = climb is not None and abs(climb) > limit
-    changes = now.level != NO_LEVEL and before.level not in (NO_LEVEL, now.level)
-    height = now.height if leaps or changes or before.height is None else before.height
-    level = before.level if now.level == NO_LEVEL and not leaps else now.level
-    if not leaps and not changes:
-        return Storey(level, height), None
-    return Storey(level, height), climb if leaps and climb is not None else float("nan")
+    level = before.level if now.level == NO_LEVEL else now.level
+    last = before.last if now.height is None else now.height
+    if now.level != NO_LEVEL and before.level not in (NO_LEVEL, now.level):
+        return Storey(level, now.height, last), float("nan")
+    if now.height is None or before.height is None:
+        return Storey(level, before.height if now.height is None else now.height, last), None
+    climb = now.height - before.height
+    if abs(climb) <= limit:
+        return Storey(level, before.height + FOLLOWS * climb, last), None
+    settled = before.last is not None and abs(now.height - before.last) <= SETTLED
+    return Storey(now.level, now.height if settled else before.height, last), climb
 
 
 def after_lift(belief: Belief, graph: PlaceGraph, before: Storey, now: Storey, climb: float) -> Belief:
     """The belief of a robot that has come to another storey: to the level that it states, if the map has it, else from
-    each place where it may have been to those that are as much higher or, if there are none, on any other storey.
+    each place where it may have been to those that are as much higher or, where heights are not known, on any other one.
 
     Args:
         before, now: what it stated on the storeys.
@@ -68,12 +92,13 @@ def after_lift(belief: Belief, graph: PlaceGraph, before: Storey, now: Storey, c
     was = weighed(belief, graph, before).given
     likely = np.argsort(-was, kind="stable")[:LIKELY]
     there = np.abs(where.height - where.height[likely, np.newaxis] - climb) <= limit
-    if not there.any():
+    heights_are_known = bool(np.isfinite(where.height[likely]).any())
+    if not there.any() and not heights_are_known:
         there = where.on_other_levels(every, likely[:, np.newaxis], limit)
     if now.level != NO_LEVEL and (where.level == now.level).any():
         there = np.broadcast_to(where.level == now.level, there.shape)
-    if not there.any():
-        return belief
+    if not there.any():  # between storeys, or on one that the map does not have
+        return replace(uninformed(len(graph)), unknown=belief.unknown) if heights_are_known else belief
     arrived = was[likely] @ (there / np.maximum(there.sum(axis=1, keepdims=True), 1))
     anywhere = uninformed(len(graph))
     given = (1 - TRUST) * anywhere.given + TRUST * arrived / arrived.sum()

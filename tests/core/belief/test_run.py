@@ -387,6 +387,19 @@ def test_people_before_a_robot_that_stands_by_odometry_do_not_drive_it_out_of_th
         assert run.estimate(1, alive(graph)).verdict == "recognized"
 
 
+def test_a_view_that_stays_while_odometry_goes_on_is_believed_no_more() -> None:
+    random, graph = np.random.default_rng(5), graph_of(posed([(float(i), 0.0) for i in range(300)]))
+    run = Run(DEFAULT, graph)
+    for row in range(100, 120):
+        run.advance(recognized_at(row, 0.9), Step(odometry=Odometry(1.0)), view(row))
+    verdicts = []
+    for _ in range(15):
+        run.advance(recognized_at(119, 0.9), Step(odometry=Odometry(1.0)), view(119))
+        assert run.sight == "constant"
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    assert verdicts[0] == "recognized" and verdicts[-6:] == ["unknown"] * 6, "it slips, or its camera is stuck"
+
+
 def test_single_frames_that_do_not_fit_do_not_unsettle_a_robot_that_stands() -> None:
     random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
     run = Run(DEFAULT, graph)

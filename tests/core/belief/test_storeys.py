@@ -92,11 +92,41 @@ def test_a_leap_of_the_height_is_a_lift(known: str) -> None:
     assert shares(run)[1] > 0.85, "from the upper storey it could not have gone up" if before[0] < 0.6 else before
 
 
+LIFT = (0.4, 1.2, 2.0, 2.8, 3.6, 4.0, 4.0, 4.0)
+STAIRS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.0)
+STEEP = (2.0, 4.0, 4.0)
+
+
+@pytest.mark.parametrize("way", [LIFT, STAIRS, STEEP])
+@pytest.mark.parametrize("known", ["heights", "both"])
+def test_a_climb_of_several_frames_ends_on_the_storey_that_it_leads_to(known: str, way: tuple[float, ...]) -> None:
+    run = Run(RunOptions(), building(known))
+    run.advance(Evidence(np.array([0]), np.array([6.0], np.float32), 0.5), Step(), storey=Storey(height=250.0))
+    for x in range(1, 4):
+        run.advance(twins(x), Step(reach=1.0), storey=Storey(height=250.0))
+    assert shares(run)[0] > 0.9
+    for height in way:
+        run.advance(twins(4, 0.0), Step(reach=0.1), storey=Storey(height=250.0 + height))
+    assert shares(run)[1] > 0.85
+    for height in (2.0, 0.5, 0.0, 0.0):
+        run.advance(twins(4, 0.0), Step(reach=0.1), storey=Storey(height=250.0 + height))
+    assert shares(run)[0] > 0.85
+
+
+def test_a_barometer_that_drifts_is_no_lift_and_a_level_that_the_map_lacks_says_nothing() -> None:
+    run = Run(RunOptions(), building("both"))
+    run.advance(Evidence(np.array([0]), np.array([6.0], np.float32), 0.5), Step(), storey=Storey(height=250.0))
+    for number in range(60):
+        run.advance(twins(1, 0.0), Step(reach=0.1), storey=Storey(77, 250.0 + 0.05 * number))
+    assert shares(run)[0] > 0.8 and run.storey.level == NO_LEVEL
+
+
 def test_what_is_stated_of_a_storey() -> None:
     assert later(UNSTATED, Storey(3, 10.0), 1.5) == (Storey(3, 10.0), None)
     assert later(Storey(3, 10.0), UNSTATED, 1.5) == (Storey(3, 10.0), None)
-    assert later(Storey(3, 10.0), Storey(3, 11.4), 1.5) == (Storey(3, 10.0), None), "the height is that of the storey"
-    assert later(Storey(3, 10.0), Storey(height=14.0), 1.5) == (Storey(NO_LEVEL, 14.0), 4.0)
+    assert later(Storey(3, 10.0), Storey(3, 11.4), 1.5) == (Storey(3, 10.14), None), "a barometer drifts"
+    assert later(Storey(3, 10.0), Storey(height=14.0), 1.5) == (Storey(NO_LEVEL, 10.0), 4.0)
+    assert later(Storey(3, 10.0, 14.0), Storey(height=14.05), 1.5)[0] == Storey(NO_LEVEL, 14.05), "it has arrived"
     changed, climb = later(Storey(3, 10.0), Storey(4, 10.5), 1.5)
     assert changed == Storey(4, 10.5) and climb is not None and np.isnan(climb)
     assert later(UNSTATED, Storey(4), 1.5)[1] is None, "the first statement is no lift"
