@@ -80,7 +80,7 @@ def later(before: Storey, now: Storey, limit: float) -> tuple[Storey, float | No
 
 def after_lift(belief: Belief, graph: PlaceGraph, before: Storey, now: Storey, climb: float) -> Belief:
     """The belief of a robot that has come to another storey: to the level that it states, if the map has it, else from
-    each place where it may have been to those that are as much higher or, where heights are not known, on any other one.
+    each place where it may have been to those that are as much higher or, where heights are unknown, on any other one.
 
     Args:
         before, now: what it stated on the storeys.

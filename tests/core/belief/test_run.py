@@ -388,7 +388,7 @@ def test_people_before_a_robot_that_stands_by_odometry_do_not_drive_it_out_of_th
 
 
 def test_a_view_that_stays_while_odometry_goes_on_is_believed_no_more() -> None:
-    random, graph = np.random.default_rng(5), graph_of(posed([(float(i), 0.0) for i in range(300)]))
+    graph = graph_of(posed([(float(i), 0.0) for i in range(300)]))
     run = Run(DEFAULT, graph)
     for row in range(100, 120):
         run.advance(recognized_at(row, 0.9), Step(odometry=Odometry(1.0)), view(row))
