@@ -57,9 +57,9 @@ class Street:
             hit = (away > 0.05) & (away < depth) & (share >= 0) & (share <= 1) & (height >= 0) & (height < HEIGHT)
             depth[hit], which[hit], across[hit], down[hit] = away[hit], wall, share[hit], 1 - height[hit] / HEIGHT
         picture = np.full((*which.shape, 3), (235, 225, 210), np.uint8)
-        columns, rows = (np.asarray(part * (PANEL - 1), np.float32) for part in (across, down))
+        right, below = (np.asarray(part * (PANEL - 1), np.float32) for part in (across, down))
         for wall in np.unique(which[which >= 0]):
-            drawn = cv2.remap(self.pictures[wall], columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            drawn = cv2.remap(self.pictures[wall], right, below, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             picture[which == wall] = drawn[which == wall]
         return np.asarray(cv2.resize(picture, SIZE, interpolation=cv2.INTER_AREA), np.uint8)
 
