@@ -243,18 +243,14 @@ def stands_out(
 ) -> NDArray[np.bool_]:
     """Whether best matches are believed if their leads are large enough, bool of any shape.
 
-    By the decision value, and in a small map by the probability as well, which has to be that of the threshold; or,
-    where one was verified, by the probability of three stages, which has to be a half as well.  The arguments are those
-    of :func:`log_odds_of`.
+    By the decision value; or, where one was verified, by the probability of three stages, which has to be a half at
+    least and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
     """
     believed = np.asarray(decision, np.float64) >= calibration.threshold
     odds = log_odds_of(decision, margin, calibration, imagined, evidence)
-    if odds is None or calibration.curve is None:
+    if odds is None or evidence is None or calibration.geometry is None or calibration.curve is None:
         return np.asarray(believed)
-    least = float(calibration.curve.log_odds(calibration.threshold))
-    if evidence is None or calibration.geometry is None:
-        return np.asarray(believed & (odds >= least))
-    believed, surely = believed & (odds >= least), odds >= max(0.0, least)
+    surely = odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
     return np.where(np.isnan(np.asarray(evidence, np.float64)), believed, surely)
 
 

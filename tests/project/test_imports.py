@@ -44,8 +44,8 @@ def test_the_node_imports_what_its_package_declares() -> None:
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CLIENT_PROJECT = tomllib.loads((CLIENT / "pyproject.toml").read_text())["project"]
-FOR_TYPES = {"numpy"}
-"""What the client imports for types, and for arrays alone: a caller who gives these has it."""
+FOR_TYPES = {"numpy", "pillow"}
+"""What the client imports for types, and for arrays and images alone: a caller who gives these has it."""
 
 OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"}
 """What runs in .venv-ros, whose packages are not here."""

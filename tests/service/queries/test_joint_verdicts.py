@@ -9,6 +9,7 @@ import pytest
 
 from core.judgement.probability import sigmoid
 from core.judgement.verdict import Judgement
+from core.places import Whereabouts
 from service.queries.multi_map import MapReport, judge_together
 from tests.core.judgement.test_fusion import CALIBRATION
 
@@ -17,8 +18,10 @@ def report(name: str, log_odds: float, evidence: float | None = None) -> MapRepo
     """The answer of a map that recognizes a place without a pose."""
     probability = float(sigmoid(cast(Any, log_odds)))
     judgement = Judgement("recognized", 0.5, 0.3, None, None, probability, evidence=evidence)
-    answer = SimpleNamespace(judgement=judgement, calibration=CALIBRATION, matches=[(0.5, SimpleNamespace(pose=None))])
-    return MapReport(name, cast(Any, SimpleNamespace()), cast(Any, answer))
+    candidates = SimpleNamespace(whereabouts=Whereabouts.along_sequence([0]))
+    answer = SimpleNamespace(judgement=judgement, calibration=CALIBRATION, candidates=candidates, matches=[(0.5, None)])
+    settings = SimpleNamespace(same_place_radius=5.0, same_place_frames=3, same_place_height=1.5)
+    return MapReport(name, cast(Any, SimpleNamespace(record=settings)), cast(Any, answer))
 
 
 @pytest.mark.parametrize("evidence", [None, 40.0])
