@@ -99,7 +99,15 @@ function View() {
     const load = (found) => left || setLoaded({ name, ...found });
     entry?.[1]().then(
       (module) => load({ component: module.default }),
-      async (error) => load({ error, there: await checkConnection() }),
+      async (error) => {
+        const there = await checkConnection();
+        if (!there) return load({ error, there });
+        // Browsers remember by its address that a file could not be fetched while the service was away.
+        return import(`./views/${name}.js?again=${epoch.value}`).then(
+          (module) => load({ component: module.default }),
+          () => load({ error, there }),
+        );
+      },
     );
     return () => (left = true);
   }, [name, epoch.value]);
