@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +48,8 @@ more, and barometers and odometry drift by less than half of that within a walk;
 
 NO_FIX = 1e-6
 """Degrees: what a receiver without a fix writes is latitude 0 and longitude 0, to so much."""
+
+Positions: TypeAlias = int | NDArray[np.integer] | slice
 
 NO_TIME = -(1 << 63)
 """The timestamp of a place without one."""
@@ -289,9 +291,14 @@ class PoseAccuracy(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    metres: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, description="Of each coordinate.")]
+    metres: Annotated[
+        float, Field(gt=0, le=1e6, allow_inf_nan=False, description="Standard deviation of each coordinate.")
+    ]
     degrees: Annotated[
-        float | None, Field(gt=0, le=360, allow_inf_nan=False, description="Of the heading; null: not stated.")
+        float | None,
+        Field(
+            gt=0, le=360, allow_inf_nan=False, description="Standard deviation of the heading; null: it is not stated."
+        ),
     ] = None
 
 
@@ -469,22 +476,21 @@ class Whereabouts:
         flat[self.kind == METRIC, 2] = 0
         return flat
 
-    def on_other_levels(self, one: ArrayLike, other: ArrayLike, height: float) -> NDArray[np.bool_]:
+    def on_other_levels(self, one: Positions, other: Positions, height: float) -> NDArray[np.bool_]:
         """Whether places are on different storeys, as far as that is known: by their levels or, unless both have one,
         by their heights.
 
         Args:
-            one, other: integers that broadcast against each other.
+            one, other: integers, or a slice, that broadcast against each other.
             height: metres within which two places may be on one storey.
         """
-        here, there = np.asarray(one), np.asarray(other)
-        ours, theirs = self.level[here], self.level[there]
-        apart = np.abs(np.asarray(self.height[here]) - self.height[there]) > height
+        ours, theirs = self.level[one], self.level[other]
+        apart = np.abs(self.height[one] - self.height[other]) > height
         return np.where((ours != NO_LEVEL) & (theirs != NO_LEVEL), ours != theirs, apart)
 
     def on_level_of(self, row: int, height: float) -> Whereabouts:
         """The same, but places that are known to be on another storey than ``row`` have no poses; height as above."""
-        return self.without_poses(self.on_other_levels(np.arange(len(self)), row, height)) if len(self) else self
+        return self.without_poses(self.on_other_levels(slice(None), row, height)) if len(self) else self
 
     def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
         """Which of the places are the same place as ``row``, itself included; bool [n].
@@ -508,7 +514,7 @@ class Whereabouts:
             if self.sequence[row] != NO_SEQUENCE:
                 reach[(self.sequence == self.sequence[row]) & (self.ordinal == self.ordinal[row])] *= SAME_VIEW
             near = np.where(self.kind == kind, distance <= reach, near)
-        near &= ~self.on_other_levels(np.arange(len(self)), row, neighborhood.height)
+        near &= ~self.on_other_levels(slice(None), row, neighborhood.height)
         near[row] = True
         return near
 

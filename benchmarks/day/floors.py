@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from benchmarks.day.__main__ import Station
-from benchmarks.day.maps import fields, shown_by
+from benchmarks.day.maps import fields, fill, shown_by
 from benchmarks.day.pictures import another_look, file
 from benchmarks.day.walks import WALKS, WalkPair, pixels
 from benchmarks.report import report
@@ -70,9 +70,7 @@ def make_building(client: Client, map_id: str, walk: WalkPair, levels: bool) -> 
     Raises:
         PlacerecError: a frame was refused.
     """
-    for one in client.maps.create(map_id).enrol(places(walk, levels), known=()):
-        if one.error is not None:
-            raise one.error
+    fill(client.maps.create(map_id), places(walk, levels))
 
 
 def _ask(

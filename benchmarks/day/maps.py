@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.day.pictures import another_look, file
 from benchmarks.day.walks import PlanarPose, WalkPair, pixels
-from placerec_client import Client, NewPlace, parameters
+from placerec_client import Client, Map, NewPlace, parameters
 
 Change: TypeAlias = Literal["plain", "stood", "twice", "look-alike", "cameras"]
 Size: TypeAlias = Literal["small", "large", "bare"]
@@ -99,6 +99,15 @@ def make_map(client: Client, map_id: str, walk: WalkPair, change: Change, size: 
         height, width = pixels(walk.references[0]).shape[:2]
         for name, share in ((WHOLE, 1.0), (CUT, LEFT)):
             made.cameras.put(name, intrinsics=_lens(width, height, share))
-    for one in made.enrol(places(walk, change, size, others), known=()):
+    fill(made, places(walk, change, size, others))
+
+
+def fill(made: Map, entries: Iterator[NewPlace]) -> None:
+    """Enrol places in an empty map.
+
+    Raises:
+        PlacerecError: a frame was refused.
+    """
+    for one in made.enrol(entries, known=()):
         if one.error is not None:
             raise one.error

@@ -1,10 +1,9 @@
 """Frames that show less than the places of a map: right and wrong answers, with the search for a framing and without.
 
-Run ``python -m benchmarks.geometry.framings --datasets ../shared/datasets [--every 2] [--no-before] [--json FILE]``."""
+Run ``python -m benchmarks.geometry.framings --datasets ../shared/datasets [--every 2] [--no-before]``."""
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections import defaultdict
@@ -62,7 +61,7 @@ def row_of(answers: list[tuple[str, bool, float, float]]) -> dict[str, Any]:
 
 
 def main(datasets: Annotated[Path, typer.Option()], every: int = 1, verify: Verify = "auto", before: bool = True,
-         to: Annotated[Path | None, typer.Option("--json")] = None) -> None:  # fmt: skip
+         ) -> None:  # fmt: skip
     """Ask each so-manieth frame both ways in turn, and print shares of them and the processor's milliseconds."""
     encoder, answers = EncoderCatalogue().get(DEFAULT_ENCODER), defaultdict[str, Any](list)
     for walk in (corridor(datasets), lip6(datasets)):
@@ -82,8 +81,6 @@ def main(datasets: Annotated[Path, typer.Option()], every: int = 1, verify: Veri
     figures = {name: row_of(some) for name, some in answers.items()}
     rows, columns = [(name, *found.values()) for name, found in figures.items()], next(iter(figures.values()))
     report("geometry_framings", "Frames that show less than the map", ["", *columns], rows, figures)
-    if to is not None:
-        to.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -88,13 +88,13 @@ def after_lift(belief: Belief, graph: PlaceGraph, before: Storey, now: Storey, c
     """
     if not len(graph):
         return belief
-    where, limit, every = graph.whereabouts, graph.neighborhood.height, np.arange(len(graph))
+    where, limit = graph.whereabouts, graph.neighborhood.height
     was = weighed(belief, graph, before).given
     likely = np.argsort(-was, kind="stable")[:LIKELY]
     there = np.abs(where.height - where.height[likely, np.newaxis] - climb) <= limit
     heights_are_known = bool(np.isfinite(where.height[likely]).any())
     if not there.any() and not heights_are_known:
-        there = where.on_other_levels(every, likely[:, np.newaxis], limit)
+        there = where.on_other_levels(slice(None), likely[:, np.newaxis], limit)
     if now.level != NO_LEVEL and (where.level == now.level).any():
         there = np.broadcast_to(where.level == now.level, there.shape)
     if not there.any():  # between storeys, or on one that the map does not have
@@ -112,10 +112,10 @@ def undecided(ahead: Belief, seen: Belief, graph: PlaceGraph, rows: NDArray[np.i
         ahead, seen: the belief before and after the frame.
         rows: int64 [m], of the map, places on these storeys.
     """
-    every, given = np.arange(len(graph)), seen.given.copy()
+    given = seen.given.copy()
     left, storeys = np.ones(len(graph), np.bool_), []
     for place in graph.places_at(rows).tolist():
-        storey = left & ~graph.whereabouts.on_other_levels(every, place, graph.neighborhood.height)
+        storey = left & ~graph.whereabouts.on_other_levels(slice(None), place, graph.neighborhood.height)
         if place >= 0 and storey.any():
             storeys.append(storey)
             left &= ~storey

@@ -23,7 +23,7 @@ perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -195,19 +195,14 @@ def fuse(views: Sequence[CameraRanking], calibration: Calibration, neighborhood:
     believed |= {view.recognized for view in views if view.recognized is not None}
     contradicting = np.flatnonzero(np.isin(rows[order], list(believed)) & ~near[best, order]).tolist()
     seeing = [view.twins for view, head in zip(views, heads, strict=True) if near[best, head]]
-    twins = [row for one in seeing for row in one] if all(seeing) else []
-    doubles = np.flatnonzero(np.isin(rows[order], twins))
-    left = 1 / (1 + float(np.exp(prior[order][doubles] - prior[best]).max(initial=0.0)))
+    doubles = [row for one in seeing for row in one] if all(seeing) else []
+    twins = np.flatnonzero(np.isin(rows[order], doubles))
+    left = 1 / (1 + float(np.exp(prior[order][twins] - prior[best]).max(initial=0.0)))
     imagined = judgements[int(surest.argmax())].imagined
     judgement = _judged(
-        total[order], found, near[np.ix_(order, order)], contradicting, calibration, steepness, best_evidence, imagined
-    )
-    if judgement.verdict == "recognized" and left < CLEAR_STOREY:
-        named = tuple(Rivals((head,), False) for head in _heads(doubles, near[np.ix_(order, order)]))
-        judgement = replace(judgement, verdict="ambiguous", rivals=named)
-    if judgement.probability is not None:
-        judgement = replace(judgement, probability=min(judgement.probability, left))
-    judgement = replace(judgement, twins=tuple(doubles.tolist()))
+        total[order], found, near[np.ix_(order, order)], contradicting, twins, left, calibration, steepness,
+        best_evidence, imagined,
+    )  # fmt: skip
     return Fused(judgement, rows[order], places.take(order), found, total[order], prior[order])
 
 
@@ -222,8 +217,7 @@ def _judged_alone(view: CameraRanking, calibration: Calibration, neighborhood: N
 def _log_odds_alone(judgement: Judgement, calibration: Calibration) -> float:
     """The log odds of a camera's best match by its own judgement; without a curve, by the decision value."""
     decision = 0.0 if judgement.decision is None else judgement.decision
-    evidence = None if judgement.evidence is None else judgement.evidence
-    stated = log_odds_of_stages(decision, judgement.lead, calibration, judgement.imagined, evidence)
+    stated = log_odds_of_stages(decision, judgement.lead, calibration, judgement.imagined, judgement.evidence)
     return log_odds(decision, calibration) if stated is None else float(stated)
 
 
@@ -252,6 +246,8 @@ def _judged(
     scores: NDArray[np.float32],
     near: NDArray[np.bool_],
     contradicting: Sequence[int],
+    twins: NDArray[np.int64],
+    left: float,
     calibration: Calibration,
     steepness: float,
     evidence: float | None,
@@ -259,10 +255,13 @@ def _judged(
 ) -> Judgement:
     """Judge the first of the ranked places; ``near`` says which of them are the same place, bool [n, n].
 
-    The verdict is ambiguous if a rival is within the margin, in log odds, or a camera recognizes another place.
+    The verdict is ambiguous if a rival is within the margin, in log odds, a camera recognizes another place, or the
+    cameras may as well see a twin.
 
     Args:
         contradicting: the places that cameras recognize which are not the first.
+        twins: int64 [k], places on other storeys that all cameras may as well see, and the probability that is ``left``
+            to the first by the likeliest of them.
         imagined: the share of the background that was imagined.
     """
     best = float(log_odds_of_places[0])
@@ -276,16 +275,21 @@ def _judged(
     least = max(least, 0.0 if evidence is not None else log_odds(calibration.threshold, calibration, imagined))
     close = np.flatnonzero(best - log_odds_of_places < calibration.margin * steepness)
     rivals = np.append(np.array(contradicting, np.int64), np.setdiff1d(np.intersect1d(close, others), contradicting))
+    halved = EVEN if len(rivals) else 1.0
     verdict: Verdict = "recognized"
     if best < least and not contradicting:
         verdict = "unknown"
-    elif len(rivals):
+    elif len(rivals) or left < CLEAR_STOREY:
         verdict = "ambiguous"
+        rivals = rivals if len(rivals) else twins
     named = tuple(Rivals((head,), False) for head in _heads(rivals, near)) if verdict == "ambiguous" else ()
     probability = None
     if calibration.curve is not None:
-        probability = float(sigmoid(np.array(best))) * (EVEN if len(rivals) else 1.0)
-    return Judgement(verdict, float(scores[0]), decision, margin, rival, probability, imagined, named, evidence)
+        probability = min(left, float(sigmoid(np.array(best))) * halved)
+    return Judgement(
+        verdict, float(scores[0]), decision, margin, rival, probability, imagined, named, evidence,
+        tuple(twins.tolist()),
+    )  # fmt: skip
 
 
 def _heads(places: NDArray[np.int64], near: NDArray[np.bool_]) -> list[int]:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -575,7 +575,7 @@ def _missed(state: Vectors, place_views: _PlaceViews, number: int) -> tuple[Vect
     cos, sin, nearness = np.cos(angle), np.sin(angle), np.exp(-state[4])
     back = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # W^T
     shift = back @ (state[:3] - position) * nearness
-    turn = (state[3] - angle - np.radians(view.heading_offset) + np.pi) % (2 * np.pi) - np.pi
+    turn = wrapped(state[3] - angle - np.radians(view.heading_offset))
     jacobian = np.zeros((4, 5))
     jacobian[:3, :3], jacobian[:3, 4], jacobian[3, 3] = back * nearness, -shift, 1
     which = [3, 4, 5, 2]
@@ -643,3 +643,8 @@ def _geographic(position: Vectors, heading: float | None) -> Pose:
     latitude = float(np.degrees(np.arctan2(z, np.hypot(x, y))))
     longitude = float(np.degrees(np.arctan2(y, x)))
     return Pose(latitude=latitude, longitude=longitude, heading=heading)
+
+
+def wrapped(angle: ArrayLike) -> Any:
+    """Angles in radians in [-π, π), as they are given: a number or an array."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

@@ -64,7 +64,7 @@ CLEAR_STOREY = 2 / 3
 in a session.  Without a prior none is, and one with a trust of 0.5 is enough; it was chosen on nothing else."""
 
 HALFWAY = 0.5
-"""Of the lead that a query has over a twin which shows the best match alone: under this share it may show either.  It
+"""A query that has less than this share of the lead over a twin which shows the best match alone may show either.  It
 is the middle.  On corridor as two storeys, the upper one copies with noise, 0.25 and 0.75 change nothing for frames of
 the other traverse, or of this one in other light (1 of 37 and 0 on the wrong storey); of further copies with noise 12,
 4 and 1 of 37 are recognized with 0.25, 0.5 and 0.75, all rightly.  Cut into three storeys that differ, corridor has the

@@ -20,16 +20,24 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Lock, Thread
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from core.errors import PlacerecError, UnfitIntrinsics
 from core.geometry.pose import RelativeView, SharedPoints, relative_view, sighting_of
 from core.geometry.verification import verify
-from core.judgement.position import APART, BUNDLE_REACH, PlaceErrors, bearing_between, estimate_pose, places_apart
+from core.judgement.position import (
+    APART,
+    BUNDLE_REACH,
+    PlaceErrors,
+    bearing_between,
+    estimate_pose,
+    places_apart,
+    wrapped,
+)
 from core.maps import Map, own_poses
 from core.places import GEOGRAPHIC, NO_POSE, Whereabouts
 from core.recognition.self_queries import spread_order
@@ -147,18 +155,15 @@ _begun: WeakSet[Map] = WeakSet()
 _lock, _surveying = Lock(), Lock()
 
 
-def pose_survey(map_: Map, again: bool = False) -> PoseSurvey:
+def pose_survey(map_: Map) -> PoseSurvey:
     """The survey of a map; it is made where there is none, or the map has grown or its poses were changed since.
-
-    Args:
-        again: make it in any case.
 
     Raises:
         StorageFailure: the map's files cannot be read.
     """
     with _surveying:
         known, holds = _at_hand(map_)
-        if known is not None and holds and not again:
+        if known is not None and holds:
             return known
         state = map_.state
         survey, rows = _survey(map_)
@@ -308,9 +313,9 @@ def _judged(map_: Map, sequence: str, samples: list[_Sample]) -> TraverseSurvey:
     turned = 0.0
     if len(bearings) >= LEAST_PAIRS:
         middle = float(np.angle(np.exp(1j * bearings).sum()))
-        middle += float(np.median(_wrapped(bearings - middle)))
-        agreed = np.mean(np.abs(_wrapped(bearings - middle)) < np.radians(WITHIN))
-        turned = float(_wrapped(middle)) if agreed >= AGREED and abs(middle) > np.radians(TURNED) else 0.0
+        middle += float(np.median(wrapped(bearings - middle)))
+        agreed = np.mean(np.abs(wrapped(bearings - middle)) < np.radians(WITHIN))
+        turned = float(wrapped(middle)) if agreed >= AGREED and abs(middle) > np.radians(TURNED) else 0.0
     degrees = None
     if len(turns) >= LEAST_PAIRS:  # of two headings, hence the root
         degrees = float(np.degrees(np.median(np.abs(turns)) / 0.6745 / np.sqrt(2)))
@@ -322,7 +327,7 @@ def _pair(place: Whereabouts, other: Whereabouts, view: RelativeView) -> _Pair:
     """What the view of the camera of one place from that of another says against their poses."""
     sign = -1 if place.kind[0] == GEOGRAPHIC else 1
     turn = sign * np.radians(float(other.heading[0] - place.heading[0])) - np.radians(view.heading_offset)
-    missed = _wrapped(turn) if view.source == "intrinsics" else np.nan
+    missed = wrapped(turn) if view.source == "intrinsics" else np.nan
     length = float(np.hypot(*view.shift[:2]))
     across = np.array([-view.shift[1], view.shift[0]]) / max(length, 1e-9)
     variance = float(across @ view.covariance[3:5, 3:5] @ across) / max(length, 1e-9) ** 2
@@ -332,7 +337,7 @@ def _pair(place: Whereabouts, other: Whereabouts, view: RelativeView) -> _Pair:
     looks = np.radians(float(90 - place.heading[0] if sign < 0 else place.heading[0]))
     shown = np.arctan2(view.shift[1], view.shift[0])
     bearing = bearing_between(Whereabouts.joined([place, other]), 0, 1)
-    return _Pair(_wrapped(bearing - looks - shown), variance, metres, missed)
+    return _Pair(wrapped(bearing - looks - shown), variance, metres, missed)
 
 
 def _likeliest(
@@ -350,7 +355,7 @@ def _likeliest(
         for pair in across:
             variance = pair.variance + LOOSE**2 + np.nan_to_num(heading) ** 2 + 2 * (metres / pair.metres) ** 2
             either = [
-                _surprise(_wrapped(pair.bearing - turned + about) ** 2 / variance, np.log(variance), 1)
+                _surprise(wrapped(pair.bearing - turned + about) ** 2 / variance, np.log(variance), 1)
                 for about in (0, np.pi)
             ]
             costs[at] -= np.logaddexp(np.log1p(-BACKWARDS) - either[0], np.log(BACKWARDS) - either[1])
@@ -384,11 +389,6 @@ def _surprise(square: float, logarithm: float, values: int) -> float:
         logarithm: of the determinant of their covariance.
     """
     return (TAIL + values) / 2 * float(np.log1p(square / TAIL)) + logarithm / 2
-
-
-def _wrapped(angle: ArrayLike) -> Any:
-    """Angles in radians in [-π, π)."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
 def _poses(where: Whereabouts) -> Array:

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = "placerec data 2\n"
 EARLIER = ("placerec data 1\n",)
-"""Of directories whose maps are brought up to date when they are opened, and which earlier versions then refuse."""
+"""Directories of these forms are brought up to date as their maps are opened, and earlier versions then refuse them."""
 _MAPS = "maps"
 # No map id begins with a dot, so these folders are never mistaken for maps.
 _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"

@@ -49,8 +49,10 @@ RETIRED = ("filter", "path_frames")
 
 Motion = Literal["first", "sequence", "speed-limit", "odometry", "contradicted"]
 
-CONTRADICTION = "What odometry looks like beside frames that are recognized by themselves, while these contradict it: "
-CONTRADICTION += "frozen, of another scale, turned, in other units, or inconsistent; null: nothing speaks against it."
+CONTRADICTION = (
+    "What odometry looks like beside frames that are recognized by themselves, while these contradict it: frozen, of "
+    "another scale, turned, in other units, or inconsistent; null: nothing speaks against it."
+)
 CONTRADICTION_NOTE = "A sentence for a person on what is wrong with odometry; null while nothing is."
 
 

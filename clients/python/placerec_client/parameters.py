@@ -1581,10 +1581,10 @@ class PoseAccuracy(TypedDict):
     """
 
     metres: float
-    """Of each coordinate."""
+    """Standard deviation of each coordinate."""
 
     degrees: NotRequired[float | None]
-    """Of the heading; null: not stated."""
+    """Standard deviation of the heading; null: it is not stated."""
 
 
 class ReviewChanges(TypedDict):
