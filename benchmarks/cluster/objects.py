@@ -23,7 +23,7 @@ from core.milvus.map import MilvusMap
 from core.postgres import rows
 from core.postgres.pictures.objects import Objects
 from core.postgres.pictures.stored import new_object
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.milvus import running_servers
 
 OF_A_QUERY = 30

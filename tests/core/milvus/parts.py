@@ -14,7 +14,7 @@ from core.milvus.collection import collection_name, milvus_errors
 from core.postgres.pictures.objects import Objects
 from tests.core.cluster.clients import Addresses
 from tests.core.cluster.parts import KillableCluster, KilledClient, KilledPostgres, KilledServer, SilentPostgres
-from tests.core.storage.frames import DIMENSION, ENCODER
+from tests.core.store.frames import DIMENSION, ENCODER
 from tests.servers.milvus import Servers, running_servers
 
 

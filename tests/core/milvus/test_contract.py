@@ -10,7 +10,7 @@ from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 
 from core.errors import UnknownMap
-from core.maps import Map
+from core.store import Map
 from core.milvus import Bucket, open_store
 from core.milvus.store import MilvusStore
 from tests.core.maps.contract import MAP, StoreContract

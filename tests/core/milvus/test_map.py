@@ -13,7 +13,8 @@ from core.errors import StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
 from core.ledger.maps.record import RECENT_SECONDS
-from core.maps import Map, MapSettings, Selection
+from core.store import Map
+from core.maps import MapSettings, Selection
 from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions
 from core.method.catalogue import EncoderCatalogue
@@ -24,9 +25,9 @@ from core.milvus.store import MilvusStore
 from core.places import Neighborhood, Pose
 from core.recognition import enrol, recognize
 from core.recognition.question import Question
-from core.storage import Atlas
+from core.store import Directory
 from tests.core.maps.writers import check_writers_lose_nothing
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, stored_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, stored_of
 from tests.servers.milvus import Servers
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
@@ -92,7 +93,7 @@ def test_a_large_map(store: MilvusStore) -> None:
 def test_a_map_answers_as_one_in_a_data_directory_does(store: MilvusStore, tmp_path: Path) -> None:
     install_two_stage_encoder(tmp_path / "models")
     encoder = EncoderCatalogue(tmp_path / "models").get(TWO_STAGES)
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     made = encoder.identity, encoder.dimension, MapSettings(verification=True), encoder.local_shape
     maps: list[Map] = [atlas.create("lab", *made), store.create("lab", *made)]
     for number in range(8):

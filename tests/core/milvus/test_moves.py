@@ -9,7 +9,7 @@ import pytest
 
 from core.milvus import open_store
 from core.milvus.store import MilvusStore
-from core.storage.files.row_formats import COMPRESSED
+from core.maps.forms import COMPRESSED
 from tests.core.maps.moves import check_a_refused_import_leaves_nothing, check_moves
 from tests.servers.milvus import Servers
 

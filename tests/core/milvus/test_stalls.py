@@ -10,7 +10,7 @@ import pytest
 from core.errors import StorageFailure
 from core.milvus import open_store
 from core.milvus.map import MilvusMap
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]

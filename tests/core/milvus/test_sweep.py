@@ -16,7 +16,7 @@ from core.milvus import open_store
 from core.milvus.map import MilvusMap
 from core.milvus.store import MilvusStore
 from core.postgres import rows
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.servers.milvus import Servers
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]

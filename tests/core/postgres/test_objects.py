@@ -20,11 +20,11 @@ from core.postgres import rows
 from core.postgres.map import PostgresMap
 from core.postgres.pictures.bucket import Bucket
 from core.postgres.pictures.objects import Objects
-from core.postgres.search.store import CodedStore
-from core.storage.files.row_formats import COMPRESSED
+from core.store.cluster import Cluster
+from core.maps.forms import COMPRESSED
 from tests.core.maps.moves import check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.servers.object_store import reading_only, running_object_store
 from tests.servers.postgres import Postgres
 
@@ -32,8 +32,8 @@ pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
 
 @pytest.fixture
-def store(postgres: Postgres, bucket: Bucket) -> Iterator[CodedStore]:
-    store = CodedStore(postgres.address, bucket)
+def store(postgres: Postgres, bucket: Bucket) -> Iterator[Cluster]:
+    store = Cluster(postgres.address, bucket)
     yield store
     for one in store.records(None, 100)[0]:
         store.delete(one.id)
@@ -41,7 +41,7 @@ def store(postgres: Postgres, bucket: Bucket) -> Iterator[CodedStore]:
 
 
 @pytest.fixture
-def lab(store: CodedStore) -> PostgresMap:
+def lab(store: Cluster) -> PostgresMap:
     return store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
 
 
@@ -61,12 +61,12 @@ def where(lab: PostgresMap, place_id: str) -> StoredObject:
     return stored
 
 
-def folder_of(store: CodedStore) -> str:
+def folder_of(store: Cluster) -> str:
     with store.database.reading() as connection:
         return rows.objects_folder(connection)
 
 
-def names_in(objects: Objects, store: CodedStore) -> set[str]:
+def names_in(objects: Objects, store: Cluster) -> set[str]:
     """All objects."""
     folder = folder_of(store)
     return {name for page in objects.names_after(folder, folder) for name in page}
@@ -77,7 +77,7 @@ def image_of(name: str) -> bytes:
 
 
 @pytest.mark.parametrize("precision", ["half", COMPRESSED])
-def test_a_map_with_objects_is_the_same_map(store: CodedStore, tmp_path: Path, precision: str) -> None:
+def test_a_map_with_objects_is_the_same_map(store: Cluster, tmp_path: Path, precision: str) -> None:
     check_moves(store, tmp_path, precision)
 
 
@@ -88,8 +88,8 @@ def test_the_room_of_objects_counts(lab: PostgresMap) -> None:
     assert room.database == len(image_of("a")) + len(image_of("b")) + room.keypoints.bytes
 
 
-def test_old_pictures_stay_where_they_are(store: CodedStore, lab: PostgresMap, postgres: Postgres) -> None:
-    without = CodedStore(postgres.address)
+def test_old_pictures_stay_where_they_are(store: Cluster, lab: PostgresMap, postgres: Postgres) -> None:
+    without = Cluster(postgres.address)
     before = without.get("lab")
     before.enrol([frame("old"), frame("replaced")])
     assert lab.picture("old") == image_of("old")
@@ -102,7 +102,7 @@ def test_old_pictures_stay_where_they_are(store: CodedStore, lab: PostgresMap, p
     without.close()
 
 
-def test_frames_for_review(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
+def test_frames_for_review(store: Cluster, lab: PostgresMap, objects: Objects) -> None:
     setting = ReviewSetting(most_frames=2)
     store.sweep_objects()
     before = names_in(objects, store)
@@ -117,11 +117,11 @@ def test_frames_for_review(store: CodedStore, lab: PostgresMap, objects: Objects
         lab.review.picture(kept[1].number)
 
 
-def test_a_page_for_review_is_of_one_moment(store: CodedStore, lab: PostgresMap) -> None:
+def test_a_page_for_review_is_of_one_moment(store: Cluster, lab: PostgresMap) -> None:
     check_pages_are_of_one_moment(lab.review, store.get("lab").review)
 
 
-def test_lost_and_damaged_objects_are_reported(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
+def test_lost_and_damaged_objects_are_reported(store: Cluster, lab: PostgresMap, objects: Objects) -> None:
     lab.enrol([frame(name) for name in ("whole", "lost", "damaged")])
     objects.delete([where(lab, "lost").name])
     objects.put({where(lab, "damaged").name: b"image of daMaged"})
@@ -133,7 +133,7 @@ def test_lost_and_damaged_objects_are_reported(store: CodedStore, lab: PostgresM
     assert lab.picture("whole") == image_of("whole")
 
 
-def test_pictures_go_after_their_rows(store: CodedStore, lab: PostgresMap, objects: Objects) -> None:
+def test_pictures_go_after_their_rows(store: Cluster, lab: PostgresMap, objects: Objects) -> None:
     """Those of deleted places and maps, and those of writes that died, but none that is being written or exported."""
     lab.enrol([frame("stays"), frame("goes")])
     other = store.create("other", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
@@ -162,7 +162,7 @@ def test_pictures_go_after_their_rows(store: CodedStore, lab: PostgresMap, objec
 
 
 def test_what_is_being_written_stays(
-    store: CodedStore, lab: PostgresMap, objects: Objects, monkeypatch: pytest.MonkeyPatch
+    store: Cluster, lab: PostgresMap, objects: Objects, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put_counters, written, go_on = record.put_counters, threading.Event(), threading.Event()
 
@@ -201,7 +201,7 @@ def test_a_store_that_refuses(lab: PostgresMap, postgres: Postgres, bucket: Buck
     """Each refusal says why; nothing is changed, nothing stays behind, and queries are answered."""
     lab.enrol([frame("a")])
     for name, (refused, why) in refusing(bucket).items():
-        other = CodedStore(postgres.address, refused)
+        other = Cluster(postgres.address, refused)
         there = other.get("lab")
         with pytest.raises(StoreUnavailable, match=why):
             other.check_pictures()
@@ -228,7 +228,7 @@ def test_a_full_store(lab: PostgresMap, postgres: Postgres, tmp_path: Path) -> N
     lab.enrol([frame("a")])
     little_room = "-volume.max=1", "-master.volumeSizeLimitMB=1"
     with running_object_store(tmp_path, *little_room) as bucket:
-        other = CodedStore(postgres.address, bucket)
+        other = Cluster(postgres.address, bucket)
         there = other.get("lab")
         large = np.random.default_rng(0).bytes(400_000)
         stored = []
