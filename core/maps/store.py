@@ -631,13 +631,6 @@ class Store(Protocol):
             StorageFull, StorageFailure.
         """
 
-    def check_pictures(self) -> None:
-        """Raise unless pictures could be stored now, if they are stored elsewhere than the rest of the maps.
-
-        Raises:
-            StorageFull, StorageFailure.
-        """
-
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
         """A page of the maps' records by id, and the cursor of the next page.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from core.ledger.maps import places
 from core.ledger.maps.connection import MapConnection
@@ -18,9 +17,6 @@ from core.milvus.writing import MilvusWrite
 from core.postgres import rows
 from core.postgres.map import PostgresMap
 
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
-
 REBUILT_AT_ONCE = 256
 """Places whose entities are made again in one transaction."""
 
@@ -28,10 +24,8 @@ REBUILT_AT_ONCE = 256
 class MilvusMap(PostgresMap):
     """The places of one environment (:class:`core.maps.store.Map`), with an entity in Milvus for each."""
 
-    def __init__(
-        self, database: PostgresLedger, state: MapState, collection: Collection, objects: Objects | None = None
-    ) -> None:
-        super().__init__(database, state, objects)
+    def __init__(self, database: PostgresLedger, state: MapState, collection: Collection) -> None:
+        super().__init__(database, state)
         self.collection = collection
         self._last: MilvusSnapshot | None = None
 
@@ -91,14 +85,14 @@ class MilvusMap(PostgresMap):
             progress(min(done, total), total)
 
     def _write(self, connection: MapConnection, state: MapState) -> MilvusWrite:
-        return MilvusWrite(connection, state, self.objects, self.collection)
+        return MilvusWrite(connection, state, self.collection)
 
     @contextmanager
     def rebuilding(self) -> Iterator[MilvusWrite]:
         """A write whose entities may go to another collection than the one that has the map's so far."""
         with self._transaction() as whole:
             connection = MapConnection(whole, self.number)
-            write = MilvusWrite(connection, self._locked_state(connection), self.objects, self.collection, True)
+            write = MilvusWrite(connection, self._locked_state(connection), self.collection, True)
             yield write
             write.finish()
         self.note(write.state)

@@ -19,7 +19,6 @@ from core.milvus.map import MilvusMap
 from core.milvus.sweep import sweep
 from core.postgres import rows
 from core.postgres.forms import Form
-from core.postgres.pictures.bucket import Bucket
 from core.postgres.store import PostgresStore
 from core.postgres.verification import inspect
 
@@ -30,28 +29,22 @@ class MilvusStore(PostgresStore[MilvusMap]):
     """Maps by id (:class:`core.maps.store.Store`), in PostgreSQL and Milvus."""
 
     def __init__(
-        self,
-        milvus: str,
-        postgres: str,
-        token: str = "",
-        database: str = "",
-        certificate: str | None = None,
-        bucket: Bucket | None = None,
+        self, milvus: str, postgres: str, token: str = "", database: str = "", certificate: str | None = None
     ) -> None:
         """Remember where both are; they are connected to when they are first used.
 
         Args:
             milvus: the address, such as ``http://localhost:19530``; ``https`` for TLS.
-            postgres, bucket: as of :class:`core.postgres.store.PostgresStore`.
+            postgres: as of :class:`core.postgres.store.PostgresStore`.
             token, database: of Milvus, ``user:password`` and the name of the database there.
             certificate: path of the file of the authority that Milvus's certificate is checked by.
         """
-        super().__init__(postgres, bucket)
+        super().__init__(postgres)
         self._collections: dict[str, Collection] = {}
         self._milvus = MilvusConnection(milvus, token, database, certificate)
 
     def _map_of(self, state: MapState) -> MilvusMap:
-        return MilvusMap(self.database, state, self._collection(state.record), self.objects)
+        return MilvusMap(self.database, state, self._collection(state.record))
 
     def _collection(self, made: MapRecord) -> Collection:
         """The collection of a map's encoder; ``_making`` is held."""

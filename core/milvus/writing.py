@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace, tokens_of, whereabouts_of
@@ -12,9 +11,6 @@ from core.ledger.maps.record import MapState
 from core.milvus.collection import Collection, Entity
 from core.postgres import rows
 from core.postgres.writing import PostgresWrite
-
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
 
 
 class MilvusWrite(PostgresWrite):
@@ -25,14 +21,9 @@ class MilvusWrite(PostgresWrite):
     """
 
     def __init__(
-        self,
-        connection: MapConnection,
-        state: MapState,
-        objects: Objects | None,
-        collection: Collection,
-        rebuilding: bool = False,
+        self, connection: MapConnection, state: MapState, collection: Collection, rebuilding: bool = False
     ) -> None:
-        super().__init__(connection, state, objects)
+        super().__init__(connection, state)
         self._collection, self._rebuilding = collection, rebuilding
         self._entities: dict[int, StoredPlace] = {}  # the places that need one, by their numbers
 

@@ -1,15 +1,14 @@
 """Maps in PostgreSQL, which any number of processes may use at the same time.
 
-PostgreSQL has all that a map is: its record, its places, their descriptors, local descriptors, keypoints and pictures,
-unless these are put into an object store.  Each write is one of its transactions, so that it happens whole or not at
-all, and two processes cannot overwrite each other.  What searches the descriptors is an engine beside it
-(:mod:`core.milvus`).
+PostgreSQL has all that a map is: its record, its places, their descriptors, local descriptors, keypoints and pictures.
+Each write is one of its transactions, so that it happens whole or not at all, and two processes cannot overwrite each
+other.  What searches the descriptors is an engine beside it (:mod:`core.milvus`).
 
 tables          the tables beside those of any map
 rows            descriptors by row, and rows that no place has any more
 writing, map, store
                 a write, a map and all maps, less what an engine adds
-review, exporter, verification, sweep
+review, exporter, verification
                 parts of them
 """
 
@@ -18,22 +17,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.errors import MissingExtra
-from core.postgres.pictures.bucket import Bucket
 
 if TYPE_CHECKING:
     from core.postgres.search.store import CodedStore
 
-__all__ = ["Bucket", "open_database"]
+__all__ = ["open_database"]
 
 
-def open_database(address: str, bucket: Bucket | None = None, cache_bytes: int = 256 << 20) -> CodedStore:
+def open_database(address: str, cache_bytes: int = 256 << 20) -> CodedStore:
     """All maps of a PostgreSQL database, searched in the memory of each service.
 
     It is connected to when it is first used, and again after an outage.
 
     Args:
         address: such as ``postgresql://placerec@localhost/placerec``.
-        bucket: where new pictures are put; None: in PostgreSQL.
         cache_bytes: most bytes of rows that are kept in memory.
 
     Raises:
@@ -42,9 +39,9 @@ def open_database(address: str, bucket: Bucket | None = None, cache_bytes: int =
     try:
         from core.postgres.search.store import CodedStore
 
-        return CodedStore(address, bucket, cache_bytes)
+        return CodedStore(address, cache_bytes)
     except ModuleNotFoundError as error:
-        if error.name not in ("obstore", "psycopg", "psycopg_pool"):
+        if error.name not in ("psycopg", "psycopg_pool"):
             raise
         raise MissingExtra(
             f"Maps in PostgreSQL need {error.name}, which others do not: pip install 'placerec[cluster]', or in a"

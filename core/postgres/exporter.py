@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from core.disk.files import disk_errors
 from core.ledger.maps.archiving import LedgerSource, pieces
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
-from core.ledger.postgres import PostgresLedger
 from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
 from core.postgres import rows
 from core.postgres.forms import Form
 from core.postgres.review import PostgresReview
-
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
 
 Viewing = Callable[[], AbstractContextManager[tuple[MapConnection, MapState]]]
 
@@ -30,20 +25,10 @@ class PostgresExporter:
         viewing: begins a transaction that reads the map, whose state comes with it.
         state: a value that is the same as long as nothing is written to the map.
         review: the frames of the map that are stored for review.
-        database: in which the map is.
-        objects: where pictures may be besides; None: nowhere.
     """
 
-    def __init__(
-        self,
-        viewing: Viewing,
-        state: Callable[[], object],
-        review: PostgresReview,
-        database: PostgresLedger,
-        objects: Objects | None,
-    ) -> None:
+    def __init__(self, viewing: Viewing, state: Callable[[], object], review: PostgresReview) -> None:
         self._viewing, self._state, self._review = viewing, state, review
-        self._database, self._objects = database, objects
 
     def state(self) -> object:
         """A value that is the same as long as nothing is written to the map, and no frame of the review labelled."""
@@ -58,15 +43,9 @@ class PostgresExporter:
             UnknownMap: the map was deleted before it was read.
             StorageFull, StorageFailure.
         """
-        with disk_errors("write the map as a file"), self._keeping_objects(), self._viewing() as (connection, state):
-            source = _Source(connection, state.record, Form(state.record).frame_bytes, self._review, self._objects)
+        with disk_errors("write the map as a file"), self._viewing() as (connection, state):
+            source = _Source(connection, state.record, Form(state.record).frame_bytes, self._review)
             return write_archive(source, path, advance, expect)
-
-    def _keeping_objects(self) -> AbstractContextManager[object]:
-        """Have no objects deleted during the block: its transaction still sees rows that are deleted meanwhile."""
-        if self._objects is None:
-            return nullcontext()
-        return self._database.locked("export a map", rows.EXPORTING, 0, shared=True)
 
 
 class _Source(LedgerSource):

@@ -9,7 +9,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from core.errors import MapBusy, StorageFailure
 from core.ledger.maps import frames, record
@@ -25,12 +24,8 @@ from core.maps.store import Scope, Snapshot
 from core.postgres import rows
 from core.postgres.exporter import PostgresExporter
 from core.postgres.review import PostgresReview
-from core.postgres.sweep import sweep_objects
 from core.postgres.tables import ERASED_TABLES
 from core.postgres.writing import PostgresWrite
-
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
 
 log = logging.getLogger(__name__)
 
@@ -42,21 +37,15 @@ class PostgresMap(LedgerMap):
     cannot be reached) and UnknownMap; methods that write may also raise StorageFull.
     """
 
-    objects: Objects | None
-
-    def __init__(self, database: PostgresLedger, state: MapState, objects: Objects | None = None) -> None:
-        """The map that was found in this state.
-
-        Args:
-            objects: where new pictures are put; None: in PostgreSQL.
-        """
-        self.objects, self.database, self._state = objects, database, state
+    def __init__(self, database: PostgresLedger, state: MapState) -> None:
+        """The map that was found in this state."""
+        self.database, self._state = database, state
         self._noted = (-math.inf, state)  # the last state that was read, and when it was asked for
         self._room: tuple[int, StorageStatus] | None = None
         self._paused = threading.local()
         super().__init__()
-        self.review = PostgresReview(state.number, self._reading, database, objects)
-        self.exporter = PostgresExporter(self.viewing, lambda: self.state, self.review, database, objects)
+        self.review = PostgresReview(state.number, self._reading, database)
+        self.exporter = PostgresExporter(self.viewing, lambda: self.state, self.review)
 
     @property
     def record(self) -> MapRecord:
@@ -140,8 +129,6 @@ class PostgresMap(LedgerMap):
                 self._tidy(MapConnection(whole, self.number))
             if self._uncleared():
                 threading.Event().wait(1)
-        if self.objects is not None:
-            sweep_objects(self.database, self.objects)
         with self.database.connection("vacuum", LONG_SECONDS) as connection:
             for table in ERASED_TABLES:
                 connection.execute(f"VACUUM {table}")

@@ -1,29 +1,25 @@
-"""Descriptors by row, rows and keys that no place has any more, and objects that no row names any more."""
+"""Descriptors by row, and rows and keys that no place has any more."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from sqlalchemy import and_, bindparam, case, column, delete, func, select, table, union, update
+from sqlalchemy import bindparam, column, delete, func, select, table, union, update
 
 from core.errors import UnknownMap
 from core.ledger.database import LedgerConnection
 from core.ledger.maps import frames
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.review import FRAMES
-from core.ledger.maps.schema import MAPS, PICTURES, PLACES
+from core.ledger.maps.schema import MAPS, PLACES
 from core.ledger.postgres import PostgresConnection
 from core.ledger.statements import Statement, among, seconds_now
-from core.postgres.tables import DEAD_KEYS, DEAD_OBJECTS, DEAD_ROWS, DESCRIPTORS, OBJECT_STORE, REVISIONS
+from core.postgres.tables import DEAD_KEYS, DEAD_ROWS, DESCRIPTORS, REVISIONS
 
 WAIT_SECONDS = 10
 """A write that waits for others to the same map is refused after this time."""
 
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
-
-EXPORTING = 7063
-"""The kind of the lock of the database that exports share, and that who deletes objects has alone."""
 
 LEFT_SECONDS = 60
 """Data that no place names any more is deleted after this time; queries that need it have ended by then."""
@@ -251,29 +247,10 @@ def last_key(connection: LedgerConnection) -> int:
     return int(connection.execute(_LAST_KEY)[0][0])
 
 
-# Objects of pictures
+# Waiting for others
 
 _SHARE = Statement(
     select(MAPS.c.number).where(MAPS.c.number == bindparam("map")).with_for_update(key_share=True, read=True)
-)
-_OBJECT_KEY = Statement(select(OBJECT_STORE.c.folder, func.nextval("drawn_keys")))
-_FOLDER = Statement(select(OBJECT_STORE.c.folder))
-_DEAD_OBJECTS = Statement(select(DEAD_OBJECTS.c.name).limit(ORPHANS_AT_ONCE))
-_CLEAR_OBJECTS = Statement(delete(DEAD_OBJECTS).where(among(DEAD_OBJECTS.c.name, "names")))
-_KNOWN_OBJECTS = Statement(
-    union(
-        *(
-            select(named).where(and_(named.is_not(None), among(named, "names")))
-            for named in (PICTURES.c.object, FRAMES.c.object, DEAD_OBJECTS.c.name)
-        )
-    )
-)
-_SWEPT = Statement(select(OBJECT_STORE.c.swept).where(OBJECT_STORE.c.listed > seconds_now() - bindparam("age")))
-_NOTE_SWEPT = Statement(
-    update(OBJECT_STORE).values(
-        swept=bindparam("key"),
-        listed=case((bindparam("whole") == 1, seconds_now()), else_=OBJECT_STORE.c.listed),
-    )
 )
 
 
@@ -285,46 +262,6 @@ def share(connection: MapConnection) -> None:
     """
     if not connection.execute(_SHARE):
         raise UnknownMap("The map was deleted meanwhile.")
-
-
-def new_object_key(connection: MapConnection) -> tuple[str, int]:
-    """The folder of the database's pictures in an object store, and a number that was never used before."""
-    ((folder, key),) = connection.whole.execute(_OBJECT_KEY)
-    return folder, int(key)
-
-
-def objects_folder(connection: LedgerConnection) -> str:
-    """The folder of the database's pictures in an object store, which no other database has."""
-    return str(connection.execute(_FOLDER)[0][0])
-
-
-def dead_objects(connection: PostgresConnection) -> list[str]:
-    """The names of some objects whose row is deleted; none while a map is exported, which may still see the row."""
-    lock = "SELECT pg_try_advisory_xact_lock(%s::int, 0)"
-    if connection.driver.execute(lock, (EXPORTING,)).fetchone() != (True,):
-        return []
-    return [name for (name,) in connection.execute(_DEAD_OBJECTS)]
-
-
-def clear_objects(connection: LedgerConnection, names: Sequence[str]) -> None:
-    """Forget dead objects, which are deleted."""
-    connection.execute(_CLEAR_OBJECTS, names=list(names))
-
-
-def known_objects(connection: LedgerConnection, names: Sequence[str]) -> set[str]:
-    """Those of some objects that a row names, or named."""
-    return {name for (name,) in connection.execute(_KNOWN_OBJECTS, names=list(names))}
-
-
-def swept_objects(connection: LedgerConnection, whole_seconds: float) -> int:
-    """The key from which on objects may be litter; 0 if the last full listing is older than ``whole_seconds``."""
-    found = connection.execute(_SWEPT, age=whole_seconds)
-    return int(found[0][0]) if found else 0
-
-
-def note_swept_objects(connection: LedgerConnection, key: int, whole: bool) -> None:
-    """Note that there is no litter up to a key, and whether all objects were listed for that."""
-    connection.execute(_NOTE_SWEPT, key=key, whole=int(whole))
 
 
 def expect_unpaused(connection: PostgresConnection, map_number: int) -> None:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.ledger import Lock
@@ -24,14 +24,9 @@ from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.places import check_map_id
 from core.postgres.map import PostgresMap
-from core.postgres.pictures.bucket import Bucket
-from core.postgres.sweep import sweep_objects
 from core.postgres.tables import TABLES
 from core.storage.archives.importing import Importing
 from core.storage.archives.unpacking import check_sizes, layout_of
-
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
 
 MOST_CONNECTIONS = 16
 
@@ -59,21 +54,19 @@ class PostgresStore(ABC, Generic[MapT]):
     Any thread may call any method, and any number of processes may use the same maps.
     """
 
-    def __init__(self, address: str, bucket: Bucket | None = None) -> None:
+    def __init__(self, address: str) -> None:
         """Remember where PostgreSQL is; it is connected to when it is first used.
 
         Its tables are made if they are missing.
 
         Args:
             address: such as ``postgresql://placerec@localhost/placerec``.
-            bucket: where new pictures are put; None: in PostgreSQL.
         """
         self._maps: OrderedDict[int, MapT] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
         self._sweeper: threading.Thread | None = None
         self.database = PostgresLedger(address, TABLES, MOST_CONNECTIONS, statement_seconds=0)
-        self.objects = None if bucket is None else _objects_of(bucket)
 
     # An engine
 
@@ -242,20 +235,6 @@ class PostgresStore(ABC, Generic[MapT]):
         self._expect_open()
         self.database.check()
 
-    def check_pictures(self) -> None:
-        self._expect_open()
-        if self.objects is not None:
-            self.objects.check()
-
-    def sweep_objects(self) -> int:
-        """Delete pictures that nothing names any more from the object store; returns how many that were.
-
-        Raises:
-            StoreUnavailable, StorageFailure.
-        """
-        self._expect_open()
-        return 0 if self.objects is None else sweep_objects(self.database, self.objects)
-
     def sweep(self) -> int:
         """Delete what was left by writes that did not end; returns the number of descriptors.
 
@@ -274,9 +253,9 @@ class PostgresStore(ABC, Generic[MapT]):
     def start_sweeping(self) -> None:
         """Sweep now and from time to time, in a thread of its own, until the store is closed."""
 
-        def swept(sweep: Callable[[], int]) -> float:
+        def swept() -> float:
             try:
-                sweep()
+                self.sweep()
             except StorageFailure as error:
                 log.debug("orphans stay for now: %s", error)
                 return AGAIN_SECONDS
@@ -287,7 +266,7 @@ class PostgresStore(ABC, Generic[MapT]):
         def run() -> None:
             wait = 0.0
             while not self._closed.wait(wait):
-                wait = min(swept(self.sweep), swept(self.sweep_objects))
+                wait = swept()
 
         self._sweeper = threading.Thread(target=run, name="sweep", daemon=True)
         self._sweeper.start()
@@ -316,16 +295,8 @@ class PostgresStore(ABC, Generic[MapT]):
     def close(self) -> None:
         """Close the connections, and refuse further reads and writes."""
         self._closed.set()
-        if self.objects is not None:
-            self.objects.close()
         self.database.close()
 
     def _expect_open(self) -> None:
         if self._closed.is_set():
             raise StorageFailure("The store is closed.")
-
-
-def _objects_of(bucket: Bucket) -> Objects:
-    from core.postgres.pictures.objects import Objects  # it imports the client of S3
-
-    return Objects(bucket)

@@ -42,16 +42,6 @@ DEAD_KEYS = Table(
 )  # fmt: skip
 Index("dead_keys_of_map", DEAD_KEYS.c.map, DEAD_KEYS.c.since)
 
-# One row: the folder of the database's pictures in an object store, and up to which key there is no litter in it, as it
-# was when all objects were last listed.
-OBJECT_STORE = Table(
-    "object_store", _METADATA, Column("single", integer(), primary_key=True), Column("folder", text(), nullable=False),
-    Column("swept", integer(), nullable=False, server_default="0"), Column("listed", real()),
-)  # fmt: skip
-
-# The objects whose row is deleted; a sweep deletes them.
-DEAD_OBJECTS = Table("dead_objects", _METADATA, Column("name", text(), primary_key=True))
-
 _OF_MAPS = [
     f"ALTER TABLE {table} ADD FOREIGN KEY (map) REFERENCES maps ON DELETE CASCADE"
     for table in (
@@ -70,26 +60,16 @@ _MORE = [
     "ALTER TABLE descriptors ALTER COLUMN descriptor SET STORAGE EXTERNAL",
     "ALTER TABLE descriptors ALTER COLUMN local SET STORAGE EXTERNAL",
     "ALTER TABLE descriptors ALTER COLUMN code SET STORAGE EXTERNAL",
-    # Keys of entities and of objects are never used twice, also if their transaction fails.
+    # Keys of entities are never used twice, also if their transaction fails.
     "CREATE SEQUENCE drawn_keys",
-    # A sweep looks them up by name.
-    *(f"CREATE UNIQUE INDEX {table}_by_object ON {table} (object)" for table in ("pictures", "review_frames")),
-    "INSERT INTO object_store (single, folder) VALUES (1, gen_random_uuid()::text)",
-    "CREATE FUNCTION note_dead_object() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN"
-    " INSERT INTO dead_objects (name) VALUES (OLD.object) ON CONFLICT DO NOTHING; RETURN NULL; END $$",
-    *(
-        f"CREATE TRIGGER {table}_deleted AFTER DELETE ON {table}"
-        " FOR EACH ROW WHEN (OLD.object IS NOT NULL) EXECUTE FUNCTION note_dead_object()"
-        for table in ("pictures", "review_frames")
-    ),
 ]
 
 ERASED_TABLES = ("places", "tokens", "pictures", "keypoints", "descriptors", "review_frames", "review_pictures")
 """The tables with what a frame shows, which are vacuumed when deleted places are erased."""
 
 TABLES = (
-    Tables("maps", 4, schema.METADATA, migrations={3: schema.LEVELS}),
+    Tables("maps", 5, schema.METADATA),
     Tables("review", 1, review.METADATA),
-    Tables("vectors", 1, _METADATA, more={"postgresql": _MORE}),
+    Tables("vectors", 2, _METADATA, more={"postgresql": _MORE}),
 )
 """Of all maps."""

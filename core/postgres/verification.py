@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from core.ledger.maps import frames, places, sequences
-from core.ledger.maps.frames import StoredPicture, read_pictures
 from core.ledger.maps.places import StoredPlace
 from core.maps.records import VerifyReport
 from core.maps.status import Progress
@@ -33,8 +32,7 @@ def inspect(map_: PostgresMap, progress: Progress, searched: Searched = nothing_
     """Read all places of a map, and compare them with what an engine searches.
 
     A place that is written meanwhile is left out.  Its rows have checksums, and PostgreSQL may have those of its own
-    pages (``initdb --data-checksums``).  Pictures are compared with their digests, also where they are in the object
-    store.
+    pages (``initdb --data-checksums``).  Pictures are compared with their digests.
 
     Raises:
         UnknownMap, StoreUnavailable, StorageFailure.
@@ -59,7 +57,7 @@ def inspect(map_: PostgresMap, progress: Progress, searched: Searched = nothing_
             pictures = frames.pictures_at(connection, numbers, damaged.pictures)
         if not stored:
             break
-        content = _Content(map_, pictures, descriptors, damaged, Form(state.record))
+        content = _Content(pictures, descriptors, damaged, Form(state.record))
         wrong = searched(stored, {row: descriptor for row, (descriptor, _) in descriptors.items()})
         found = {one.row: why for one in stored if (why := content.damage(one) or wrong.get(one.row)) is not None}
         if found:
@@ -99,16 +97,13 @@ class _Content:
 
     def __init__(
         self,
-        map_: PostgresMap,
-        pictures: Mapping[int, StoredPicture],
+        pictures: Mapping[int, bytes],
         descriptors: Mapping[int, tuple[bytes, bytes]],
         damaged: _Damaged,
         form: Form,
     ) -> None:
-        self._pictures, self._read = pictures, read_pictures(map_.objects, pictures)
-        self._descriptors, self._damaged, self._form = descriptors, damaged, form
-        read = sum(len(picture or b"") for picture in self._read.values())
-        self.size = read + sum(len(part) for both in descriptors.values() for part in both)
+        self._pictures, self._descriptors, self._damaged, self._form = pictures, descriptors, damaged, form
+        self.size = sum(map(len, pictures.values())) + sum(len(part) for both in descriptors.values() for part in both)
 
     def damage(self, stored: StoredPlace) -> str | None:
         """The damage of one place; None if there is none."""
@@ -122,12 +117,9 @@ class _Content:
             return f"PostgreSQL: the {place.picture} of place {name} does not match its digest"
         if (row in self._pictures) != (place.picture != "none"):
             return f"PostgreSQL: place {name} is recorded to keep {place.picture}, which is not true"
-        picture = self._read.get(row)
-        if row in self._pictures and picture is None:
-            return f"object store: the picture of place {name} is missing, or is not the one that was stored"
         # The digest of a place with a camera covers its image and the camera's mask.
         whole = place.picture == "image" and place.camera is None
-        if whole and picture is not None and hashlib.sha256(picture).digest() != stored.digest:
+        if whole and hashlib.sha256(self._pictures[row]).digest() != stored.digest:
             return f"PostgreSQL: the image of place {name} does not match its digest"
         if row in self._damaged.keypoints:
             return f"PostgreSQL: the keypoints of place {name} are damaged"

@@ -384,9 +384,6 @@ class Atlas:
         self._expect_open()
         check_writable(self._directory)
 
-    def check_pictures(self) -> None:
-        """Pictures are stored with the rest."""
-
     def close(self) -> None:
         """Wait for reads and writes under way, close all maps, and release the lock on the directory."""
         with self._making:

@@ -8,7 +8,7 @@ from core.disk.files import FolderLock, disk_errors, make_folder
 from core.disk.permissions import close_to_others
 from core.maps import Store
 from core.milvus import open_store
-from core.postgres import Bucket, open_database
+from core.postgres import open_database
 from core.storage import Atlas
 from service.access import key_file
 from service.settings import Settings
@@ -62,7 +62,7 @@ def _store(settings: Settings) -> SweptStore:
     assert settings.database is not None  # the settings were checked
     address = settings.database.get_secret_value()
     if settings.engine == "postgres":
-        return open_database(address, _bucket(settings), settings.row_cache_bytes)
+        return open_database(address, settings.row_cache_bytes)
     assert settings.milvus is not None
     certificate = settings.milvus_certificate
     return open_store(
@@ -70,20 +70,5 @@ def _store(settings: Settings) -> SweptStore:
         address,
         settings.milvus_token.get_secret_value(),
         settings.milvus_database,
-        None if certificate is None else str(certificate),
-        _bucket(settings),
-    )
-
-
-def _bucket(settings: Settings) -> Bucket | None:
-    if settings.objects is None:
-        return None
-    certificate = settings.objects_certificate
-    return Bucket(
-        settings.objects,
-        settings.objects_endpoint,
-        settings.objects_region,
-        settings.objects_access_key,
-        settings.objects_secret_key.get_secret_value(),
         None if certificate is None else str(certificate),
     )

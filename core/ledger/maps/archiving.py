@@ -15,7 +15,6 @@ from core.geometry.keypoints import count_of
 from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import read_cameras
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.frames import ObjectReader
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.schema import SEQUENCES
 from core.ledger.statements import Statement
@@ -45,18 +44,10 @@ class LedgerSource(ABC):
     Args:
         frame_bytes: the size of one place's descriptors, as the map stores them.
         review: the frames of the map that are stored for review.
-        objects: where pictures may be besides.
     """
 
-    def __init__(
-        self,
-        connection: MapConnection,
-        record: MapRecord,
-        frame_bytes: int,
-        review: Review,
-        objects: ObjectReader | None = None,
-    ) -> None:
-        self.connection, self._objects, self._review = connection, objects, review
+    def __init__(self, connection: MapConnection, record: MapRecord, frame_bytes: int, review: Review) -> None:
+        self.connection, self._review = connection, review
         self.record, self.frame_bytes = ArchivedRecord.model_validate(record.model_dump()), frame_bytes
 
     @abstractmethod
@@ -122,11 +113,10 @@ class LedgerSource(ABC):
     def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         """The pictures of those of the places that keep one."""
         for some in pieces([place for place in group if place.picture_bytes]):
-            stored = frames.pictures_at(self.connection, [place.row for place in some])
-            found = frames.read_pictures(self._objects, stored)
+            found = frames.pictures_at(self.connection, [place.row for place in some])
             for place in some:
                 if (picture := found.get(place.row)) is None:
-                    raise StorageFailure(f"The picture of place {place.id!r} is missing, or damaged.")
+                    raise StorageFailure(f"The picture of place {place.id!r} is missing.")
                 yield picture
 
     def keypoints(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:

@@ -9,8 +9,6 @@ import hashlib
 import logging
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
 
 from sqlalchemy import and_, bindparam, delete, exists, func, select, union
 
@@ -28,11 +26,11 @@ _OF_PLACES = PLACES.join(KEYPOINTS, and_(_K.map == _P.map, _K.row == _P.row))
 
 _PUT_PICTURE = Statement(
     lambda insert: insert(PICTURES).values(
-        {name: bindparam(name) for name in ("map", "row", "digest", "size", "bytes", "object")}
+        {name: bindparam(name) for name in ("map", "row", "digest", "size", "bytes")}
     )
 )
 _PICTURES_AT = Statement(
-    select(_PICTURE.row, _PICTURE.bytes, _PICTURE.object, _PICTURE.size, _PICTURE.digest).where(
+    select(_PICTURE.row, _PICTURE.bytes, _PICTURE.digest).where(
         _PICTURE.map == bindparam("map"), among(_PICTURE.row, "rows")
     )
 )
@@ -91,45 +89,6 @@ _OF_NO_PLACE = Statement(
 _AT_ONCE = 100
 
 
-@dataclass(frozen=True)
-class StoredObject:
-    """A picture that is in an object store, as its row names it.
-
-    name: of the object; it was never used before.
-    size: in bytes.
-    digest: SHA-256 of the picture, 32 bytes.
-    """
-
-    name: str
-    size: int
-    digest: bytes
-
-
-StoredPicture = bytes | StoredObject
-"""A picture in its row: its bytes, or the object that has them."""
-
-
-class ObjectReader(Protocol):
-    """Reads objects: the bytes of each in order; None: it is missing or damaged."""
-
-    def read(self, stored: Sequence[StoredObject]) -> Sequence[bytes | None]: ...
-
-
-def read_pictures(objects: ObjectReader | None, pictures: Mapping[int, StoredPicture]) -> dict[int, bytes]:
-    """Pictures by row, wherever they are; those whose object is missing, or damaged, are left out.
-
-    Raises:
-        StorageFailure: one is in an object store, and none is known.
-        StoreUnavailable: the object store cannot be reached, or refuses.
-    """
-    far = {row: one for row, one in pictures.items() if isinstance(one, StoredObject)}
-    if far and objects is None:
-        raise StorageFailure("The picture is in an object store, and this service is configured without one.")
-    near = {row: one for row, one in pictures.items() if not isinstance(one, StoredObject)}
-    found = zip(far, [] if objects is None else objects.read(list(far.values())), strict=True)
-    return near | {row: picture for row, picture in found if picture is not None}
-
-
 def checksum_of(record: bytes, digest: bytes) -> int:
     """The checksum of a record of the keypoints of the frame with this digest."""
     return zlib.crc32(record, zlib.crc32(digest))
@@ -138,22 +97,18 @@ def checksum_of(record: bytes, digest: bytes) -> int:
 # Pictures
 
 
-def put_pictures(connection: MapConnection, pictures: Mapping[int, StoredPicture]) -> None:
+def put_pictures(connection: MapConnection, pictures: Mapping[int, bytes]) -> None:
     """Store the pictures of frames that have none, by row."""
-    given: list[dict[str, Any]] = []
-    for row, picture in pictures.items():
-        if isinstance(picture, StoredObject):
-            columns = {"digest": picture.digest, "size": picture.size, "bytes": None, "object": picture.name}
-        else:
-            digest = hashlib.sha256(picture).digest()
-            columns = {"digest": digest, "size": len(picture), "bytes": picture, "object": None}
-        given.append({"row": row, **columns})
-    connection.execute_many(_PUT_PICTURE, given)
+    connection.execute_many(
+        _PUT_PICTURE,
+        [
+            {"row": row, "digest": hashlib.sha256(picture).digest(), "size": len(picture), "bytes": picture}
+            for row, picture in pictures.items()
+        ],
+    )
 
 
-def pictures_at(
-    connection: MapConnection, rows: Sequence[int], damaged: set[int] | None = None
-) -> dict[int, StoredPicture]:
+def pictures_at(connection: MapConnection, rows: Sequence[int], damaged: set[int] | None = None) -> dict[int, bytes]:
     """The pictures of frames by row; frames without one are left out.
 
     Args:
@@ -162,11 +117,9 @@ def pictures_at(
     Raises:
         StorageFailure: the bytes of one do not match their SHA-256.
     """
-    found: dict[int, StoredPicture] = {}
-    for row, content, name, size, digest in connection.execute(_PICTURES_AT, rows=list(rows)):
-        if name is not None:
-            found[row] = StoredObject(name, size, digest)
-        elif isinstance(content, bytes) and hashlib.sha256(content).digest() == digest:
+    found: dict[int, bytes] = {}
+    for row, content, digest in connection.execute(_PICTURES_AT, rows=list(rows)):
+        if isinstance(content, bytes) and hashlib.sha256(content).digest() == digest:
             found[row] = content
         elif damaged is None:
             raise StorageFailure("A stored picture is damaged.")
@@ -176,9 +129,9 @@ def pictures_at(
 
 
 def stored_pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, tuple[bytes, bytes]]:
-    """The bytes of the pictures of frames and their recorded SHA-256 by row, sound or not; no objects."""
+    """The bytes of the pictures of frames and their recorded SHA-256 by row, sound or not."""
     found = connection.execute(_PICTURES_AT, rows=list(rows))
-    return {row: (bytes(content), digest) for row, content, _, _, digest in found if content is not None}
+    return {row: (bytes(content), digest) for row, content, digest in found}
 
 
 def sizes_at(connection: MapConnection, rows: Sequence[int]) -> tuple[dict[int, tuple[int, bytes]], dict[int, int]]:
@@ -284,7 +237,7 @@ def _sound_rows(connection: MapConnection, rows: Sequence[int]) -> Iterator[int]
 
 
 def room(connection: MapConnection) -> tuple[int, int, int]:
-    """How many frames have keypoints, the bytes of their records, and the bytes of pictures, wherever they are."""
+    """How many frames have keypoints, the bytes of their records, and the bytes of pictures."""
     ((count, size),) = connection.execute(_ROOM)
     ((pictures,),) = connection.execute(_PICTURE_ROOM)
     return int(count), int(size), int(pictures)

@@ -31,7 +31,6 @@ from core.ledger.maps import frames, places, sequences
 from core.ledger.maps.cameras import Cameras
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.counterparts import Counterparts
-from core.ledger.maps.frames import ObjectReader, read_pictures
 from core.ledger.maps.plan import Plan
 from core.ledger.maps.transfer import Transfer
 from core.ledger.maps.writing import Write
@@ -55,9 +54,6 @@ from core.places import Look, Place, PlaceFields, look_address, place_and_look
 
 class LedgerMap(ABC):
     """The part of a map that is in a ledger (:class:`core.maps.store.Map`).  Any thread may call any method."""
-
-    objects: ObjectReader | None = None
-    """Where pictures may be that are not in the ledger."""
 
     def __init__(self) -> None:
         self.cameras = Cameras(self._reading, self._writing, lambda: self.state)
@@ -186,22 +182,14 @@ class LedgerMap(ABC):
 
     def _pictured(self, place_id: str) -> tuple[Place | None, bytes | None]:
         """A place and its picture; None for what there is not."""
-        before: int | None = None
-        while True:
-            with self._reading() as connection:
-                stored = places.find(connection, place_id)
-                if stored is None:
-                    return None, None
-                try:
-                    pictures = frames.pictures_at(connection, [stored.row])
-                except StorageFailure as damage:
-                    raise StorageFailure(f"The stored picture of {_named(place_id)} is damaged.") from damage
-            found = read_pictures(self.objects, pictures)
-            if stored.row in found or stored.row not in pictures:
-                return stored.place, found.get(stored.row)
-            if stored.row == before:
-                raise StorageFailure(f"The picture of {_named(place_id)} is missing in the object store, or damaged.")
-            before = stored.row  # or the place got another frame meanwhile
+        with self._reading() as connection:
+            stored = places.find(connection, place_id)
+            if stored is None:
+                return None, None
+            try:
+                return stored.place, frames.pictures_at(connection, [stored.row]).get(stored.row)
+            except StorageFailure as damage:
+                raise StorageFailure(f"The stored picture of {_named(place_id)} is damaged.") from damage
 
     # Writing
 

@@ -32,7 +32,6 @@ from sqlalchemy import (
 from core.errors import StorageFailure, UnknownFrame
 from core.ledger.maps.checksums import is_sound, sealed, sealed_columns
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.frames import ObjectReader, StoredObject, StoredPicture, read_pictures
 from core.ledger.statements import Statement, among, binary, integer, text
 from core.maps.records import ReviewSetting
 from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
@@ -44,7 +43,8 @@ FRAMES = Table(
     "review_frames", METADATA, Column("map", integer(), nullable=False), Column("number", integer(), nullable=False),
     Column("at", text(), nullable=False), Column("digest", binary(), nullable=False),
     Column("size", integer(), nullable=False), Column("answer", text(), nullable=False), Column("label", text()),
-    Column("object", text()), Column("seal", integer(), nullable=False), PrimaryKeyConstraint("map", "number"),
+    Column("object", text()),  # always NULL; the checksums of rows of 1.0 cover it
+    Column("seal", integer(), nullable=False), PrimaryKeyConstraint("map", "number"),
     UniqueConstraint("map", "digest"), CheckConstraint("length(digest) = 32"), sqlite_strict=True,
 )  # fmt: skip
 # Apart from the frames, so that a listing need not read the pictures.
@@ -125,9 +125,6 @@ _NEXT = Statement(
 class ReviewTable(ABC):
     """The frames of one map that are stored for review (:class:`core.maps.review.Review`).  Any thread may use it."""
 
-    objects: ObjectReader | None = None
-    """Where pictures may be that are not in the ledger."""
-
     def __init__(self) -> None:
         self._held: set[int] = set()
 
@@ -138,14 +135,6 @@ class ReviewTable(ABC):
     @abstractmethod
     def _writing(self) -> AbstractContextManager[MapConnection]:
         """A transaction that writes, and raises if the map is gone."""
-
-    def _picture_to_store(self, connection: MapConnection, picture: bytes) -> StoredPicture:
-        """A picture as its row has it."""
-        return picture
-
-    def _put_object(self, stored: StoredObject, picture: bytes) -> None:
-        """Store a picture that its row names as an object, before the COMMIT."""
-        raise NotImplementedError
 
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False) -> bool:
         if len(data) > setting.most_bytes:
@@ -173,7 +162,6 @@ class ReviewTable(ABC):
         label: Mapping[str, Any] | None,
     ) -> bool:
         """Store a frame under the next number, unless the same file is stored already; whether it was."""
-        stored = self._picture_to_store(connection, data)
         ((number,),) = connection.execute(_NEXT)
         values = {
             "number": number,
@@ -182,14 +170,11 @@ class ReviewTable(ABC):
             "size": len(data),
             "answer": json.dumps(answer),
             "label": None if label is None else json.dumps(label),
-            "object": stored.name if isinstance(stored, StoredObject) else None,
+            "object": None,
         }
         if not connection.execute(_PUT, **sealed(_COLUMNS, values)):
             return False
-        if isinstance(stored, StoredObject):
-            self._put_object(stored, data)
-        else:
-            connection.execute(_PUT_PICTURE, number=number, bytes=data)
+        connection.execute(_PUT_PICTURE, number=number, bytes=data)
         return True
 
     def labels_state(self) -> object:
@@ -236,17 +221,10 @@ class ReviewTable(ABC):
 
     def picture(self, number: int) -> bytes:
         with self._reading() as connection:
-            values = _expect(connection, number)
-            frame, near = _frame(values), connection.one(_PICTURE, number=number)
-        name, stored = values[_COLUMNS.index("object")], dict[int, StoredPicture]()
-        if name is not None:
-            stored[number] = StoredObject(name, frame.size, frame.digest)
-        elif near is not None:
-            stored[number] = near[0]
-        data = read_pictures(self.objects, stored).get(number)
-        if data is None or hashlib.sha256(data).digest() != frame.digest:
+            frame, stored = _frame(_expect(connection, number)), connection.one(_PICTURE, number=number)
+        if stored is None or hashlib.sha256(stored[0]).digest() != frame.digest:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
-        return data
+        return bytes(stored[0])
 
     @contextmanager
     def held(self, number: int) -> Iterator[None]:
@@ -307,7 +285,7 @@ def unsound(connection: MapConnection) -> list[int]:
 
 
 def first_after(connection: MapConnection, number: int) -> tuple[int, bytes, bytes | None] | None:
-    """The first frame of a higher number: its number, its digest, and its picture where that is in the ledger."""
+    """The first frame of a higher number: its number, its digest, and its picture, unless that is gone."""
     found = connection.one(_FIRST_AFTER, after=number)
     return None if found is None else (int(found[0]), found[1], found[2])
 

@@ -130,10 +130,10 @@ TOKENS = _table(
     "tokens", ("token", "row"), _column("token", text()), _column("row", integer()), clustered=True
 )  # fmt: skip
 
-# Apart from the places, so that a listing need not read them.  The bytes are there, or in an object store under a name.
+# Apart from the places, so that a listing need not read them.
 PICTURES = _table(
     "pictures", ("row",), _column("row", integer()), _column("digest", binary()), _column("size", integer()),
-    _column("bytes", binary(), optional=True), _column("object", text(), optional=True),
+    _column("bytes", binary()),
 )  # fmt: skip
 
 # The checksum covers the digest of the frame, too.

@@ -17,7 +17,6 @@ from core.errors import LookNameTaken, RepeatedLook, TooManyLooks, UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.ledger.maps import frames, places, record, sequences
 from core.ledger.maps.connection import MapConnection
-from core.ledger.maps.frames import StoredPicture
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.maps.enrolling import picture_of
@@ -47,7 +46,7 @@ class Write(ABC):
         self._codes: dict[str, int] = {}  # of sequences
         self._ordinals: dict[int, int] = {}  # the next of each sequence, that is not stored yet
         self._places: list[StoredPlace] = []
-        self._pictures_by_row: dict[int, StoredPicture] = {}
+        self._pictures_by_row: dict[int, bytes] = {}
         self._keypoints: dict[int, tuple[bytes, bytes]] = {}  # digest of the frame and record, by row
         self._latest: dict[str, LatestViews] = {}  # of the sequences that frames were added to
         self._kinds: set[PoseKind] = set()  # of the poses that places may get, as far as was looked up
@@ -105,10 +104,6 @@ class Write(ABC):
     @abstractmethod
     def _note(self, stored: StoredPlace) -> None:
         """Note a place that was stored, new or changed."""
-
-    def picture_to_store(self, picture: bytes) -> StoredPicture:
-        """A picture as its row has it."""
-        return picture
 
     @abstractmethod
     def _finish(self) -> None:
@@ -384,7 +379,7 @@ class Write(ABC):
 
     def put_picture(self, row: int, picture: bytes) -> None:
         """Store the picture of a frame that has none."""
-        self._pictures_by_row[row] = self.picture_to_store(picture)
+        self._pictures_by_row[row] = picture
 
     def put_keypoints(self, stored: StoredPlace, record: bytes) -> None:
         """Store the record of the keypoints of a place's frame, in the place of any other."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
 
 from core.geometry.keypoints import Keypoints, keypoints_of
 from core.index import Coder
@@ -24,9 +23,6 @@ from core.postgres.writing import PostgresWrite
 from core.storage.search.scopes import Chooser
 from core.storage.search.snapshot import SearchScope, Snapshot
 from core.storage.search.tiers import tier_for, unopened
-
-if TYPE_CHECKING:
-    from core.postgres.pictures.objects import Objects
 
 
 class CodedWrite(PostgresWrite):
@@ -48,10 +44,8 @@ class CodedMap(PostgresMap):
         Others: as of :class:`core.postgres.map.PostgresMap`.
     """
 
-    def __init__(
-        self, database: PostgresLedger, state: MapState, cache: RowCache, objects: Objects | None = None
-    ) -> None:
-        super().__init__(database, state, objects)
+    def __init__(self, database: PostgresLedger, state: MapState, cache: RowCache) -> None:
+        super().__init__(database, state)
         self._cache = cache
         self._followed = FollowedMap(database, cache, state.number)
 
@@ -127,4 +121,4 @@ class CodedMap(PostgresMap):
         return self.index_status()
 
     def _write(self, connection: MapConnection, state: MapState) -> CodedWrite:
-        return CodedWrite(connection, state, self.objects)
+        return CodedWrite(connection, state)

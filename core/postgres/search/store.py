@@ -13,7 +13,6 @@ from core.maps.records import VerifyReport
 from core.maps.status import Progress, no_progress
 from core.postgres import rows
 from core.postgres.forms import Form
-from core.postgres.pictures.bucket import Bucket
 from core.postgres.search.cache import BYTES, RowCache
 from core.postgres.search.map import CodedMap
 from core.postgres.store import PostgresStore
@@ -28,12 +27,12 @@ class CodedStore(PostgresStore[CodedMap]):
         Others: as of :class:`core.postgres.store.PostgresStore`.
     """
 
-    def __init__(self, address: str, bucket: Bucket | None = None, cache_bytes: int = BYTES) -> None:
-        super().__init__(address, bucket)
+    def __init__(self, address: str, cache_bytes: int = BYTES) -> None:
+        super().__init__(address)
         self.cache = RowCache(cache_bytes)
 
     def _map_of(self, state: MapState) -> CodedMap:
-        return CodedMap(self.database, state, self.cache, self.objects)
+        return CodedMap(self.database, state, self.cache)
 
     @contextmanager
     def _deleting(self, map_: CodedMap) -> Iterator[None]:

@@ -113,7 +113,7 @@ class ClusterKills(Generic[ServersT]):
             time.sleep(draw.uniform(0.2, 2.0))
             killed = self.parts[part]
             time.sleep(max(0.0, self._served.get(part, 0.0) + killed.lives - time.monotonic()))
-            self._store.sweep_objects()  # must not take anything that counts
+            self._store.sweep()  # must not take anything that counts
             killed.kill(draw)
             began = time.monotonic()
             killed.start()

@@ -1,17 +1,13 @@
-"""The parts that a campaign kills of a cluster with a Milvus and an object store."""
+"""The parts that a campaign kills of a cluster with a Milvus."""
 
 from __future__ import annotations
 
 from contextlib import closing
-from hashlib import sha256
 
 import numpy as np
 from pymilvus import MilvusClient
 
-from core.errors import StorageFailure
-from core.ledger.maps.frames import StoredObject
 from core.milvus.collection import collection_name, milvus_errors
-from core.postgres.pictures.objects import Objects
 from tests.core.cluster.clients import Addresses
 from tests.core.cluster.parts import KillableCluster, KilledClient, KilledPostgres, KilledServer, SilentPostgres
 from tests.core.storage.frames import DIMENSION, ENCODER
@@ -37,33 +33,13 @@ class KilledMilvus(KilledServer):
             client.search(name, query, limit=1, timeout=2, anns_field="descriptor", consistency_level="Strong")
 
 
-class KilledObjectStore(KilledServer):
-    """Asked to write an object and to read it."""
-
-    def __init__(self, servers: Servers) -> None:
-        super().__init__(servers.objects)
-        self._bucket = servers.bucket
-
-    def ask(self) -> None:
-        content = b"asked"
-        asked = StoredObject("asked", len(content), sha256(content).digest())
-        objects = Objects(self._bucket)
-        try:
-            objects.put({asked.name: content})
-            if objects.read([asked]) != [content]:
-                raise StorageFailure("it does not read what it wrote")
-        finally:
-            objects.close()
-
-
 MILVUS = KillableCluster(
     running_servers,
-    lambda servers: Addresses(servers.postgres_address, servers.milvus_address, servers.bucket),
+    lambda servers: Addresses(servers.postgres_address, servers.milvus_address),
     {
         "milvus": lambda servers, _: KilledMilvus(servers),
         "postgres": lambda servers, _: KilledPostgres(servers.postgres),
         "silence": lambda servers, _: SilentPostgres(servers.postgres),
-        "objects": lambda servers, _: KilledObjectStore(servers),
         "client": lambda _, client: KilledClient(client),
     },
 )

@@ -11,7 +11,7 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from core.errors import UnknownMap
 from core.maps import Map
-from core.milvus import Bucket, open_store
+from core.milvus import open_store
 from core.milvus.store import MilvusStore
 from tests.core.maps.contract import MAP, StoreContract
 from tests.servers.milvus import Servers
@@ -23,7 +23,6 @@ class Cluster(StoreContract):
     """Two clients of real servers: what one writes, the other reads next."""
 
     servers: ClassVar[Servers]
-    bucket: ClassVar[Bucket | None] = None
 
     def __init__(self) -> None:
         super().__init__()
@@ -32,7 +31,7 @@ class Cluster(StoreContract):
             self.other.delete(MAP)
 
     def opened(self) -> MilvusStore:
-        return open_store(self.servers.milvus_address, self.servers.postgres_address, bucket=self.bucket)
+        return open_store(self.servers.milvus_address, self.servers.postgres_address)
 
     @property
     def map(self) -> Map:
@@ -44,11 +43,6 @@ class Cluster(StoreContract):
         self.other.close()
 
 
-class ClusterWithObjects(Cluster):
-    """The same, with pictures in an object store."""
-
-
-@pytest.mark.parametrize(("kind", "examples"), [(Cluster, 15), (ClusterWithObjects, 10)])
-def test_contract(servers: Servers, kind: type[Cluster], examples: int) -> None:
-    Cluster.servers, ClusterWithObjects.bucket = servers, servers.bucket
-    run_state_machine_as_test(kind, settings=settings(max_examples=examples, stateful_step_count=20, deadline=None))
+def test_contract(servers: Servers) -> None:
+    Cluster.servers = servers
+    run_state_machine_as_test(Cluster, settings=settings(max_examples=15, stateful_step_count=20, deadline=None))
