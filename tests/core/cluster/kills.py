@@ -185,7 +185,7 @@ def cluster_of(vectors: str) -> KillableCluster[Any]:
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
     engine = argparse.ArgumentParser(prog="scripts/soak cluster", add_help=False)
-    told = "what searches the maps; milvus: with an object store besides (default: %(default)s)"
+    told = "what searches the maps (default: %(default)s)"
     engine.add_argument("--vectors", choices=("postgres", "milvus"), default="postgres", help=told)
     cluster = cluster_of(engine.parse_known_args(arguments)[0].vectors)
     chosen = read_arguments(arguments, "cluster", __doc__, cluster.parts, kills=100, others=engine)
