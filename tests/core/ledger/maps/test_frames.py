@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -13,7 +12,6 @@ from sqlalchemy import bindparam, delete, update
 from core.errors import StorageFailure
 from core.ledger import Statement
 from core.ledger.maps import frames
-from core.ledger.maps.frames import StoredObject
 from core.ledger.maps.schema import KEYPOINTS, PICTURES, PLACES
 from tests.core.ledger.maps.memory import MemoryMap
 from tests.core.store.frames import frame, keypoints_of
@@ -119,30 +117,3 @@ def test_a_damaged_picture_is_not_given_out(two: MemoryMap) -> None:
     for read in (two.picture, two.thumbnail):
         with pytest.raises(StorageFailure, match="The stored picture of place 'a' is damaged"):
             read("a")
-
-
-class Objects:
-    """An object store with what is in a dictionary."""
-
-    def __init__(self, content: dict[str, bytes]) -> None:
-        self._content = content
-
-    def read(self, stored: Sequence[StoredObject]) -> list[bytes | None]:
-        return [self._content.get(one.name) for one in stored]
-
-
-def test_a_picture_may_be_in_an_object_store(two: MemoryMap) -> None:
-    picture = b"far away"
-    with two._writing() as write:
-        frames.delete_frames(write.connection, [0])
-        far = StoredObject("objects/1", len(picture), hashlib.sha256(picture).digest())
-        frames.put_pictures(write.connection, {0: far})
-        assert frames.pictures_at(write.connection, [0, 1]) == {0: far, 1: b"thumbnail of b"}
-        assert frames.stored_pictures_at(write.connection, [0]) == {}
-    with pytest.raises(StorageFailure, match="configured without one"):
-        two.picture("a")
-    two.objects = Objects({})
-    with pytest.raises(StorageFailure, match="missing in the object store"):
-        two.picture("a")
-    two.objects = Objects({"objects/1": picture})
-    assert (two.picture("a"), two.picture("b")) == (picture, b"thumbnail of b")
