@@ -9,10 +9,12 @@ cached rows included, and reads it anew.
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +78,15 @@ class FollowedMap:
         self._lock = threading.RLock()
         self._joining = threading.Lock()
         self._held: Followed | None = None
+        self._given = WeakSet[Snapshot]()
+
+    @property
+    def has_older_readers(self) -> bool:
+        """Whether a snapshot is in use that shows another state of the map than the last one."""
+        now = None if self._held is None else self._held.snapshot
+        if any(one is not now for one in self._given):
+            gc.collect()  # one in a circle of objects, as a traceback makes it, is in use by nobody
+        return any(one is not now for one in self._given)
 
     @property
     def held(self) -> Followed | None:
@@ -111,6 +122,7 @@ class FollowedMap:
             snapshot = self._read(connection, state, source)
         else:
             source, snapshot = held.source, self._with_changes(connection, state, held)
+        self._given.add(snapshot)
         self._held = now = Followed(snapshot, state.revision, state.stamp, source)
         if snapshot.table is not None and snapshot.table.is_loose:
             threading.Thread(target=self._join, name="index", daemon=True).start()
@@ -254,6 +266,7 @@ class FollowedMap:
                     if now is None or now.source is not held.source or now.snapshot.table is None:
                         return
                     self._held = replace(now, snapshot=now.snapshot.with_block(block))
+                    self._given.add(self._held.snapshot)
         except Exception:
             log.exception("The codes of a map could not be joined; searches read all of them")
         finally:

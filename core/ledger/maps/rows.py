@@ -166,9 +166,14 @@ def leave(connection: MapConnection, row: int, revision: int) -> None:
     connection.execute(_LEAVE, number=row, revision=revision)
 
 
-def clear(connection: MapConnection, most: int = CLEARED_AT_ONCE) -> int:
-    """Delete what is stored of up to ``most`` rows that died a while ago; returns how many of them there were."""
-    rows = [row for (row,) in connection.execute(_OLD, age=LEFT_SECONDS, most=most)]
+def clear(connection: MapConnection, at_once: bool = False) -> int:
+    """Delete what is stored of some rows that died a while ago; returns how many of them there were.
+
+    Args:
+        at_once: also of those that died a moment ago.
+    """
+    age = -1 if at_once else LEFT_SECONDS
+    rows = [row for (row,) in connection.execute(_OLD, age=age, most=CLEARED_AT_ONCE)]
     if rows:
         for statement in _DELETE.values():
             connection.execute(statement, rows=rows)

@@ -21,7 +21,7 @@ from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
 from core.store import Directory, Map
 from core.upkeep.redundancy import neighbour_pairs, stops
-from tests.core.storage.search.test_indexing import settled
+from tests.core.store.settled import settled
 from tests.service.scenes import scene
 
 PLACES, SPOT, LOOKS = 12, 5, 120
