@@ -21,7 +21,17 @@ from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.maps.enrolling import picture_of
 from core.maps.forms import Form
-from core.maps.records import MOST_LOOKS, Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
+from core.maps.records import (
+    COMPACT_FROM,
+    MOST_LOOKS,
+    Change,
+    Enrolment,
+    History,
+    Keep,
+    MapRecord,
+    PicturedPlace,
+    SameFrame,
+)
 from core.maps.stored_fields import moment_text, same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, ViewedFrame, latest_views, leaves_view, reach_of
 from core.places import NO_SEQUENCE, Place, PlaceFields, Pose, PoseKind, check_coordinates, place_and_look
@@ -469,10 +479,11 @@ class Write:
         self._store_waiting()
         if self._new:
             descriptors, local = ({row: both[at] for row, both in self._new.items()} for at in (0, 1))
-            codes = Coder.of(self._form.dimension).encode(self._form.descriptors(list(descriptors.values())))
             rows.put(self._connection, "descriptors", descriptors)
             rows.put(self._connection, "locals", local)
-            rows.put(self._connection, "codes", dict(zip(self._new, map(bytes, codes), strict=True)))
+            if self.state.searched >= COMPACT_FROM or self.record.index == "compact":
+                codes = Coder.of(self._form.dimension).encode(self._form.descriptors(list(descriptors.values())))
+                rows.put(self._connection, "codes", dict(zip(self._new, map(bytes, codes), strict=True)))
         if self.state != self._before:
             record.put_counters(self._connection, self.state)
             rows.note_revision(self._connection, self.state.revision, self.state.stamp)
