@@ -573,6 +573,10 @@ class Store(Protocol):
             InvalidIdentifier, MapExists, StorageFull, StorageFailure: nothing of the map is left.
         """
 
+    @property
+    def open_maps(self) -> int:
+        """The number of maps that are ready for use; this does not wait."""
+
     def get(self, map_id: str) -> Map:
         """A map, ready for use.
 

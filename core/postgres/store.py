@@ -177,6 +177,11 @@ class PostgresStore(ABC, Generic[MapT]):
         """The same as :meth:`get`."""
         return self.get(map_id)
 
+    @property
+    def open_maps(self) -> int:
+        """The number of maps of which something is in memory."""
+        return len(self._maps)
+
     def opened(self, map_id: str) -> MapT | None:
         """None: only PostgreSQL knows whether a map is still there."""
         return None

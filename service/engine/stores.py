@@ -11,6 +11,7 @@ from core.milvus import open_store
 from core.postgres import Bucket, open_database
 from core.storage import Atlas
 from service.access import key_file
+from service.open_files import most_open_maps
 from service.settings import Settings
 
 
@@ -33,10 +34,13 @@ class OpenStore:
 
     def __init__(self, settings: Settings) -> None:
         self.maps: Store
+        self.most_open: int
+        """The number of maps that may be open at the same time."""
         self._lock: FolderLock | None = None
         with disk_errors(f"open the data directory {settings.data_dir}"):
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
+        self.most_open = most_open_maps(settings)
         if settings.engine == "files":
             self.maps = Atlas(settings.data_dir)
             return
