@@ -310,6 +310,11 @@ class Directory(Store):
         found = self._maps.get(map_id)
         return found if found is not None and found.is_open else None
 
+    @property
+    def open_maps(self) -> int:
+        """The number of maps that were read from disk and are in service."""
+        return sum(one.is_open for one in self._maps.copy().values())
+
     def find(self, map_id: str) -> Map:
         """A map whose record and number of places can be used without reading it from disk.
 
