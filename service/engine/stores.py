@@ -30,7 +30,7 @@ class OpenStore:
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
         self.most_open = most_open_maps(settings)
         if settings.engine == "files":
-            self.maps = Directory(settings.data_dir)
+            self.maps = Directory(settings.data_dir, self.most_open)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
