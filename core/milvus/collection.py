@@ -19,7 +19,7 @@ from pymilvus import DataType, MilvusClient
 from pymilvus.exceptions import MilvusException
 
 from core.errors import StoreOfAnotherVersion, StoreUnavailable
-from core.ledger.outage import Outage, Unreachable
+from core.outage import Outage, Unreachable
 from core.milvus.expressions import NO_HEADING
 from core.milvus.indexes import indexing_for, search_settings
 from core.places import Whereabouts
