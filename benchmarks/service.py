@@ -31,7 +31,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.question import Query
 from core.recognition.recognition import locate
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.threads import allowed_threads, cores, share_cores
 from service.commands.load import measure
 from service.commands.timing.samples import fill_map
@@ -113,7 +113,7 @@ def main(
         (folder / "frames").mkdir()
         for index, data in enumerate(frames):
             (folder / "frames" / f"{index:03d}.jpg").write_bytes(data)
-        atlas = Atlas(folder / "copy")
+        atlas = Directory(folder / "copy")
         map_ = atlas.get(MAP)
         queue = {"QUEUE_LENGTH": 2 * max(numbers)}
         with service(folder / "data", threads, queue) as process:

@@ -25,7 +25,7 @@ from benchmarks.report import report
 from core.maps import Enrolment, MapSettings
 from core.maps.archives.reading import Archive, check
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.archives.building import build
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
@@ -49,14 +49,14 @@ def fill(map_: Map, places: int) -> None:
 
 def made(folder: Path, places: int) -> None:
     """A data directory with a map."""
-    atlas = Atlas(folder / "data")
+    atlas = Directory(folder / "data")
     fill(atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL), places)
     atlas.close()
 
 
 def measured(folder: Path) -> dict[str, float]:
     """Export the map, check the file, import it: seconds of each, MB (10^6 bytes) of the file and of memory."""
-    atlas = Atlas(folder / "data")
+    atlas = Directory(folder / "data")
     lab = atlas.get("lab")
     before, began = peak_memory(os.getpid()), time.perf_counter()
     made = lab.exporter.write(folder / "lab.tar")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from benchmarks.cluster.stores import MilvusAddress, PostgresAddress, both_stores
 from benchmarks.report import report, verdict
 from core.judgement.curves import auc_pr
-from core.maps import Map
+from core.store import Map
 from core.maps.records import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
 from benchmarks.frames import camera_frames
 from benchmarks.report import report, verdict
-from core.maps import Map, Store
+from core.store import Map, Store
 from core.maps.records import Enrolment, MapSettings
 from core.places import PlaceFields
-from core.postgres.search.store import CodedStore
-from core.storage import Atlas
+from core.store.cluster import Cluster
+from core.store import Directory
 from core.threads import cores, share_cores
 from tests.servers.postgres import running_postgres
 
@@ -114,13 +114,13 @@ def storage(places: int, found: Times, drives: int) -> None:
     with ExitStack() as stack:
         server = stack.enter_context(running_postgres())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stores: dict[str, Store] = {"files": Atlas(folder), "postgres": CodedStore(server.address)}
+        stores: dict[str, Store] = {"files": Directory(folder), "postgres": Cluster(server.address)}
         queries = filled(stores, places, found)
         queries = queries[: min(len(queries), 200)]
         stores["files"].close()
         for name, opened in (
-            ("files", lambda: Atlas(folder)),
-            ("postgres", lambda: CodedStore(server.address)),
+            ("files", lambda: Directory(folder)),
+            ("postgres", lambda: Cluster(server.address)),
         ):
             stores[name].close()
             made: list[Store] = []

@@ -28,7 +28,7 @@ from benchmarks.maps.references import Material, material
 from benchmarks.maps.search import Array, Best, Contender, _enrolment, measure
 from benchmarks.report import report, verdict
 from core.errors import StoreUnavailable
-from core.maps import Map
+from core.store import Map
 from core.maps.records import Enrolment, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder

@@ -14,7 +14,7 @@ import typer
 
 from core.milvus import open_store
 from core.milvus.store import MilvusStore
-from core.storage import Atlas
+from core.store import Directory
 from tests.servers.milvus import running_servers
 
 MilvusAddress = Annotated[str, typer.Option("--milvus", help="Of a Milvus; empty: one of this machine's own.")]
@@ -25,7 +25,7 @@ PostgresAddress = Annotated[str, typer.Option("--postgres", help="Of its Postgre
 class Stores:
     """Both.  processes: the numbers of Milvus's and PostgreSQL's first processes, if they were started here."""
 
-    embedded: Atlas
+    embedded: Directory
     milvus: MilvusStore
     processes: dict[str, int]
 
@@ -50,7 +50,7 @@ def both_stores(milvus: str, postgres: str) -> Iterator[Stores]:
             servers = stack.enter_context(running_servers())
             milvus, postgres = servers.milvus_address, servers.postgres_address
             processes = {"milvus": servers.milvus.process_id, "postgres": servers.postgres.process_id}
-        embedded = Atlas(Path(stack.enter_context(tempfile.TemporaryDirectory())))
+        embedded = Directory(Path(stack.enter_context(tempfile.TemporaryDirectory())))
         stack.callback(embedded.close)
         there = open_store(milvus, postgres)
         stack.callback(there.close)

@@ -26,7 +26,7 @@ from benchmarks.process import Process, service
 from benchmarks.report import report, verdict
 from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage import Atlas
+from core.store import Directory
 
 ENCODER, DIMENSION, BATCH = "made-up@" + "0" * 64, 8, 5000
 BEGAN = datetime(2026, 11, 20, tzinfo=UTC)
@@ -35,7 +35,7 @@ BEGAN = datetime(2026, 11, 20, tzinfo=UTC)
 def fill(folder: Path, places: int) -> None:
     """A data directory with a map."""
     random = np.random.default_rng(0)
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings())
     for first in range(0, places, BATCH):
         items = []

@@ -32,7 +32,7 @@ from benchmarks.report import report, verdict
 from core.maps import Enrolment, MapSettings
 from core.method.catalogue import EncoderCatalogue
 from core.places import PlaceFields, Pose
-from core.storage import Atlas
+from core.store import Directory
 
 STEPS, ROUNDS = 120, 5
 DRAWN = """selector => {
@@ -61,7 +61,7 @@ def fill_traverses(folder: Path, frames: int) -> None:
     """A map of the default encoder with two traverses, the second along the first; descriptors are made up."""
     random = np.random.default_rng(1)
     encoder = next(one for one in EncoderCatalogue(folder / "models").describe() if one.default)
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     two = atlas.create("two", encoder.identity, encoder.dimension, MapSettings(verification=False))
     first = random.standard_normal((frames, encoder.dimension), dtype=np.float32)
     for name in ("monday", "tuesday"):

@@ -34,7 +34,8 @@ from core.belief import Run, RunOptions, Step, View, evidence_of, place_graph, v
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -42,7 +43,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas
+from core.store import Directory
 from core.threads import cores, share_cores
 from lab.training.map_sizes import corridor_and_lip6
 from lab.training.validation import TraverseTask
@@ -143,7 +144,7 @@ def pose(poses: Poses, place: int, random: np.random.Generator) -> Pose | None:
     return Pose(x=ROUNDED * round(x / ROUNDED), y=0) if poses == "coarse" else Pose(x=x + random.normal(0, 0.2), y=0)
 
 
-def fill(atlas: Atlas, name: str, encoder: Encoder, shots: Sequence[tuple[int, Shot]], poses: Poses) -> Map:
+def fill(atlas: Directory, name: str, encoder: Encoder, shots: Sequence[tuple[int, Shot]], poses: Poses) -> Map:
     """A map of frames, each at a reference, in their order."""
     random = np.random.default_rng(7)
     made = atlas.create(name, encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
@@ -342,7 +343,7 @@ def main(
         for how in chosen(get_args(Poses), poses):
             for kind, frames in maps.items():
                 with tempfile.TemporaryDirectory() as folder:
-                    atlas = Atlas(Path(folder))
+                    atlas = Directory(Path(folder))
                     map_ = fill(atlas, "stood", camera.encoder, frames, how)
                     for mode in chosen(get_args(Verify), verify):
                         row = (f"{name}, {how}, {mode}, {kind}", *measured(camera.encoder, map_, ask, mode))

@@ -26,7 +26,7 @@ from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.stages import agree
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.threads import share_cores
 from service.commands.timing.samples import write_map
 from service.malloc import configure_malloc
@@ -107,7 +107,7 @@ def main(
             encodings = one.encode_batch([decode(frame) for frame in known])
             write_map(folder / "data", map_id, one, ((found.descriptor, found.local) for found in encodings))
         shutil.copytree(folder / "data", folder / "copy")  # the service holds its own alone
-        atlas = Atlas(folder / "copy")
+        atlas = Directory(folder / "copy")
         times = in_process(encoders, [atlas.get(map_id) for map_id in ids], frames, rounds)
         atlas.close()
         with service(folder / "data", threads) as process:

@@ -19,14 +19,15 @@ from benchmarks.day.pictures import Look, cut, file, portrait
 from benchmarks.day.walks import WalkPair, corridor, lip6, pixels
 from benchmarks.report import report
 from core.frames.intrinsics import Intrinsics
-from core.maps import Map, MapSettings
+from core.store import Map
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.framings import FrameReframing
 from core.recognition.question import Question, Verify
 from core.recognition.recognition import enrol, recognize
-from core.storage import Atlas
+from core.store import Directory
 
 CUT, RANDOM = cut(0.6, 0.6), np.random.default_rng(0)
 KINDS: dict[str, tuple[Look | None, str | None]] = {
@@ -36,7 +37,7 @@ KINDS: dict[str, tuple[Look | None, str | None]] = {
 WAYS = {"": FrameReframing, ", as it is": lambda *_: None}
 
 
-def make_map(atlas: Atlas, encoder: Encoder, walk: WalkPair) -> Map:
+def make_map(atlas: Directory, encoder: Encoder, walk: WalkPair) -> Map:
     """A map of the references, which knows the camera of whole frames and that of frames that are cut to 60 %."""
     settings, whole = MapSettings(keep="none"), pixels(walk.references[0])
     made = atlas.create(walk.name, encoder.identity, encoder.dimension, settings, encoder.local_shape)
@@ -65,7 +66,7 @@ def main(datasets: Annotated[Path, typer.Option()], every: int = 1, verify: Veri
     """Ask each so-manieth frame both ways in turn, and print shares of them and the processor's milliseconds."""
     encoder, answers = EncoderCatalogue().get(DEFAULT_ENCODER), defaultdict[str, Any](list)
     for walk in (corridor(datasets), lip6(datasets)):
-        with tempfile.TemporaryDirectory() as folder, closing(Atlas(Path(folder))) as atlas:
+        with tempfile.TemporaryDirectory() as folder, closing(Directory(Path(folder))) as atlas:
             map_ = make_map(atlas, encoder, walk)
             for kind, (look, camera) in KINDS.items():
                 question, known = Question(verify=verify, camera=camera), kind != "strangers"

@@ -45,7 +45,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas
+from core.store import Directory
 from lab.training.views.augmentation import augment
 from service.commands.timing.samples import write_map
 
@@ -263,7 +263,7 @@ def estimates(encoder: Encoder, network: XFeat, traverse: PosedTraverse) -> Iter
         poses = [Pose(x=x, y=y, heading=heading % 360) for x, y, heading in traverse.poses]
         enrolments = ((place.descriptor, place.local) for place in described)
         write_map(Path(folder), "poses", encoder, enrolments, fields=lambda index: PlaceFields(pose=poses[index]))
-        atlas = Atlas(Path(folder))
+        atlas = Directory(Path(folder))
         map_ = atlas.get("poses")
         answers = locate(map_, encoder, [Query(encoder.encode(frame), Question(k=1)) for frame in traverse.queries])
         reach = neighborhood_of(map_).radius

@@ -26,7 +26,8 @@ from core.frames.images import decode
 from core.frames.traverses import find_images, read_ground_truth
 from core.geometry.detection import find_keypoints
 from core.judgement.curves import auc_pr
-from core.maps import Map, MapSettings
+from core.store import Map
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
@@ -34,7 +35,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, describe
 from core.recognition.rigs import locate_rig
-from core.storage import Atlas
+from core.store import Directory
 
 WAYS: tuple[Verify, ...] = ("never", "auto", "always")
 TRAVERSES = {"corridor": ("corridor", "query", "ref"), "lip6": ("lip6_outdoor", "query", "reference")}
@@ -116,7 +117,7 @@ def main(
             truth[at, [*shown]] = True
         asking, there = Rig(encoder, asked[::every]), Rig(encoder, enrolled)
         half = len(there) // 2
-        with tempfile.TemporaryDirectory() as folder, closing(Atlas(Path(folder))) as atlas:
+        with tempfile.TemporaryDirectory() as folder, closing(Directory(Path(folder))) as atlas:
             for part, numbers in {"all": range(len(there)), "first half": range(half)}.items():
                 settings = MapSettings(keep="none", same_place_radius=RADIUS)
                 map_id = part.replace(" ", "-")

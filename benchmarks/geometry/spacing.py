@@ -49,7 +49,7 @@ from core.places import PlaceFields, Pose, PoseAccuracy
 from core.recognition.pose_survey import pose_survey
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import describe, locate
-from core.storage import Atlas
+from core.store import Directory
 
 Array = NDArray[np.float64]
 SPACINGS = "2,4,6,8,12"
@@ -192,7 +192,7 @@ def ask(
         stated: the poses that the places are enrolled with, as those of the traverse.
         exact: how exact the map states them to be.
     """
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     settings = MapSettings(keep="none", pose_accuracy=exact)
     map_ = atlas.create("spaced", encoder.identity, encoder.dimension, settings, encoder.local_shape)
     map_.cameras.put(CAMERA, None, traverse.camera)

@@ -31,12 +31,13 @@ from core.judgement.reliability import reliability
 from core.judgement.trials import StagedTrials, joined_stages
 from core.judgement.verdict import Calibration
 from core.learning import PlacedFrame, lesson_of, placed_frames, trials_of
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import LabelledQueries, LabelledQuery, run_trials
-from core.storage import Atlas
+from core.store import Directory
 from service.maps.self_calibration import LEAST_FRAMES
 
 FIRST = 900
@@ -76,7 +77,7 @@ class Calibrated:
 class AskedMap:
     """A map of a world that is asked frames of known places, in memory and in a store: its rows are the same."""
 
-    def __init__(self, encoder: Encoder, world: RobotWorld, atlas: Atlas) -> None:
+    def __init__(self, encoder: Encoder, world: RobotWorld, atlas: Directory) -> None:
         first = encoded(encoder, world.first, world.keypoints)
         points, headings = curve(world.spacing * np.arange(len(first)))
         positions = np.column_stack([points.real, points.imag])
@@ -146,7 +147,7 @@ def truth_of(world: RobotWorld, run: EncodedRun) -> list[PlacedFrame]:
 
 def examined(encoder: Encoder, world: RobotWorld, seed: int, folder: Path) -> dict[str, Any]:
     """Every condition of a world: what one run says, and what that does for the next one."""
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     asked, told = AskedMap(encoder, world, atlas), {}
     graph, first_half = asked.living.graph(), np.arange(asked.places) < asked.places // 2
     for condition in world.conditions:

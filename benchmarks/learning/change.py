@@ -47,7 +47,8 @@ from core.judgement.change import (
     log_odds_in_map,
 )
 from core.judgement.probability import sigmoid
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
@@ -55,7 +56,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, answer_to_blank, locate
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas
+from core.store import Directory
 from lab.training.photographs import find_photographs, read
 from service.learning.adoption import graph_of
 
@@ -253,7 +254,7 @@ class KnownWorld:
                 yield truth, alone.alone.during(found.unknown, agreed)
 
 
-def enrolled(world: RobotWorld, encoder: Encoder, atlas: Atlas, whole: bool) -> Map:
+def enrolled(world: RobotWorld, encoder: Encoder, atlas: Directory, whole: bool) -> Map:
     """The map of a world's first places, or of the whole of it."""
     map_ = atlas.create("world", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     count = len(world.first) if whole else round(IN_THE_MAP * len(world.first))
@@ -331,7 +332,7 @@ def fitted(worlds: Sequence[Sequence[JudgedFrame]]) -> list[float]:
 def measured(name: str, world: RobotWorld, encoder: Encoder, runs: bool) -> tuple[list[JudgedFrame], list[list[Any]]]:
     """The frames of a world as they were judged alone, and what was said of those of its runs."""
     with TemporaryDirectory() as folder:
-        atlas = Atlas(Path(folder) / "data")
+        atlas = Directory(Path(folder) / "data")
         asked = np.arange(len(world.right))
         map_ = enrolled(world, encoder, atlas, whole=name == "webcam")
         place = KnownWorld(world, map_, encoder, asked[-CUTS:] if name == "webcam" else asked)

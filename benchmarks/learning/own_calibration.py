@@ -19,13 +19,14 @@ from benchmarks.report import report
 from core.errors import CalibrationImpossible
 from core.judgement.calibration import Held, Target, fit_map_calibration
 from core.judgement.trials import StagedTrials
-from core.maps import Map, MapSettings
+from core.store import Map
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import queries_from_traverse, run_trials
 from core.recognition.recognition import enrol
-from core.storage import Atlas
+from core.store import Directory
 
 WALKS = {"corridor": corridor, "lip6": lip6}
 MOST_QUERIES = 300
@@ -66,7 +67,7 @@ def walked(map_: Map, encoder: Encoder, walk: WalkPair) -> None:
 
 def examined(encoder: Encoder, walk: WalkPair, folder: Path, precision: float) -> dict[str, CalibratedBy | str]:
     """The calibrations of a walk's map, by two stages and by three; or why there is none."""
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     map_ = atlas.create("walk", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     walked(map_, encoder, walk)
     snapshot = map_.snapshot()

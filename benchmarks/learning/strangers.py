@@ -35,7 +35,8 @@ from core.geometry.keypoints import Keypoints
 from core.judgement.background import GUARD_FACTOR
 from core.learning import least_score
 from core.learning.cohort import CLEAR
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -43,7 +44,7 @@ from core.places import PlaceFields, Pose, look_address
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas
+from core.store import Directory
 from service.learning.adoption import graph_of, likeness_of_encodings
 
 LOOKS = (1, 3, 10)
@@ -176,7 +177,7 @@ def _least(encoder: Encoder, frames: Sequence[DrawnFrame], apart: np.ndarray, at
     return least_score(scores(beside), scores(far), encoder.calibration)
 
 
-def enrolled(one: LookedWorld, encoder: Encoder, atlas: Atlas, looks: int, learnt: bool) -> Map:
+def enrolled(one: LookedWorld, encoder: Encoder, atlas: Directory, looks: int, learnt: bool) -> Map:
     """The map with so many looks a place."""
     map_ = atlas.create("world", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     world = one.world
@@ -316,7 +317,7 @@ def main(
         for learnt in (True, False):
             for looks in LOOKS if learnt else LOOKS[1:]:
                 with TemporaryDirectory() as folder:
-                    atlas = Atlas(Path(folder) / "data")
+                    atlas = Directory(Path(folder) / "data")
                     found = figures_of(QuestionedMap(world, enrolled(world, chosen, atlas, looks, learnt), chosen))
                     atlas.close()
                 kind = "first" if looks == 1 else "learnt" if learnt else "any score"

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
 from core.frames.preprocessing import Pixels
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions

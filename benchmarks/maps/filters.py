@@ -30,7 +30,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from service.commands.timing.samples import fill_map, sample_descriptors, sample_frame
 from service.queries.parameters import FilterParameters
 
@@ -127,7 +127,7 @@ def main(
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         if not (folder / "maps" / MAP).is_dir():
             fill_map(folder, MAP, encoder, places, fields=fields)
-        atlas = Atlas(folder)
+        atlas = Directory(folder)
         stack.callback(atlas.close)
         map_ = atlas.get(MAP)
         built(map_)

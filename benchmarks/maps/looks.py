@@ -26,14 +26,15 @@ from benchmarks.report import report, verdict
 from core.frames.images import decode
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import Enrolment, Map, Selection
+from core.maps import Enrolment, Selection
+from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import PlaceFields, look_address
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
-from core.storage import Atlas
+from core.store import Directory
 
 LOOKS = (0, 1, 3, 10)
 """How many looks a place has besides its first."""
@@ -120,7 +121,7 @@ def asked(map_: Map, encoder: Encoder, frame: Frame, without: str | None = None)
 def measured(encoder: Encoder, places: Sequence[Webcam], looks: int) -> dict[str, float]:
     """The shares of the answers in a map whose places have so many looks besides their first."""
     with TemporaryDirectory() as folder:
-        atlas = Atlas(Path(folder) / "data")
+        atlas = Directory(Path(folder) / "data")
         map_ = atlas.create("webcams", encoder.identity, encoder.dimension, local_shape=encoder.local_shape)
         map_.enrol([enrolment(place.name, place.first) for place in places])
         added = [

@@ -27,7 +27,7 @@ from benchmarks.process import ROOT, median, memory, service
 from benchmarks.report import report, verdict
 from core.maps import Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from service.commands.timing.samples import fill_map, jpeg, sample_frame
 
 MAP = "large"
@@ -52,7 +52,7 @@ def made(folder: Path, places: int, precision: Precision) -> dict[str, Any]:
     if not (folder / "maps" / MAP).is_dir():
         fill_map(folder, MAP, EncoderCatalogue().get(DEFAULT_ENCODER), places, precision)
     wrote = time.monotonic() - began
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     map_ = atlas.get(MAP)
     seconds = built(map_)
     status, storage = map_.index_status().model_dump(), map_.storage_status().model_dump()
@@ -82,7 +82,7 @@ def first_query(folder: Path) -> dict[str, float]:
 
 def searched(folder: Path) -> dict[str, float]:
     """Open the map in this process and search it, at first by whole codes and then when their blocks are joined."""
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     before, began = memory(os.getpid()), time.monotonic()
     map_ = atlas.get(MAP)
     opened = time.monotonic() - began

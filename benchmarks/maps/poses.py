@@ -24,7 +24,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
-from core.storage import Atlas
+from core.store import Directory
 from service.commands.timing.samples import write_map
 
 REACH = 15
@@ -35,7 +35,7 @@ def answers(encoder: Encoder, queries: list[Encoding], places: list[Encoding]) -
     with tempfile.TemporaryDirectory() as folder:
         described = ((place.descriptor, place.local) for place in places)
         write_map(Path(folder), "poses", encoder, described, fields=lambda index: PlaceFields(pose=Pose(x=index, y=0)))
-        atlas = Atlas(Path(folder))
+        atlas = Directory(Path(folder))
         found = locate(atlas.get("poses"), encoder, [Query(query, Question(k=1)) for query in queries])
         atlas.close()
     return found

@@ -36,7 +36,7 @@ from core.maps.records import Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.stages import score_matrix
-from core.storage.files.row_formats import (
+from core.maps.forms import (
     BLOCK,
     COMPRESSED,
     inner_products,

@@ -39,9 +39,9 @@ from core.maps import Enrolment, MapSettings, Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.files.segment_files import Layout
-from core.storage.search.snapshot import Snapshot
+from core.store.snapshot import Snapshot
 from core.threads import cores, share_cores
 
 Array = NDArray[np.float32]
@@ -94,7 +94,7 @@ def write_map(folder: Path, encoder: Encoder, of: Material, places: int, precisi
             best, first = Best(stored["products"], stored["rows"]), int(stored["seen"])
     if first == places:
         return
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     try:
         map_ = atlas.get(_name(places))
     except UnknownMap:
@@ -184,7 +184,7 @@ def run(
     contenders: list[Contender] = []
     facts: list[dict[str, Any]] = []
     flats = {places: flat_index(of, places) for places in sorted({min(size, FLAT_PLACES) for size in sizes})}
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     for places in sizes:
         map_, truth = atlas.get(_name(places)), np.load(folder / f"truth-{places}.npz")["rows"]
         snapshot, seconds = indexed(map_)

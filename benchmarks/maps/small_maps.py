@@ -24,8 +24,8 @@ from core.index import Coder, CodeTable
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.places import NO_POSE
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
-from core.storage.search.segment import Location
-from core.storage.search.snapshot import Snapshot
+from core.store.segment import Location
+from core.store.snapshot import Snapshot
 from core.threads import share_cores
 
 Array = NDArray[np.float32]

@@ -23,7 +23,7 @@ from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.places import PlaceFields
 from core.recognition.calibration import queries_from_map, run_trials
-from core.storage import Atlas
+from core.store import Directory
 from service.commands.timing.samples import sample_descriptors, write_map
 from service.upkeep.alignment import _shared
 
@@ -50,7 +50,7 @@ def main(frames: Annotated[int, typer.Option(min=20, help="Of each of two traver
             return PlaceFields(sequence="first" if index < frames else "second")
 
         storing = processor_milliseconds(lambda: write_map(store, "lab", encoder, described, fields=fields))
-        atlas = Atlas(store)
+        atlas = Directory(store)
         map_ = atlas.get("lab")
         snapshot = map_.snapshot()
         queries = queries_from_map(map_, snapshot, frames)

@@ -14,9 +14,9 @@ from core.geometry.keypoints import Keypoints
 from core.judgement.trials import StagedTrials
 from core.learning.frames import RunFrame
 from core.learning.proposals import LEAST_PROBABILITY, Lesson
-from core.maps import Map
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import ProgressCallback, queries_from_rows, run_trials, spread
+from core.store import Map
 
 MOST_ASKED = 300
 """Frames of a run that are asked again at most, evenly spread over it: as many as of a traverse."""

@@ -1,6 +1,7 @@
-"""Maps, whatever stores them: their records, a caller's knowledge of a place, and the interfaces of a store."""
+"""Maps, whatever stores them: their records, and a caller's knowledge of a place."""
 
 from core.maps.counterparts import Correspondence, own_poses
+from core.maps.enrolling import Reject, refuse_all
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import (
     AlarmLimit,
@@ -22,10 +23,9 @@ from core.maps.records import (
     TierSetting,
     VerifyReport,
 )
-from core.maps.review import ReviewFrame, stored_frames
+from core.maps.review import ReviewFrame
 from core.maps.selection import Selection
 from core.maps.status import ErasureReport, IndexStatus, Recall, StorageStatus
-from core.maps.store import Map, Ranking, Reject, Scope, Snapshot, Store, refuse_all
 
 __all__ = [
     "EVERY_PLACE",
@@ -40,28 +40,22 @@ __all__ = [
     "IndexStatus",
     "Keep",
     "LearningSetting",
-    "Map",
     "MapRecord",
     "MapSettings",
     "PicturedPlace",
     "PlaceFilter",
     "Precision",
-    "Ranking",
     "Recall",
     "Reject",
     "RejectedGround",
     "ReviewFrame",
     "ReviewSetting",
     "SameFrame",
-    "Scope",
     "Selection",
     "SequenceSummary",
-    "Snapshot",
     "StorageStatus",
-    "Store",
     "TierSetting",
     "VerifyReport",
     "own_poses",
     "refuse_all",
-    "stored_frames",
 ]

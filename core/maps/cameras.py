@@ -83,33 +83,3 @@ class ReadCameras(KnownCameras):
     def known(self, name: str) -> CameraRecord | None:
         """One camera; None if the map had none of this name."""
         return self._cameras.get(name)
-
-
-class Cameras(KnownCameras):
-    """All cameras of one map.  Any thread may use it; every method may raise what the map's own may raise."""
-
-    @abstractmethod
-    def all(self) -> list[CameraRecord]:
-        """All cameras by name."""
-
-    @abstractmethod
-    def put(
-        self,
-        name: str,
-        mask: Mask | None,
-        intrinsics: Intrinsics | None = None,
-        value_range: ValueRange | None = None,
-    ) -> tuple[CameraRecord, bool]:
-        """Make a camera or replace all its settings, durably; returns the camera and whether it is new.
-
-        Raises:
-            InvalidField: the map has too many cameras.
-        """
-
-    @abstractmethod
-    def forget(self, name: str) -> None:
-        """Delete a camera; its places stay as they are.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """

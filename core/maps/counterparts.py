@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,32 +75,14 @@ def changes_by(
         yield stored, track, station, pose, pose_of
 
 
-class Counterparts(Protocol):
-    """Reads and writes where the places of one map have counterparts.  Any thread may use it."""
+class HandedOver(Protocol):
+    """Reads which poses alignment has handed over."""
 
     def handed_over(self) -> dict[int, str]:
         """The rows of places and looks whose pose was handed over, each with the id of the place that it comes from."""
 
-    def store(self, change: Correspondence) -> None:
-        """Store stations and poses, all of them or, if this raises, none.
 
-        Rows whose place is gone are left out.  Hold the map's writes (``Transfer.paused_writes``) from the decision
-        on if none may be.
-        """
-
-    def copy(self, other: Any, names: Mapping[str, str]) -> None:
-        """Bring places that were copied from another map to the stations that they have there, in one write.
-
-        A station is derived from the nearest frame of its track that both maps have.  If they have none, as where the
-        sequence is gone, the places on the track come to a new one, which no sequence has.
-
-        Args:
-            other: the counterparts of the map from which they were copied, of the same store.
-            names: the ids of the copied places in this map, by their ids in the other.
-        """
-
-
-def own_poses(counterparts: Counterparts, where: Whereabouts, rows: NDArray[np.int64] | None = None) -> Whereabouts:
+def own_poses(counterparts: HandedOver, where: Whereabouts, rows: NDArray[np.int64] | None = None) -> Whereabouts:
     """Places with the poses that are their own, which alone are truth: an alignment would prove itself by those that it
     has handed over.
 

@@ -18,6 +18,15 @@ CheckDescriptors = Callable[[NDArray[np.float32]], NDArray[np.bool_]]
 """Says which of some descriptors, float32 [n, D], an encoder can have given: bool [n]."""
 
 
+Reject = Callable[[int, Exception], None]
+"""Is called with the position of an item of many and the reason why it is not taken; it may raise, to refuse all."""
+
+
+def refuse_all(_position: int, error: Exception) -> None:
+    """Refuse all items because of one."""
+    raise error
+
+
 def any_descriptors(descriptors: NDArray[np.float32]) -> NDArray[np.bool_]:
     """All descriptors, float32 [n, D], taken as they are: bool [n]."""
     return np.ones(len(descriptors), np.bool_)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Any
 
 from core.maps.records import ReviewSetting
 
@@ -46,83 +45,6 @@ class StoredReviews:
     size: int
 
 
-class Review(Protocol):
-    """The frames of one map stored for review.  Any thread may use it; every method may raise StorageFull
-    and StorageFailure."""
-
-    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False) -> bool:
-        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
-
-        Args:
-            renew: if the same file is stored already, and has no label, it gets this answer in place of its former one.
-
-        Returns:
-            Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.
-        """
-
-    def shrink(self, setting: ReviewSetting) -> None:
-        """Drop the oldest frames beyond new limits, and give back the room."""
-
-    def drop_before(self, moment: datetime) -> int:
-        """Drop the frames that were asked before a moment, with their labels; returns how many.
-
-        A map that is not open yet is not opened for this.
-        """
-
-    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
-        """The latest frames, newest first, and how many are stored in all, as of one moment.
-
-        Args:
-            before: only frames with a smaller number; None: all.
-            labelled: only frames with a label, or without one; None: all.
-        """
-
-    def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
-
-    def find(self, number: int) -> ReviewFrame:
-        """One frame.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
-
-    def picture(self, number: int) -> bytes:
-        """The file of a frame.
-
-        Raises:
-            UnknownFrame: it is not stored.
-            StorageFailure: it is damaged.
-        """
-
-    def held(self, number: int) -> AbstractContextManager[None]:
-        """Protect a frame, if it is stored, from being dropped for newer ones until the block ends; one at a time.
-
-        This waits for nothing.
-        """
-
-    def label(self, number: int, label: Mapping[str, Any] | None) -> ReviewFrame:
-        """Label a frame; the label replaces an earlier one, and None takes it back.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
-
-    def label_first(self, number: int, label: Mapping[str, Any]) -> bool:
-        """Label a frame that has no label, whoever else labels it at the same time; whether it had none.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
-
-    def discard(self, number: int) -> None:
-        """Throw a frame away.
-
-        Raises:
-            UnknownFrame: it is not stored.
-        """
-
-
 def frames_to_drop(
     frames: Iterable[tuple[int, int]], count: int, size: int, setting: ReviewSetting, held: Container[int]
 ) -> list[int]:
@@ -140,26 +62,3 @@ def frames_to_drop(
             going.append(number)
             count, size = count - 1, size - bytes_
     return going
-
-
-PAGE = 500
-"""Frames that are read at a time."""
-
-
-def stored_frames(
-    review: Review, labelled: bool | None = None, look: Callable[[], None] = lambda: None
-) -> Iterator[ReviewFrame]:
-    """All frames that a map has stored for review, the newest first; those that are read may be discarded meanwhile.
-
-    Args:
-        labelled: only frames with a label, or without one; None: all.
-        look: is called before each page.
-    """
-    before: int | None = None
-    while True:
-        look()
-        page = review.page(before, PAGE, labelled).frames
-        yield from page
-        if len(page) < PAGE:
-            return
-        before = page[-1].number

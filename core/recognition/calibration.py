@@ -28,7 +28,7 @@ from core.judgement.calibration import (
 )
 from core.judgement.trials import StagedTrials, Trial, gathered, joined_stages
 from core.judgement.verdict import Calibration, Judgement, judge
-from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot, own_poses
+from core.maps import PlaceFilter, own_poses
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE
@@ -36,6 +36,7 @@ from core.recognition.comparison import MapComparison
 from core.recognition.question import Verifier
 from core.recognition.stages import Candidates, agree, calibration_of, neighborhood_of
 from core.recognition.verification import verify_candidates
+from core.store import Map, Ranking, Scope, Snapshot
 
 Item = TypeVar("Item")
 Flags = NDArray[np.bool_]

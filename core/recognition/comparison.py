@@ -13,10 +13,10 @@ from core.errors import UnknownPlace
 from core.geometry.keypoints import Keypoints
 from core.geometry.matching import count_matches
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
-from core.maps import Map
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
 from core.recognition.question import Verifier
+from core.store import Map
 
 
 class Comparison(Protocol):

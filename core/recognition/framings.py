@@ -23,13 +23,13 @@ from core.frames.intrinsics import Intrinsics
 from core.geometry.detection import ScaledFrame, find_keypoints
 from core.geometry.keypoints import SHARES, Keypoints
 from core.judgement.verdict import Judgement, Rivals
-from core.maps import Map
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.places import Neighborhood
 from core.recognition.question import Query
 from core.recognition.stages import Candidates, rank_places
+from core.store import Map
 
 FITS = 0.27
 """A best match whose cells have this mean squared cosine is not doubted: of frames cut to 60 % hardly any has."""

@@ -38,10 +38,11 @@ from core.judgement.position import (
     places_apart,
     wrapped,
 )
-from core.maps import Map, own_poses
+from core.maps import own_poses
 from core.places import GEOGRAPHIC, NO_POSE, Whereabouts
 from core.recognition.self_queries import spread_order
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 
 log = logging.getLogger(__name__)
 

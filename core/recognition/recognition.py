@@ -29,7 +29,7 @@ from core.geometry.pose import RelativeView, SharedPoints
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
-from core.maps import Enrolment, Map
+from core.maps import Enrolment
 from core.maps.moment import one_look
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -47,6 +47,7 @@ from core.recognition.stages import (
     rank_places,
 )
 from core.recognition.verification import NOT_VERIFIED, ThirdStage, relative_views, sightings, third_stage
+from core.store import Map
 from core.threads import begun
 
 ATTEMPTS = 3

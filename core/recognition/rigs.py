@@ -14,13 +14,13 @@ from core.judgement.fusion import CameraRanking, Fused, fuse, witnesses
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Judgement
-from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.pose_survey import place_errors
 from core.recognition.question import Query
 from core.recognition.recognition import ATTEMPTS, Answer, first_looks, judgement_of, locate, places_of, rival_places
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
 from core.recognition.verification import ThirdStage, VerificationState, third_stage
+from core.store import Map
 
 
 def locate_rig(

@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.maps import Map, own_poses
+from core.maps import own_poses
 from core.maps.records import Outline
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 
 Positions = NDArray[np.int64]
 

@@ -26,11 +26,12 @@ from core.judgement.background import FULL
 from core.judgement.geometry import Geometry
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
-from core.maps import Map, MapSettings, Ranking, Scope, Selection
-from core.maps.store import merged
+from core.maps import MapSettings, Selection
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import Neighborhood, Whereabouts
+from core.store import Map, Ranking, Scope
+from core.store.snapshot import merged
 
 Array = NDArray[np.float32]
 Positions = NDArray[np.int64]

@@ -26,12 +26,12 @@ from core.geometry.verification import Verification, verify
 from core.judgement.geometry import Geometry, final_gains, final_order
 from core.judgement.position import places_apart
 from core.judgement.verdict import Calibration, Judgement, worth_verifying
-from core.maps import Map
 from core.method.encoder import Encoder
 from core.places import NO_POSE, Neighborhood
 from core.recognition.comparison import Comparison, MapComparison
 from core.recognition.question import Query, Verifier
 from core.recognition.stages import Candidates, Positions, calibration_of, neighborhood_of
+from core.store import Map
 
 VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 """Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if the best match of two stages

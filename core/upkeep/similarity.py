@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.alignment import LARGEST_STEP, SharedStretch, of_matrix, shared_stretches
-from core.maps import Snapshot
 from core.method.encoder import Encoder
 from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
+from core.store import Snapshot
 from core.threads import allowed_threads, compute_alone, in_turns
 
 Rows = NDArray[np.int64]

@@ -18,7 +18,7 @@ from typing import Any
 
 from core.disk.files import FolderLock, disk_errors, sync_file
 from core.errors import MapQuarantined, PlacerecError, StorageFailure, StorageFull, UnknownMap
-from core.maps import Map
+from core.store import Map
 from service.backups.index import BackupEntry, BackupIndex, InvalidIndex, file_name
 from service.backups.shelf import Backup, BackupSchedule, Shelf, name_of, take_over
 from service.engine.engine import Engine

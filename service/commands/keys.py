@@ -138,7 +138,7 @@ def _store(data_dir: Any) -> Keys:
 
 def _absent(data_dir: Any, maps: list[str]) -> list[str]:
     """Those of the maps that the data directory does not have; none if maps are in a database."""
-    from core.storage.atlas import has_map
+    from core.store.directory import has_map
 
     settings = read_settings(data_dir)
     return [name for name in maps if settings.database is None and not has_map(settings.data_dir, name)]

@@ -24,12 +24,13 @@ from core.errors import (
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
-from core.maps import Map, MapRecord, Store
+from core.maps import MapRecord
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
 from core.recognition.recognition import needs_keypoints
+from core.store import Map, Store
 from service.engine.encoders import Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.engine.rehearsal import rehearse

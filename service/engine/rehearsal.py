@@ -28,7 +28,7 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.preprocessing import Pixels
 from core.judgement.alignment import LEAST_FRAMES, of_matrix, shared_stretches
 from core.kernels.compiled import PROCESSOR, instructions, levels, processor, settings_of
-from core.maps import Map
+from core.maps.forms import COMPRESSED, inner_products, pack_descriptors
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, canary_frame
 from core.method.regions import box_sums
@@ -36,8 +36,7 @@ from core.places import PlaceFields, Pose
 from core.recognition import Answer, enrol, recognize
 from core.recognition.question import Question
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas
-from core.storage.files.row_formats import COMPRESSED, inner_products, pack_descriptors
+from core.store import Directory, Map
 
 FRAMES = 2
 """Of each of the two traverses."""
@@ -68,7 +67,7 @@ def rehearse(encoder: Encoder) -> None:
 
 def _rehearse(encoder: Encoder) -> None:
     with tempfile.TemporaryDirectory(prefix="placerec-rehearsal-") as folder:
-        atlas = Atlas(Path(folder))
+        atlas = Directory(Path(folder))
         try:
             shape = encoder.local_shape
             _rehearse_in(atlas.create("rehearsal", encoder.identity, encoder.dimension, local_shape=shape), encoder)

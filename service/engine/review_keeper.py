@@ -16,7 +16,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 from core.errors import PlacerecError
-from core.maps import Map
+from core.store import Map
 
 MOST_WAITING, MOST_WAITING_BYTES = 32, 64 << 20
 """The most frames, and bytes of their files, that wait to be written; further ones are dropped."""

@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from contextvars import Context
 from dataclasses import dataclass, field
 
-from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, answer_to_blank, locate
+from core.store import Map
 from core.threads import cores
 from service.engine.encoders import Encoded
 from service.fairness import CALLER, FairQueue

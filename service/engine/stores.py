@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from core.disk.files import FolderLock, disk_errors, make_folder
 from core.disk.permissions import close_to_others
-from core.maps import Store
-from core.milvus import open_store
-from core.postgres import open_database
-from core.storage import Atlas
+from core.store import Directory, Store, open_cluster
 from service.access import key_file
 from service.settings import Settings
-
-
-class SweptStore(Store, Protocol):
-    """A store that several services use."""
-
-    def start_sweeping(self) -> None:
-        """Delete what others have left, now and from time to time."""
 
 
 class OpenStore:
@@ -38,37 +26,21 @@ class OpenStore:
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
         if settings.engine == "files":
-            self.maps = Atlas(settings.data_dir)
+            self.maps = Directory(settings.data_dir)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            store = _store(settings)
+            assert settings.database is not None  # the settings were checked
+            cluster = open_cluster(settings.database.get_secret_value(), settings.row_cache_bytes)
         except BaseException:
             self._lock.release()
             raise
-        store.start_sweeping()
-        self.maps = store
+        cluster.start_sweeping()
+        self.maps = cluster
 
     def close(self) -> None:
         """Wait for reads and writes under way, close the store, and release the data directory."""
         self.maps.close()
         if self._lock is not None:
             self._lock.release()
-
-
-def _store(settings: Settings) -> SweptStore:
-    """The store of maps in a database."""
-    assert settings.database is not None  # the settings were checked
-    address = settings.database.get_secret_value()
-    if settings.engine == "postgres":
-        return open_database(address, settings.row_cache_bytes)
-    assert settings.milvus is not None
-    certificate = settings.milvus_certificate
-    return open_store(
-        settings.milvus,
-        address,
-        settings.milvus_token.get_secret_value(),
-        settings.milvus_database,
-        None if certificate is None else str(certificate),
-    )

@@ -13,9 +13,9 @@ from fastapi.routing import APIRoute
 from pydantic import AfterValidator
 from starlette.responses import Response
 
-from core.maps import Map
 from core.numerals import Decimal
 from core.places import check_map_id, check_place_id, check_sequence
+from core.store import Map
 from service.access.roles import Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline

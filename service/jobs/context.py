@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
 from core.frames.masks import Mask
-from core.maps import Map, Store
+from core.store import Map, Store
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline

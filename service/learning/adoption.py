@@ -41,12 +41,14 @@ from core.learning import (
     services,
 )
 from core.learning.anchors import place_of
-from core.maps import Enrolment, LearningSetting, Map, ReviewFrame, stored_frames
+from core.ledger.maps.review import stored_frames
+from core.maps import Enrolment, LearningSetting, ReviewFrame
 from core.method.encoder import Encoder, Encoding
 from core.places import Look, PlaceFields, look_address, place_and_look
 from core.recognition.question import Query
 from core.recognition.recognition import describe, frame_digest, locate
 from core.recognition.stages import calibration_of, likeness_of_first, neighborhood_of, rank_places
+from core.store import Map
 from service.engine.encoders import Encoded
 
 Encode = Callable[[Sequence[bytes], Sequence[str | None], bool], list[Encoded | Exception]]

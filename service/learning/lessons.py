@@ -35,12 +35,13 @@ from core.learning import (
     trials_of,
 )
 from core.learning.proposals import LEAST_ANCHORS
-from core.maps import Map, ReviewSetting
+from core.maps import ReviewSetting
 from core.maps.records import MOST_LOOKS
 from core.maps.stored_fields import moment_text
 from core.method.encoder import Encoder
 from core.recognition.calibration import ProgressCallback
 from core.recognition.stages import calibration_of
+from core.store import Map
 from service.access.audit import ASKER
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine

@@ -20,10 +20,12 @@ from core.belief import PlaceGraph
 from core.errors import RevisionMismatch, UnknownStretch
 from core.learning import GroundStretch, Lesson, RunFrame, new_ground_of
 from core.learning.new_ground import LEAST_FRAMES
-from core.maps import LearningSetting, Map, RejectedGround, ReviewFrame, ReviewSetting, stored_frames
+from core.ledger.maps.review import stored_frames
+from core.maps import LearningSetting, RejectedGround, ReviewFrame, ReviewSetting
 from core.maps.records import MOST_POSES, MOST_REJECTED
 from core.maps.stored_fields import moment_text
 from core.places import Place, PlaceFields, Pose
+from core.store import Map
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

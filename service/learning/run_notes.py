@@ -11,7 +11,7 @@ from threading import Lock
 from weakref import WeakSet
 
 from core.learning import RunFrame, Witness
-from core.maps import Map
+from core.store import Map
 from service.access.audit import ASKER, Asker
 from service.access.roles import Principal
 

@@ -19,7 +19,6 @@ from core.judgement.acceptance import held_out_change
 from core.judgement.calibration import FittedCalibration, Target, adjust_calibration
 from core.judgement.trials import StagedTrials, Trials, joined_stages
 from core.judgement.verdict import Calibration
-from core.maps import Map, Snapshot
 from core.method.encoder import Encoder
 from core.recognition.calibration import (
     LabelledQueries,
@@ -34,6 +33,7 @@ from core.recognition.calibration import (
     calibrate_map as fit_calibration,
 )
 from core.recognition.stages import calibration_of
+from core.store import Map, Snapshot
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

@@ -14,9 +14,9 @@ from core import errors
 from core.judgement.calibration import Effect, Kinds, effect_of
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
-from core.maps import Map
 from core.places import Timestamp
 from core.recognition.calibration import one_sided
+from core.store import Map
 from service.errors.problems import problem_documentation
 from service.http.headers import entity_tag
 from service.http.routing import EngineDep, MapId, single_values

@@ -13,7 +13,7 @@ from starlette.responses import Response, StreamingResponse
 
 from core import errors
 from core.judgement.verdict import Verdict
-from core.maps import Map
+from core.store import Map
 from service.access.roles import OPERATIONS, Principal, covers
 from service.engine.engine import Engine
 from service.errors.faults import Fault, InvalidRequest, RoleTooLow, TooManyListeners

@@ -20,8 +20,8 @@ from starlette.types import Message, Receive, Scope, Send
 
 from core.disk.permissions import PRIVATE_FOLDER
 from core.errors import StorageFull
-from core.maps import Map
 from core.maps.archives.writing import Exported
+from core.store import Map
 from service.errors.faults import NotReady, RangeNotSatisfiable, TooManyExports
 from service.places.staging import RESERVE
 from service.settings import Settings

@@ -33,11 +33,11 @@ from core.frames.images import Limits
 from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive, opening_of
 from core.maps.archives.tar_layout import BLOCK
+from core.maps.archives.unpacking import check_sizes
 from core.maps.enrolling import any_descriptors
 from core.maps.records import MOST_LOOKS, Precision
 from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
-from core.storage.archives.unpacking import check_sizes
 from service.engine.engine import Engine
 from service.errors.faults import ClientGone, TooManyImports, TooManyPlaces
 from service.http.arrivals import Arrival, arriving

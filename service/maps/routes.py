@@ -12,9 +12,10 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from core import errors
 from core.judgement.verdict import Calibration
-from core.maps import AlarmSetting, LearningSetting, Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
+from core.maps import AlarmSetting, LearningSetting, MapRecord, MapSettings, ReviewSetting, VerifyReport
 from core.maps.pagination import Listing, decode_name, page_of
 from core.places import check_map_id
+from core.store import Map
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.errors.problems import problem_documentation

@@ -16,7 +16,7 @@ from core.judgement.calibration import effect_of
 from core.judgement.reliability import reliability
 from core.judgement.trials import StagedTrials, Trials
 from core.learning import count_witnesses
-from core.maps import Map
+from core.store import Map
 from service.engine.engine import Engine
 from service.jobs.context import JobCancelled, JobContext, progress_of
 from service.learning.run_notes import RunNotes

@@ -12,8 +12,8 @@ from typing import Any
 
 from starlette.requests import Request
 
-from core.maps import Map
 from core.recordings.plausibility import MOST_SPEED
+from core.store import Map
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, NothingEnrolled, UnsupportedMediaType

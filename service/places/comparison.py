@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.frames.masks import Mask, with_range
-from core.maps import Map
 from core.names import LONGEST, composed
 from core.places import Camera, Place, PoseKind, Sequence, check_coordinates, pose_kinds
 from core.recognition.recognition import frame_digest
+from core.store import Map
 
 MOST_COMPARED = 4000
 """Frames of one request: with ids of full length and digests they fit into a body of JSON."""

@@ -9,9 +9,10 @@ from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field, replace
 
 from core.frames.masks import Mask
-from core.maps import Change, Enrolment, Map, Reject, SameFrame, refuse_all
+from core.maps import Change, Enrolment, Reject, SameFrame, refuse_all
 from core.places import Place, PlaceFields, look_address
 from core.recognition.recognition import describe, frame_digest
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

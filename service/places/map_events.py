@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from core.maps import Map
+from core.store import Map
 from service.engine.engine import Engine
 from service.events.schemas import MapEvent
 

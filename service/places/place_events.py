@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from core.maps import Change, Map
+from core.maps import Change
 from core.places import Place
+from core.store import Map
 from service.access.audit import ASKER
 from service.engine.engine import Engine
 from service.events.schemas import ChangedPlace, EnrolmentEvent

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from anyio import CapacityLimiter
 
-from core.maps import Map, own_poses
+from core.maps import own_poses
 from core.places import NO_POSE
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 from core.upkeep import coverage
 from core.upkeep.redundancy import first_looks
 from service.errors.faults import PlanTooLarge

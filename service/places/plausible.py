@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from core.maps import Map
 from core.places import Pose, is_no_fix, microseconds
 from core.recognition.pose_survey import pose_survey
 from core.recordings.plausibility import Source, jitter_of, judge
+from core.store import Map
 from service.errors.faults import ImplausiblePose, InvalidRequest
 from service.http.schemas import validated
 from service.places.parameters import BatchItem

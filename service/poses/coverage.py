@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.maps import Map
 from core.places import Coordinate, Pose, check_coordinates, pose_kinds
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 from core.upkeep.surroundings import State, Surroundings, surroundings
 from service.http.schemas import validated
 from service.places.parameters import PoseParameters

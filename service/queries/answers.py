@@ -9,9 +9,9 @@ from fastapi import Depends
 
 from core.judgement.change import UsualScore, WorldChange, change_of
 from core.judgement.position import PoseEstimate
-from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import Candidates
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView

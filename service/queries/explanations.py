@@ -11,7 +11,6 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.geometry.verification import LEAST_MATCHES
-from core.maps import Map
 from core.method.encoder import Encoder
 from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
@@ -19,6 +18,7 @@ from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
 from core.places import Place, look_address
 from core.recognition.recognition import Answer
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

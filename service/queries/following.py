@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from core.errors import PlacerecError
 from core.judgement.verdict import Verdict
-from core.maps import Map
+from core.store import Map
 from core.upkeep.histories import PlacePeriod
 from service.engine.engine import Engine
 from service.queries.counts import PassedBy

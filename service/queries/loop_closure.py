@@ -10,11 +10,11 @@ from starlette.responses import Response
 
 from core import errors
 from core.belief import view_of
-from core.maps import Map
 from core.maps.selection import Selection
 from core.places import Place, check_place_id
 from core.recognition.question import Question
 from core.recognition.recognition import Answer, answer_to_blank, locate
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.errors.faults import (

@@ -14,12 +14,12 @@ from core.geometry.keypoints import Keypoints
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import EVEN, Verdict, least_probability
-from core.maps import Map
 from core.places import GEOGRAPHIC, Whereabouts
 from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

@@ -19,7 +19,8 @@ from core.judgement.change import UsualScore
 from core.judgement.verdict import Verdict
 from core.ledger import Ledger
 from core.ledger.disposable import once_more_if_replaced
-from core.maps import AlarmName, Map
+from core.maps import AlarmName
+from core.store import Map
 from core.upkeep.drift import Week
 from core.upkeep.histories import Histories, PlacePeriod
 from service.engine.engine import Engine

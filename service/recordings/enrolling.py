@@ -12,7 +12,6 @@ from core.belief.view import STILL, View, view_of
 from core.errors import InvalidImage, InvalidRecording, InvalidTrajectory
 from core.frames.images import decode
 from core.frames.masks import Mask, range_in
-from core.maps import Map
 from core.places import Camera, Level, PlaceFields, PoseAccuracy, check_sequence, coordinates_of
 from core.places import Sequence as TraverseName
 from core.recordings import RecordedFrame, Recording
@@ -21,6 +20,7 @@ from core.recordings.paths import check_lost_poses, traverse_of, way_of
 from core.recordings.pictures import range_remark, used_range
 from core.recordings.plausibility import MOST_SPEED
 from core.recordings.recording import LARGEST_GAP
+from core.store import Map
 from service.engine.engine import Engine
 from service.errors.faults import PlacesTaken
 from service.http.multipart import FormPart

@@ -9,8 +9,8 @@ from typing import Any
 
 from core.errors import PlacerecError, StorageFailure, UnknownCamera
 from core.frames.masks import Mask
-from core.maps import Map
 from core.places import look_address
+from core.store import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.learning.adoption import LEARNING

@@ -12,9 +12,9 @@ from starlette.responses import Response
 
 from core import errors
 from core.frames.containers import read_header
-from core.maps import Map
 from core.maps.pagination import Listing, decode_number, page_of
 from core.places import PlaceFields, check_place_id, look_address
+from core.store import Map
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

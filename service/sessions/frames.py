@@ -26,11 +26,11 @@ from core.clocks import Interval, future, interval
 from core.errors import FrameOutOfOrder
 from core.judgement.change import WorldChange
 from core.learning import RunFrame
-from core.maps import Map
 from core.maps.selection import Selection
 from core.recognition.question import Question
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 from service.access.audit import ASKER
 from service.access.roles import ANONYMOUS, Principal
 from service.engine.engine import Engine

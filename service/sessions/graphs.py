@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from core.belief import PlaceGraph, place_graph
-from core.maps import Map, Snapshot
 from core.maps.selection import Selection
 from core.recognition.stages import neighborhood_of
+from core.store import Map, Snapshot
 from service.sessions.session import Session, creation_time
 
 GRAPH_REUSE = 20.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 from core.belief import Contradiction, Run, to_bytes
 from core.clocks import Stamp
-from core.maps import Map
 from core.maps.selection import Conditions, Selection
+from core.store import Map
 from service.access.audit import Asker
 from service.access.roles import Principal, covers
 from service.errors.faults import QueueFull, SessionOfAnother

@@ -27,7 +27,7 @@ from core.belief import DamagedRecord, PlaceGraph, Run, from_bytes
 from core.disk.files import Damage
 from core.errors import StorageFailure, StorageFull, UnknownSequence
 from core.ledger import Ledger
-from core.maps import Map
+from core.store import Map
 from service.access.audit import ASKER
 from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events

@@ -12,7 +12,8 @@ from collections.abc import Callable, Collection
 from typing import get_args
 
 from core.errors import PlacerecError, UnknownMap
-from core.maps import AlarmName, AlarmSetting, Map
+from core.maps import AlarmName, AlarmSetting
+from core.store import Map
 from service.engine.engine import Engine
 from service.events.schemas import NO_ASKER, AlarmEvent
 from service.queries.given_answers import MapKey

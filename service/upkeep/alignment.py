@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.alignment import LARGEST_STEP, LEAST_FRAMES, shared_stretches
-from core.maps import Correspondence, Map, Snapshot
+from core.maps import Correspondence
 from core.maps.records import Outline
 from core.places import NO_POSE
 from core.recognition.stages import neighborhood_of
+from core.store import Map, Snapshot
 from core.upkeep.correspondence import common_stations, handed_over, on_its_own
 from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames

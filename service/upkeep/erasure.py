@@ -14,8 +14,10 @@ from functools import partial
 from typing import Any
 
 from core.errors import UnknownFrame
-from core.maps import Map, PlaceFilter, ReviewFrame, stored_frames
+from core.ledger.maps.review import stored_frames
+from core.maps import PlaceFilter, ReviewFrame
 from core.places import Look, look_address, place_and_look
+from core.store import Map
 from service.engine.engine import Engine
 from service.errors.faults import SessionExpired, UnknownSession
 from service.jobs.context import JobContext, yield_to_requests

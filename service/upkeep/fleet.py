@@ -13,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core import errors
 from core.judgement.verdict import Verdict
-from core.maps import AlarmName, Map
+from core.maps import AlarmName
 from core.places import Timestamp
+from core.store import Map
 from service.access.roles import Principal, covers
 from service.engine.engine import Engine
 from service.errors.problems import problem_documentation

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.background import GUARD_FACTOR
-from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.pose_survey import PoseSurvey, pose_survey
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
+from core.store import Map
 from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
 from core.upkeep.drift import Trend, score_trend, unknown_trend

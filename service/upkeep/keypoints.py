@@ -16,8 +16,9 @@ from core.frames.images import ANY_SIZE, decode
 from core.frames.masks import Mask, range_in
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import Map, PicturedPlace
+from core.maps import PicturedPlace
 from core.networks.xfeat import packaged_xfeat
+from core.store import Map
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, yield_to_requests
 

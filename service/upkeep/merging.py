@@ -24,7 +24,7 @@ from core.errors import (
     UnknownMap,
     WrongEncoder,
 )
-from core.maps import Enrolment, History, Map, Snapshot
+from core.maps import Enrolment, History
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
@@ -32,6 +32,7 @@ from core.places import PoseKind, check_coordinates, check_place_id, look_addres
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
+from core.store import Map, Snapshot
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
 from service.jobs.context import JobContext, JobInterrupted, yield_to_requests

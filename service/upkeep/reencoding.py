@@ -16,9 +16,10 @@ import numpy as np
 from core.errors import InvalidImage, MapExists, NoRegions, PlacerecError, UnknownCamera, UnknownMap
 from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
-from core.maps import Enrolment, History, Map
+from core.maps import Enrolment, History
 from core.maps.records import Outline
 from core.places import place_and_look
+from core.store import Map
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
 from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_after_requests

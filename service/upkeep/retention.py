@@ -9,7 +9,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 
 from core.errors import PlacerecError
-from core.maps import Map
+from core.store import Map
 from service.administration.audit_trail import AuditTrail
 from service.settings import Settings
 from service.upkeep.erasure import Rooms

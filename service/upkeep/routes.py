@@ -10,8 +10,8 @@ from fastapi import APIRouter, Depends, Query, Response
 from pydantic import Field
 
 from core import errors
-from core.maps import Map
 from core.places import check_map_id
+from core.store import Map
 from service.engine.engine import Engine
 from service.errors.faults import (
     EncoderNotInstalled,

@@ -18,9 +18,10 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.judgement.alignment import SharedStretch
-from core.maps import Map, own_poses
+from core.maps import own_poses
 from core.method.encoder import Encoder
 from core.recognition.stages import neighborhood_of
+from core.store import Map
 from core.upkeep.similarity import NONE, GreyScale, Rows, counterparts, nearest_by_pose, score_pairs, stretches_of
 from service.errors.faults import EncoderNotInstalled, TooManyPairs
 from service.errors.problems import problem_documentation

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 
-from core.maps import AlarmName, Map, MapRecord
+from core.maps import AlarmName, MapRecord
+from core.store import Map
 from core.upkeep.histories import (
     QUIET,
     RECENT,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from core.places import Neighborhood, place_and_look
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from tests.durability.model import GONE
 
 SETTLING_SECONDS = 60.0
@@ -20,7 +20,7 @@ def sha(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def contents(atlas: Atlas) -> dict[str, Any]:
+def contents(atlas: Directory) -> dict[str, Any]:
     """All maps, unlisted ones too, read whole, verified and searched.
 
     Raises:

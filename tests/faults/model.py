@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from core.storage import Atlas, Map
-from tests.core.storage.frames import descriptor_of, keypoints_of, local_of, stored_of
+from core.store import Directory, Map
+from tests.core.store.frames import descriptor_of, keypoints_of, local_of, stored_of
 
 State = dict[str, Any]
 """Maps by id: the description, tier setting, cameras, and places in the order of their enrolment."""
@@ -67,7 +67,7 @@ def _rows(row: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([row], dtype=np.int64)
 
 
-def all_told(atlas: Atlas) -> State:
+def all_told(atlas: Directory) -> State:
     """Every map in service."""
     return {record.id: told(atlas.get(record.id)) for record in atlas.records(None, 1000)[0]}
 

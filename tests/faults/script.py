@@ -20,9 +20,9 @@ from core.errors import PlacerecError
 from core.frames.masks import Mask
 from core.maps import Correspondence, MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.search import index_files
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.faults.model import State, all_told, best_of, place
 
 MASK = Mask(polygons=(((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0)),))
@@ -35,12 +35,12 @@ class World:
     """The data directory; ``atlas`` is None while it is closed."""
 
     directory: Path
-    atlas: Atlas | None = None
+    atlas: Directory | None = None
 
     def open(self) -> None:
         """Open the directory, as a start of the service does."""
         if self.atlas is None:
-            self.atlas = Atlas(self.directory, rows_per_segment=4)
+            self.atlas = Directory(self.directory, rows_per_segment=4)
 
     def close(self) -> None:
         """Close the directory."""

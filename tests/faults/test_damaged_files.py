@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, StorageFailure
 from core.maps import MapSettings, PlaceFilter
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.search import index_files
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.faults.damage import DAMAGES, Damage, flip, flip_anywhere, flip_used
 from tests.faults.model import State, told
 from tests.faults.script import MASK
@@ -32,7 +32,7 @@ SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
 MAPS = ("lab", "hall", "coded")
 
 
-def make_map(atlas: Atlas, name: str) -> Map:
+def make_map(atlas: Directory, name: str) -> Map:
     """A dozen places of every kind, some of which were changed or forgotten."""
     made = atlas.create(name, ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
     made.cameras.put("left", MASK)
@@ -68,7 +68,7 @@ class Sound:
 def closed(tmp_path_factory: pytest.TempPathFactory) -> Sound:
     """A data directory after an orderly end, with the caches of the map "coded"."""
     folder = tmp_path_factory.mktemp("sound")
-    atlas = Atlas(folder / "data", rows_per_segment=4)
+    atlas = Directory(folder / "data", rows_per_segment=4)
     for name in MAPS:
         make_map(atlas, name)
     coded = atlas.get("coded")
@@ -87,7 +87,7 @@ def crashed(closed: Sound, tmp_path_factory: pytest.TempPathFactory) -> Sound:
     """A data directory after a crash, with two more commits in SQLite's log."""
     folder = tmp_path_factory.mktemp("crashed")
     shutil.copytree(closed.directory, folder / "written")
-    atlas, allowed = Atlas(folder / "written"), {name: list(states) for name, states in closed.allowed.items()}
+    atlas, allowed = Directory(folder / "written"), {name: list(states) for name, states in closed.allowed.items()}
     for late in ("a", "b"):
         for name in ("lab", "coded"):
             atlas.get(name).enrol([frame(f"late-{late}", x=77.0)])
@@ -133,7 +133,7 @@ def outcome(sound: Sound, copy: Path, name: str, may_lose: bool = False) -> str:
     Raises:
         AssertionError: it answers differently, and nothing reports the damage.
     """
-    atlas = Atlas(copy)
+    atlas = Directory(copy)
     try:
         found = _outcome(atlas, name, sound.allowed[name] if may_lose else sound.allowed[name][:1])
         for other in set(MAPS) - {name}:
@@ -144,7 +144,7 @@ def outcome(sound: Sound, copy: Path, name: str, may_lose: bool = False) -> str:
         atlas.close()
 
 
-def _outcome(atlas: Atlas, name: str, allowed: list[State]) -> str:
+def _outcome(atlas: Directory, name: str, allowed: list[State]) -> str:
     try:
         read = answers(atlas.get(name))
     except MapQuarantined:
@@ -241,7 +241,7 @@ def test_a_damaged_cache_is_made_again(closed: Sound, tmp_path: Path) -> None:
 
 def check_rebuilt(copy: Path) -> None:
     """All files of the index must be made again."""
-    atlas = Atlas(copy)
+    atlas = Directory(copy)
     try:
         coded = atlas.get("coded")
         until = time.monotonic() + 60
@@ -264,7 +264,7 @@ def test_a_log_that_is_damaged_in_its_middle_is_found(crashed: Sound, tmp_path: 
 def test_the_end_of_a_log_that_is_damaged_is_as_a_crash_leaves_it(crashed: Sound, tmp_path: Path) -> None:
     path = crashed.directory / "maps" / "lab" / "map.sqlite-wal"
     copy = damaged(crashed, tmp_path, path, lambda found, _: flip(found, found.stat().st_size - 9), random.Random(SEED))
-    atlas = Atlas(copy)
+    atlas = Directory(copy)
     assert answers(atlas.get("lab")) == crashed.allowed["lab"][1], "all but the last commit"
     assert atlas.verify("lab").ok
     atlas.get("lab").enrol([frame("goes-on")])

@@ -22,8 +22,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.storage import Atlas
-from tests.core.storage.frames import frame
+from core.store import Directory
+from tests.core.store.frames import frame
 from tests.faults.damage import flip
 from tests.faults.injection import attached
 from tests.service.places.test_durability import answers
@@ -236,7 +236,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 def prepare(data: Path, models: Path) -> None:
     """A sound map, a damaged one, and damage to every file beside the maps; descriptors are made up."""
     (encoder,) = (one for one in EncoderCatalogue().describe() if one.name == DEFAULT_ENCODER)
-    atlas = Atlas(data)
+    atlas = Directory(data)
     for name in ("sound", "damaged"):
         made = atlas.create(name, encoder.identity, encoder.dimension, local_shape=encoder.local_shape)
         made.enrol([frame("p0", dimension=encoder.dimension, local_shape=encoder.local_shape)])

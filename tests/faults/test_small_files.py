@@ -17,7 +17,7 @@ import pytest
 from core.disk.files import Damage
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
 from core.maps.archives.reading import Archive, check
-from core.storage import Atlas
+from core.store import Directory
 from service.access.keys import Keys
 from service.errors.faults import KeysUnreadable
 from service.jobs.file import open_file
@@ -124,7 +124,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = Keys.of(folder)
     for name in ("robot", "operator"):
         store.create(name, "query" if name == "robot" else "admin")
-    atlas = Atlas(folder / "maps", rows_per_segment=4)
+    atlas = Directory(folder / "maps", rows_per_segment=4)
     (folder / "export.tar").write_bytes(exported(make_map(atlas, "lab"), folder / "kept"))
     atlas.close()
     for left in ("maps", "kept"):

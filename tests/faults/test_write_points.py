@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from core.storage import Atlas
+from core.store import Directory
 from tests.faults.injection import Point, ScriptProcesses, write_points
 from tests.faults.model import State, all_told
 from tests.faults.script import AFTERWARDS, PLAIN, STEPS, Step, empty
@@ -89,7 +89,7 @@ def check(told: dict[str, Any], directory: Path, steps: Sequence[Step]) -> None:
     state = told["state"]
     state.setdefault("lab", empty())
     AFTERWARDS.effect(state)
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     try:
         assert atlas.quarantined() == {}
         assert all_told(atlas) == state

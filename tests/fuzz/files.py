@@ -32,7 +32,7 @@ from core.errors import InvalidCursor, InvalidModel, PlacerecError
 from core.maps import MapSettings
 from core.maps.archives.reading import Archive, check
 from core.maps.pagination import decode_name, decode_number, encode_cursor
-from core.storage import Atlas
+from core.store import Directory
 from lab.conversion.caffemodel import read_caffemodel
 from lab.conversion.checkpoints import read_checkpoint
 from lab.conversion.isolation import address_space, convert
@@ -43,7 +43,7 @@ from service.http.multipart import FormReader
 from tests.core.recordings.bags import WRITERS, walk
 from tests.core.storage.archives.conftest import filled
 from tests.core.storage.archives.files import changed, exported, imported
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 from tests.lab.conversion.hostile import damaged
 from tests.lab.conversion.onnx_writer import MAPS
 from tests.lab.conversion.test_isolation import write_caffemodels, write_checkpoints, write_mats, write_onnx
@@ -94,7 +94,7 @@ class Kind:
 
 
 def _write_archive(folder: Path) -> list[Path]:
-    atlas = Atlas(folder / "data", rows_per_segment=4)
+    atlas = Directory(folder / "data", rows_per_segment=4)
     try:
         made = filled(atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE))
         content = exported(made, folder / "whole")
@@ -121,7 +121,7 @@ def _read_archive(path: Path) -> None:
     with TemporaryDirectory(dir=path.parent) as folder:
         with Archive(path) as archive:
             check(archive)
-        atlas = Atlas(Path(folder))
+        atlas = Directory(Path(folder))
         try:
             found = imported(atlas, path, "taken")
             report = found.verify()

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from core.ledger import Tables
-from core.storage import review
-from core.storage.atlas import FORMAT
+from core.store import review
+from core.store.directory import FORMAT
 from core.storage.database import schema
 from placerec_client import Client, Map, NewPlace
 from service.access import key_table

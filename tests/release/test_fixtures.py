@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from core.storage.atlas import FORMAT
+from core.store.directory import FORMAT
 from placerec_client import Client
 from tests.release import furnishing
 from tests.release.conversation import Replay, read

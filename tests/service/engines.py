@@ -17,7 +17,7 @@ from service.engine.engine import Engine
 from service.jobs.job import Job
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
-from tests.core.storage.frames import keypoints_of
+from tests.core.store.frames import keypoints_of
 
 ENCODER = "some@" + "0" * 64
 

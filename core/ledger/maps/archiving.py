@@ -1,28 +1,41 @@
-"""The content of a map for an export file, as one transaction sees it."""
+"""Exporting a map: its state of one moment, read in one transaction, which holds up no writes, as one file."""
 
 from __future__ import annotations
 
 import json
 import logging
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
+from pathlib import Path
 
 from sqlalchemy import bindparam, select
 
+from core.disk.files import disk_errors
 from core.errors import StorageFailure, UnknownFrame
 from core.geometry.keypoints import count_of
-from core.ledger.maps import frames, places, sequences
+from core.ledger.maps import cameras, frames, places, rows, sequences
 from core.ledger.maps.cameras import read_cameras
+from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace
+from core.ledger.maps.record import MapState
+from core.ledger.maps.review import Review
 from core.ledger.maps.schema import SEQUENCES
 from core.ledger.statements import Statement
 from core.maps.archives.lines import AnswerLine, written_line
 from core.maps.archives.manifest import MOST_PART_BYTES, ArchivedRecord
-from core.maps.archives.writing import ArchivedLabel, ArchivedPlace, Chunks
+from core.maps.archives.writing import (
+    Advance,
+    ArchivedLabel,
+    ArchivedPlace,
+    Expect,
+    Exported,
+    write_archive,
+)
+from core.maps.forms import Form
 from core.maps.records import MapRecord
-from core.maps.review import Review, ReviewFrame
+from core.maps.review import ReviewFrame
 from core.maps.stored_fields import POSE_VALUES, moment_text
 from core.places import Pose
 
@@ -38,25 +51,66 @@ _NAMES = Statement(
 )
 
 
-class LedgerSource(ABC):
-    """A map as it is in one transaction (:class:`core.maps.archives.writing.ArchiveSource`).
+class Exporter:
+    """Writes export files of one map.  Any thread may use it.
 
     Args:
-        frame_bytes: the size of one place's descriptors, as the map stores them.
+        viewing: begins a transaction that reads the map, whose state comes with it; raises if the map is gone.
+        state: a value that is the same as long as nothing is written to the map.
         review: the frames of the map that are stored for review.
+        expect_there: raises if the map is closed or deleted meanwhile.
     """
 
-    def __init__(self, connection: MapConnection, record: MapRecord, frame_bytes: int, review: Review) -> None:
-        self.connection, self._review = connection, review
-        self.record, self.frame_bytes = ArchivedRecord.model_validate(record.model_dump()), frame_bytes
+    def __init__(
+        self,
+        viewing: Callable[[], AbstractContextManager[tuple[MapConnection, MapState]]],
+        state: Callable[[], object],
+        review: Review,
+        expect_there: Callable[[], object],
+    ) -> None:
+        self._viewing, self._state, self._review, self._expect_there = viewing, state, review, expect_there
 
-    @abstractmethod
-    def frames(self, group: Sequence[ArchivedPlace]) -> Chunks:
+    def state(self) -> object:
+        """A value that is the same as long as nothing is written to the map, and no frame of the review labelled."""
+        return self._state(), self._review.labels_state()
+
+    def write(
+        self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
+    ) -> Exported:
+        """Write the present state of the map as a new file, which a crash may lose; nothing is left if this raises.
+
+        Every row and every value is compared with its checksum.
+
+        Raises:
+            UnknownMap, MapQuarantined: the map was deleted meanwhile, or is damaged.
+            StorageFull, StorageFailure.
+        """
+        with disk_errors("write the map as a file"), self._viewing() as (connection, state):
+            for table, names in (("places", places.unsound(connection)), ("cameras", cameras.unsound(connection))):
+                if names:
+                    raise DamagedRow(f"{names[0]!r} of {table} does not match its checksum")
+            return write_archive(
+                _Source(connection, state.record, self._review, self._expect_there), path, advance, expect
+            )
+
+
+class _Source:
+    """A map as it is in one transaction (:class:`core.maps.archives.writing.ArchiveSource`)."""
+
+    def __init__(
+        self, connection: MapConnection, record: MapRecord, review: Review, expect_there: Callable[[], object]
+    ) -> None:
+        self.connection, self._review, self.expect_there = connection, review, expect_there
+        self.record = ArchivedRecord.model_validate(record.model_dump())
+        self.frame_bytes = Form.of(record).frame.itemsize
+
+    def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
         """The descriptors of places as they are stored, in their order."""
-
-    @abstractmethod
-    def expect_there(self) -> None:
-        """Raise if the map is gone."""
+        for some in pieces(group):
+            numbers = [place.row for place in some]
+            descriptors, local = (rows.at(self.connection, kind, numbers) for kind in rows.OF_FRAMES)
+            yield b"".join(part for row in numbers for part in (descriptors[row], local[row]))
+            self.expect_there()
 
     def sequence_lines(self) -> Iterator[bytes]:
         """The lines of sequences by name; that of places without a sequence comes first."""
@@ -188,7 +242,7 @@ def _archived(
         }
     )
     size = 0 if picture is None else picture[0]
-    return ArchivedPlace(place.id, text, stored.number, stored.row, stored.checksum, size, keypoints)
+    return ArchivedPlace(place.id, text, stored.number, stored.row, size, keypoints)
 
 
 def _pose(pose: Pose | None) -> dict[str, float] | None:

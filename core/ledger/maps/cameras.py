@@ -18,8 +18,7 @@ from core.ledger.maps.connection import MapConnection, Reading
 from core.ledger.maps.schema import CAMERAS
 from core.ledger.maps.writing import Write
 from core.ledger.statements import Statement
-from core.maps.cameras import MOST_CAMERAS, CameraRecord
-from core.maps.cameras import Cameras as AnyCameras
+from core.maps.cameras import MOST_CAMERAS, CameraRecord, KnownCameras
 from core.maps.stored_fields import moment_text
 
 _C = CAMERAS.c
@@ -38,8 +37,8 @@ _PUT = Statement(
 _DELETE = Statement(delete(CAMERAS).where(_C.map == bindparam("map"), _C.name == bindparam("which")))
 
 
-class Cameras(AnyCameras):
-    """All cameras of one map (:class:`core.maps.cameras.Cameras`).
+class Cameras(KnownCameras):
+    """All cameras of one map.
 
     They are few and needed by every frame, so they are remembered until the map is written to.  Any thread may use it.
     Every method may raise what ``reading`` and ``writing`` raise.
@@ -60,6 +59,7 @@ class Cameras(AnyCameras):
         return list(self._records().values())
 
     def known(self, name: str) -> CameraRecord | None:
+        """One camera; None if the map has none of this name."""
         return self._records().get(name)
 
     def put(

@@ -2,8 +2,7 @@
 
 SQLite has no checksums of its own and does not notice a flipped bit in a pose or in a place's metadata; PostgreSQL has
 them where its cluster was made with them.  The column ``seal`` of a row is the CRC-32 of its other columns but the
-map's number.  Columns that a later version added behind them are covered where they have a value, so that they change
-no checksum of rows from before.
+map's number.
 """
 
 from __future__ import annotations
@@ -26,23 +25,16 @@ def sealed_columns(table: Table) -> tuple[str, ...]:
     return tuple(column.name for column in table.columns if column.name not in ("map", "seal"))
 
 
-def checksum_of(values: Sequence[Any], least: int | None = None) -> int:
-    """The checksum of a row with these values, in the order of :func:`sealed_columns`.
-
-    Args:
-        least: NULLs at the end that follow so many values are left out; None: none is.
-    """
-    count = len(values)
-    while least is not None and count > least and values[count - 1] is None:
-        count -= 1
-    return zlib.crc32(ascii(tuple(values[:count])).encode())
+def checksum_of(values: Sequence[Any]) -> int:
+    """The checksum of a row with these values, in the order of :func:`sealed_columns`."""
+    return zlib.crc32(ascii(tuple(values)).encode())
 
 
-def sealed(columns: Sequence[str], values: Mapping[str, Any], least: int | None = None) -> dict[str, Any]:
-    """Values of a row with its checksum (:func:`checksum_of`)."""
-    return {**values, "seal": checksum_of([values[name] for name in columns], least)}
+def sealed(columns: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a row with its checksum."""
+    return {**values, "seal": checksum_of([values[name] for name in columns])}
 
 
-def is_sound(values: Sequence[Any], seal: int, least: int | None = None) -> bool:
-    """Whether a row matches its checksum (:func:`checksum_of`)."""
-    return bool(seal == checksum_of(values, least))
+def is_sound(values: Sequence[Any], seal: int) -> bool:
+    """Whether a row matches its checksum."""
+    return bool(seal == checksum_of(values))

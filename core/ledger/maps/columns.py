@@ -17,10 +17,10 @@ from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, 
 
 _P = PLACES.c
 _AT_ONCE = 65_536
-_NUMBERS = 14
+_NUMBERS = 13
 _COLUMNS = (
     select(
-        _P.row, _P.checksum, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
+        _P.row, _P.sequence, _P.ordinal, _P.x, _P.y, _P.z, _P.latitude, _P.longitude, _P.heading,
         func.coalesce(_P.track, _P.sequence), func.coalesce(_P.station, _P.ordinal), _P.least,
         _P.accuracy_metres, func.substr(_P.timestamp, 1, 26), _P.level,
     ).where(_P.map == bindparam("map"))
@@ -34,11 +34,9 @@ class Columns:
     """The places of a map, in any order.
 
     rows: int64 [n], of their frames.
-    checksums: uint32 [n], of the descriptors in these rows.
     """
 
     rows: NDArray[np.int64]
-    checksums: NDArray[np.uint32]
     whereabouts: Whereabouts
 
     def by_row(self, total: int) -> Whereabouts:
@@ -59,7 +57,7 @@ class Columns:
 
 
 def read_columns(connection: MapConnection, rows: int, after: int | None = None) -> Columns:
-    """Row, checksum and whereabouts of every place.
+    """Row and whereabouts of every place.
 
     Args:
         rows: how many rows the map has.
@@ -83,22 +81,22 @@ def read_columns(connection: MapConnection, rows: int, after: int | None = None)
         raise DamagedRow(f"a place has row {row.max()}, but there are {rows}")
     if len(row) and row.min() < 0:
         raise DamagedRow("a place has no row")
-    kind, position = _positions(found[:, 4:9], found[:, 9])
+    kind, position = _positions(found[:, 3:8], found[:, 8])
     whereabouts = Whereabouts(
         kind,
         position,
-        found[:, 2].astype(np.int32),
-        found[:, 3].astype(np.int64),
-        found[:, 9].astype(np.float32),
+        found[:, 1].astype(np.int32),
+        found[:, 2].astype(np.int64),
+        found[:, 8].astype(np.float32),
         np.concatenate(moments).astype(np.int64),
-        found[:, 10].astype(np.int32),
-        found[:, 11].astype(np.int64),
-        np.where(np.isnan(found[:, 12]), -np.inf, found[:, 12]).astype(np.float32),
+        found[:, 9].astype(np.int32),
+        found[:, 10].astype(np.int64),
+        np.where(np.isnan(found[:, 11]), -np.inf, found[:, 11]).astype(np.float32),
         np.array([codes[level] for level in levels], np.int32),
-        found[:, 6],
-        found[:, 13].astype(np.float32),
+        found[:, 5],
+        found[:, 12].astype(np.float32),
     )
-    return Columns(row, found[:, 1].astype(np.uint32), whereabouts)
+    return Columns(row, whereabouts)
 
 
 def _positions(

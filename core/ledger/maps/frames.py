@@ -10,7 +10,7 @@ import logging
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 
-from sqlalchemy import and_, bindparam, delete, exists, func, select, union
+from sqlalchemy import and_, bindparam, delete, func, select
 
 from core.errors import InvalidKeypoints, StorageFailure
 from core.geometry.keypoints import Keypoints, keypoints_of
@@ -43,11 +43,7 @@ _RECORD_SIZES = Statement(
     select(_K.row, func.length(_K.record)).where(_K.map == bindparam("map"), among(_K.row, "rows"))
 )
 _PUT_KEYPOINTS = Statement(
-    lambda insert: (
-        put := insert(KEYPOINTS).values({name: bindparam(name) for name in ("map", "row", "checksum", "record")})
-    ).on_conflict_do_update(
-        index_elements=["map", "row"], set_={"checksum": put.excluded.checksum, "record": put.excluded.record}
-    )
+    lambda insert: insert(KEYPOINTS).values({name: bindparam(name) for name in ("map", "row", "checksum", "record")})
 )
 _KEYPOINTS_AT = Statement(
     select(_P.row, _P.id, _P.digest, _K.checksum, _K.record)
@@ -75,16 +71,6 @@ _PAGE_OF_KEYPOINTS = Statement(
     .where(_P.map == bindparam("map"), _P.row > bindparam("after"))
     .order_by(_P.row)
     .limit(bindparam("most"))
-)
-_OF_NO_PLACE = Statement(
-    union(
-        *(
-            select(table.c.row).where(
-                table.c.map == bindparam("map"), ~exists().where(_P.map == table.c.map, _P.row == table.c.row)
-            )
-            for table in (PICTURES, KEYPOINTS)
-        )
-    )
 )
 _AT_ONCE = 100
 
@@ -128,22 +114,11 @@ def pictures_at(connection: MapConnection, rows: Sequence[int], damaged: set[int
     return found
 
 
-def stored_pictures_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, tuple[bytes, bytes]]:
-    """The bytes of the pictures of frames and their recorded SHA-256 by row, sound or not."""
-    found = connection.execute(_PICTURES_AT, rows=list(rows))
-    return {row: (bytes(content), digest) for row, content, digest in found}
-
-
 def sizes_at(connection: MapConnection, rows: Sequence[int]) -> tuple[dict[int, tuple[int, bytes]], dict[int, int]]:
     """Of frames by row: the size and the SHA-256 of their pictures, and the bytes of the records of keypoints."""
     pictures = connection.execute(_PICTURE_SIZES, rows=list(rows))
     records = connection.execute(_RECORD_SIZES, rows=list(rows))
     return {row: (size, digest) for row, size, digest in pictures}, dict(records)
-
-
-def rows_of_no_place(connection: MapConnection) -> list[int]:
-    """The rows that have a picture or keypoints, but no place."""
-    return [row for (row,) in connection.execute(_OF_NO_PLACE)]
 
 
 # Keypoints
@@ -207,6 +182,7 @@ def records_at(connection: MapConnection, rows: Sequence[int]) -> dict[int, byte
 
 def put_keypoints(connection: MapConnection, records: Mapping[int, tuple[bytes, bytes]]) -> None:
     """Store records of keypoints in the place of any others: digest of the frame and record, by row."""
+    connection.execute(_DELETE_KEYPOINTS, rows=list(records))
     connection.execute_many(
         _PUT_KEYPOINTS,
         [

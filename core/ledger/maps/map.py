@@ -34,7 +34,7 @@ from core.ledger.maps.counterparts import Counterparts
 from core.ledger.maps.plan import Plan
 from core.ledger.maps.transfer import Transfer
 from core.ledger.maps.writing import Write
-from core.maps.enrolling import check_enrolment
+from core.maps.enrolling import Reject, check_enrolment, refuse_all
 from core.maps.glances import Glances
 from core.maps.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
@@ -48,7 +48,6 @@ from core.maps.records import (
     patched_fields,
     patched_record,
 )
-from core.maps.store import Reject, refuse_all
 from core.places import Look, Place, PlaceFields, look_address, place_and_look
 
 
@@ -93,6 +92,11 @@ class LedgerMap(ABC):
     # Reading
 
     def place(self, place_id: str) -> Place:
+        """One place.
+
+        Raises:
+            UnknownPlace.
+        """
         with self._reading() as connection:
             return places.expect(connection, place_id).place
 
@@ -115,10 +119,20 @@ class LedgerMap(ABC):
         return [stored.place for stored in page], more
 
     def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """The ids of the places that fulfil some conditions, in the order of their enrolment.
+
+        Raises:
+            TooManyToDelete: there are more than ``most``.
+        """
         with self._reading() as connection:
             return _not_more(places.ids_of(connection, wanted, most + 1), most)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
+        """A page of sequences by name, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
         listing: Listing = ["sequences", self.record.id]
         after = decode_name(listing, cursor)
         with self._reading() as connection:
@@ -126,15 +140,21 @@ class LedgerMap(ABC):
         return page_of(listing, found, limit, lambda sequence: sequence.name)
 
     def unknown_sequences(self, names: Sequence[str]) -> set[str]:
+        """Those of the names that no sequence has."""
         with self._reading() as connection:
             return {name for name in names if sequences.find_code(connection, name) is None}
 
     def digest(self, place_id: str) -> bytes | None:
+        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             stored = places.find(connection, place_id)
         return None if stored is None else stored.digest
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
+        """The places of rows that a search returned; None where a place was deleted or got another frame since.
+
+        Of the row of a look it is its place, with the camera and the picture of the look, which it names.
+        """
         with self._glancing() as connection:
             found = places.at_rows(connection, [int(row) for row in rows])
         return [None if (stored := found.get(int(row))) is None else stored.shown() for row in rows]
@@ -158,16 +178,36 @@ class LedgerMap(ABC):
         return [found.get(row) for row in wanted]
 
     def glances_at(self, rows: Sequence[int]) -> NDArray[np.int8]:
+        """The best keypoints of those places, int8 [n, 64, 64] (``core.geometry.matching``); zeros where are none."""
         return self._glances.at([int(row) for row in rows])
 
     def without_keypoints(self, after: int, limit: int) -> list[PicturedPlace]:
+        """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
+
+        Args:
+            after: the number of the last place of the page before; 0 for the first page.
+            limit: how many places are listed at most; fewer if there are no further ones.
+        """
         with self._reading() as connection:
             return frames.without_keypoints(connection, after, limit)
 
     def picture(self, place_id: str) -> bytes | None:
+        """The stored picture of a place's frame, as the place's ``picture`` says; None if it is gone or has none.
+
+        Raises:
+            StorageFailure: the picture is missing or damaged.
+        """
         return self._pictured(place_id)[1]
 
     def thumbnail(self, place_id: str) -> bytes:
+        """A small JPEG of a place.
+
+        Raises:
+            UnknownPlace: there is no such place.
+            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            StorageFailure: the picture is missing or damaged.
+            MemoryError: its pixels do not fit into memory.
+        """
         place, picture = self._pictured(place_id)
         if place is None:
             raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
@@ -233,15 +273,24 @@ class LedgerMap(ABC):
         if not items:
             return []
         with self._writing() as write:
-            write.expect(len(new))
             write.look_for([item.id for item in items])
             return [_enrolled(write, item, partial(reject, position)) for position, item in enumerate(items)]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
+        """Replace all fields of a place; its frame stays.
+
+        Raises:
+            UnknownPlace, InvalidField, MixedCoordinates.
+        """
         with self._writing() as write:
             return write.set_fields(places.expect(write.connection, place_id), fields)
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
+        """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
+
+        Raises:
+            UnknownPlace, InvalidField, MixedCoordinates.
+        """
         with self._writing() as write:
             stored = places.expect(write.connection, place_id)
             return write.set_fields(stored, patched_fields(stored.place, changes))[0]
@@ -261,6 +310,11 @@ class LedgerMap(ABC):
             return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
 
     def forget(self, place_id: str) -> None:
+        """Delete a place with its looks.
+
+        Raises:
+            UnknownPlace.
+        """
         with self._writing() as write:
             write.forget(places.expect(write.connection, place_id))
 
@@ -357,7 +411,6 @@ class LedgerMap(ABC):
         with self._writing() as write:
             if (stored := write.find(look.id)) is not None and stored.digest == look.digest:
                 return "unchanged", 0
-            write.expect(1)
             gone = _withdrawn(write, instead)
             change = write.enrol(look)[1]
             if most_places is not None and places.count_learnt(write.connection) > most_places:
@@ -412,6 +465,11 @@ class LedgerMap(ABC):
         return len(found)
 
     def forget_sequence(self, name: str) -> int:
+        """Delete all places of a sequence; returns how many.
+
+        Raises:
+            UnknownSequence: there is none.
+        """
         count, spelled = 0, None
         with self._writing() as write:
             while some := places.listed(write.connection, -1, _AT_ONCE, PlaceFilter(sequence=name)):

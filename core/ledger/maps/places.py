@@ -47,14 +47,12 @@ LONGEST_TEXT = 512
 
 _P, _S, _T = PLACES.c, SEQUENCES.c, TOKENS.c
 _COLUMNS = sealed_columns(PLACES)
-_LEAST = _COLUMNS.index("revision") + 1  # those behind it are of later versions than 1.0
 # A join might begin with the sequences of the map, and so read all its places.
 _NAME = select(_S.name).where(_S.map == _P.map, _S.code == _P.sequence).scalar_subquery()
-_WHOLE = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME)
-_STORED = _WHOLE.where(_P.map == bindparam("map"))
+_STORED = select(*(_P[name] for name in _COLUMNS), _P.seal, _NAME).where(_P.map == bindparam("map"))
 _NUMBERS = (
-    "number", "row", "checksum", "digest", "sequence", "ordinal", "track", "station", "key", "revision", "look_of",
-    "seen", "run", "least", "right", "wrong", "passed",
+    "number", "row", "digest", "sequence", "ordinal", "track", "station", "revision", "look_of", "seen", "run", "least",
+    "right", "wrong", "passed",
 )  # fmt: skip
 
 _IS_PLACE = _P.look_of.is_(None)
@@ -74,7 +72,6 @@ _LEARNT_PLACES = Statement(
     )
 )
 _PLACES_FROM = Statement(_STORED.where(_IS_PLACE, _P.run == bindparam("run")).order_by(_P.number))
-_BY_KEYS = Statement(_WHOLE.where(among(_P.key, "keys")))  # keys are those of one map
 _ROWS_OF = Statement(select(_P.id, _P.row).where(_P.map == bindparam("map"), among(_P.id, "ids")))
 _NUMBERS_OF = Statement(select(_P.id, _P.number).where(_P.map == bindparam("map"), among(_P.id, "ids")))
 _ROWS_OF_PLACE = Statement(
@@ -132,7 +129,6 @@ _WITHOUT_IMAGE = Statement(
     select(func.count()).select_from(PLACES).where(_P.map == bindparam("map"), _P.picture != "image")
 )
 _COUNT = Statement(select(func.count(), func.count(_P.look_of)).select_from(PLACES).where(_P.map == bindparam("map")))
-_CHECKSUMS = Statement(select(_P.row, _P.id, _P.checksum).where(_P.map == bindparam("map")))
 _PICTURED = Statement(
     select(_P.id, _P.row, _P.picture, _P.digest, _P.camera).where(_P.map == bindparam("map")).order_by(_P.number)
 )
@@ -154,12 +150,10 @@ class StoredPlace:
 
     number: grows in the order of enrolment.
     row: of its frame.
-    checksum: of its descriptors; 0: where they are has its own.
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
     ordinal: its position in its sequence (``core.maps.views``).
     track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
-    key: of its entity in Milvus.
     revision: of the map's write that changed it last.
     look_of: the number of the place whose look it is; None: it is a place.
     seen: when a look's frame was taken, as text; run: the run from which a look or a place was learnt.
@@ -169,14 +163,12 @@ class StoredPlace:
 
     number: int
     row: int
-    checksum: int
     digest: bytes
     sequence: int
     ordinal: int
     place: Place
     track: int | None = None
     station: int | None = None
-    key: int | None = None
     revision: int = 0
     look_of: int | None = None
     seen: str | None = None
@@ -227,7 +219,7 @@ class StoredPlace:
 
 def _stored(values: Sequence[Any]) -> StoredPlace:
     *columns, seal, sequence = values
-    if not is_sound(columns, seal, _LEAST):
+    if not is_sound(columns, seal):
         raise DamagedRow(f"the row of place {columns[1]!r} does not match its checksum")
     return _from_columns(dict(zip(_COLUMNS, columns, strict=True)), sequence)
 
@@ -301,11 +293,6 @@ def of_ids(connection: MapConnection, place_ids: Sequence[str]) -> dict[str, Sto
 def at_rows(connection: MapConnection, rows: Sequence[int]) -> dict[int, StoredPlace]:
     """The places whose frames are in ``rows`` now, by row."""
     return {stored.row: stored for stored in map(_stored, connection.execute(_BY_ROWS, rows=list(rows)))}
-
-
-def of_keys(connection: MapConnection, keys: Sequence[int]) -> list[StoredPlace]:
-    """The places of entities in Milvus, in any order."""
-    return [_stored(values) for values in connection.execute(_BY_KEYS, keys=list(keys))]
 
 
 def looks_of(connection: MapConnection, stored: StoredPlace) -> list[StoredPlace]:
@@ -500,11 +487,6 @@ def count_without_image(connection: MapConnection) -> int:
     return int(connection.execute(_WITHOUT_IMAGE)[0][0])
 
 
-def checksums(connection: MapConnection) -> list[tuple[int, str, int]]:
-    """Row, id and checksum of the descriptors of all places, in any order."""
-    return connection.execute(_CHECKSUMS)
-
-
 def pictured(connection: MapConnection) -> list[tuple[str, int, Keep, bytes, str | None]]:
     """Id, row, kind of picture, digest and camera of all places, in the order of their enrolment."""
     return connection.execute(_PICTURED)
@@ -514,7 +496,7 @@ def unsound(connection: MapConnection) -> list[str]:
     """The ids of the places whose row does not match its checksum."""
     found, after = [], -1
     while page := connection.execute(_SEALS, after=after, most=_AT_ONCE):
-        found += [str(columns[1]) for *columns, seal in page if not is_sound(columns, seal, _LEAST)]
+        found += [str(columns[1]) for *columns, seal in page if not is_sound(columns, seal)]
         after = page[-1][0]
     return found
 
@@ -531,7 +513,7 @@ def placed(item_id: str, fields: PlaceFields, sequence: int, ordinal: int, **val
     """
     columns = {
         "id": item_id, "sequence": sequence, "ordinal": ordinal, "track": None, "station": None, "pose_of": None,
-        "key": None, "look_of": None, "looks": 0, "seen": None, "run": None, "least": None,
+        "look_of": None, "looks": 0, "seen": None, "run": None, "least": None,
         "right": 0, "wrong": 0, "passed": 0, **values, **field_columns(fields),
     }  # fmt: skip
     return _from_columns(columns, fields.sequence)
@@ -563,7 +545,7 @@ def with_place(stored: StoredPlace, **changes: Any) -> StoredPlace:
 
 def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
     """Store new places."""
-    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored), _LEAST) for stored in new])
+    connection.execute_many(_INSERT, [sealed(_COLUMNS, _columns_of(stored)) for stored in new])
     tokens = [{"token": token, "row": one.row} for one in new for token in _tokens(one.place.metadata)]
     if tokens:
         connection.execute_many(_PUT_TOKEN, tokens)
@@ -571,7 +553,7 @@ def insert(connection: MapConnection, new: Sequence[StoredPlace]) -> None:
 
 def put(connection: MapConnection, stored: StoredPlace, before: StoredPlace) -> None:
     """Store a changed place in the place of its former state."""
-    values = sealed(_COLUMNS, _columns_of(stored), _LEAST)
+    values = sealed(_COLUMNS, _columns_of(stored))
     del values["number"]
     connection.execute(_UPDATE, which=stored.number, **{f"new_{name}": value for name, value in values.items()})
     if (stored.row, stored.place.metadata) != (before.row, before.place.metadata):

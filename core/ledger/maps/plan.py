@@ -11,7 +11,9 @@ from sqlalchemy import bindparam, case, func, select
 from core.ledger.maps.connection import Reading
 from core.ledger.maps.schema import PLACES, SEQUENCES
 from core.ledger.statements import Statement, json_list, rounded
-from core.maps.store import HANDED_OVER, HAS_PICTURE
+
+HANDED_OVER, HAS_PICTURE = 1, 2
+"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is stored."""
 
 _P, _S = PLACES.c, SEQUENCES.c
 _DIGITS = {"x": 3, "y": 3, "z": 3, "latitude": 7, "longitude": 7, "heading": 2}
@@ -44,7 +46,7 @@ _PLACES = Statement(
 
 
 class Plan:
-    """Reads the plan of one map (:class:`core.maps.store.Plan`).  Any thread may use it.
+    """Reads the plan of one map: where all its places are.  Any thread may use it.
 
     Args:
         reading: begins a transaction that reads the map; the method may raise what it raises.
@@ -54,7 +56,17 @@ class Plan:
         self._reading = reading
 
     def columns(self, step: int = 1) -> str:
-        """The places in the order of their enrolment as the members of a JSON object, without its braces."""
+        """The places in the order of their enrolment as the members of a JSON object, without its braces.
+
+        The members: ``sequences``, the names of the traverses; arrays with a value for each place: ``ids``,
+        ``sequence`` (index into ``sequences``, -1 without one) and ``flags`` (:data:`HANDED_OVER`,
+        :data:`HAS_PICTURE`); and ``x``, ``y``, ``z`` (metres), ``latitude``, ``longitude``, ``heading`` (degrees) and
+        ``timestamp`` (milliseconds since 1970 UTC), each an array with null where a place has no value, or null if no
+        place has one.
+
+        Args:
+            step: about one place in every ``step`` is listed.
+        """
         with self._reading() as connection:
             names = dict(connection.execute(_NAMES))
             ((ids, sequence, flags, *optional),) = connection.execute(_PLACES, step=step)

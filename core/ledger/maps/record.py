@@ -17,10 +17,6 @@ from core.ledger.statements import Statement, seconds_now
 from core.maps.records import MapRecord, validation_message
 from core.places import NO_SEQUENCE
 
-RECENT_SECONDS = 15
-"""The age of a write up to which Milvus is asked to wait for it; three times the five seconds after which Milvus waits
-for it in any case (:meth:`core.milvus.collection.Collection.search`)."""
-
 
 @dataclass(frozen=True)
 class MapState:
@@ -33,8 +29,7 @@ class MapState:
     revision, stamp: the number of the last write, and a text that it drew at random, by which a revision that was lost
         and made again is told from the first one.
     posed: the number of a place that got a pose while the map was open, and may have it still; 0: none is known.
-    recent: whether it was written to in the last ``RECENT_SECONDS`` by the clock of the database.
-    collection: Milvus's id of the collection that has them; 0 as long as there are none.
+    recall: of the codes, as it was last measured, in JSON; None: it was not.
     """
 
     number: int
@@ -44,9 +39,8 @@ class MapState:
     numbers: int = 1
     revision: int = 0
     stamp: str = ""
-    collection: int = 0
     looks: int = 0
-    recent: bool = True
+    recall: str | None = None
     posed: int = 0
 
     @property
@@ -56,10 +50,9 @@ class MapState:
 
 
 _SEALED = ("record",)  # the counters change with every write, and are compared with the places
-_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "collection", "looks")
+_COUNTERS = ("places", "rows", "numbers", "revision", "stamp", "looks", "recall")
 _STATE = (
-    MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS),
-    (MAPS.c.touched > seconds_now() - RECENT_SECONDS).label("recent"),
+    MAPS.c.number, MAPS.c.id, MAPS.c.listed, MAPS.c.record, MAPS.c.seal, *(MAPS.c[name] for name in _COUNTERS)
 )  # fmt: skip
 
 _CREATE = Statement(
@@ -75,8 +68,6 @@ _OF_NUMBER = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")))
 _OF_NUMBER_LOCKED = Statement(select(*_STATE).where(MAPS.c.number == bindparam("map")).with_for_update())
 _LISTED = Statement(select(*_STATE).where(MAPS.c.id == bindparam("id"), MAPS.c.listed == 1))
 _NUMBER_OF = Statement(select(MAPS.c.number).where(MAPS.c.id == bindparam("id")))
-_ALL = Statement(select(MAPS.c.number, MAPS.c.record).order_by(MAPS.c.number))
-_COLLECTIONS = Statement(select(MAPS.c.collection, MAPS.c.id).where(MAPS.c.collection != 0).order_by(MAPS.c.id))
 _IS_LISTED = Statement(select(MAPS.c.listed).where(MAPS.c.id == bindparam("id")))
 _RECORDS = Statement(
     select(*_STATE)
@@ -248,22 +239,3 @@ def put_record(connection: MapConnection, record: MapRecord) -> None:
 def delete_map(connection: MapConnection) -> None:
     """Delete a map with all that belongs to it."""
     connection.change(_DELETE)
-
-
-def numbers(connection: LedgerConnection) -> list[int]:
-    """The numbers of all maps, also of unlisted ones."""
-    return [number for number, _ in connection.execute(_ALL)]
-
-
-def encoders(connection: LedgerConnection) -> list[tuple[str, int]]:
-    """The encoders of all maps, each with the values of its descriptors."""
-    found = (MapRecord.model_validate_json(text) for _, text in connection.execute(_ALL))
-    return sorted({(record.encoder, record.dimension) for record in found})
-
-
-def used_collections(connection: LedgerConnection) -> dict[int, list[str]]:
-    """Milvus's ids of the collections that have descriptors of maps, and these maps."""
-    found: dict[int, list[str]] = {}
-    for collection, map_id in connection.execute(_COLLECTIONS):
-        found.setdefault(collection, []).append(map_id)
-    return found

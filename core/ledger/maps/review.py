@@ -8,57 +8,26 @@ from __future__ import annotations
 
 import hashlib
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import (
-    CheckConstraint,
-    Column,
-    MetaData,
-    PrimaryKeyConstraint,
-    Table,
-    UniqueConstraint,
-    bindparam,
-    delete,
-    func,
-    select,
-    update,
-)
+from sqlalchemy import bindparam, delete, func, select, update
 
 from core.errors import StorageFailure, UnknownFrame
 from core.ledger.maps.checksums import is_sound, sealed, sealed_columns
-from core.ledger.maps.connection import MapConnection
-from core.ledger.statements import Statement, among, binary, integer, text
+from core.ledger.maps.connection import MapConnection, Reading
+from core.ledger.maps.schema import REVIEW_FRAMES as FRAMES
+from core.ledger.maps.schema import REVIEW_NUMBERS as NUMBERS
+from core.ledger.maps.schema import REVIEW_PICTURES as PICTURES
+from core.ledger.statements import Statement, among
 from core.maps.records import ReviewSetting
 from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
 from core.maps.stored_fields import moment_text
 
-METADATA = MetaData()
-
-FRAMES = Table(
-    "review_frames", METADATA, Column("map", integer(), nullable=False), Column("number", integer(), nullable=False),
-    Column("at", text(), nullable=False), Column("digest", binary(), nullable=False),
-    Column("size", integer(), nullable=False), Column("answer", text(), nullable=False), Column("label", text()),
-    Column("object", text()),  # always NULL; the checksums of rows of 1.0 cover it
-    Column("seal", integer(), nullable=False), PrimaryKeyConstraint("map", "number"),
-    UniqueConstraint("map", "digest"), CheckConstraint("length(digest) = 32"), sqlite_strict=True,
-)  # fmt: skip
-# Apart from the frames, so that a listing need not read the pictures.
-_PICTURES = Table(
-    "review_pictures", METADATA, Column("map", integer(), nullable=False), Column("number", integer(), nullable=False),
-    Column("bytes", binary(), nullable=False), PrimaryKeyConstraint("map", "number"), sqlite_strict=True,
-)  # fmt: skip
-# The number of the next frame, so that none is used twice.
-_NUMBERS = Table(
-    "review_numbers", METADATA, Column("map", integer(), primary_key=True), Column("next", integer(), nullable=False),
-    sqlite_strict=True,
-)  # fmt: skip
-
-_F, _P = FRAMES.c, _PICTURES.c
+_F, _P = FRAMES.c, PICTURES.c
 _COLUMNS = sealed_columns(FRAMES)
 _OF_MAP = _F.map == bindparam("map")
 _READ = select(*(_F[name] for name in _COLUMNS), _F.seal).where(_OF_MAP)
@@ -100,43 +69,52 @@ _RENEW = Statement(
     .values(answer=bindparam("new_answer"), seal=bindparam("new_seal"))
 )
 _DELETE = Statement(delete(FRAMES).where(_OF_MAP, among(_F.number, "numbers")))
-_DELETE_PICTURES = Statement(delete(_PICTURES).where(_P.map == bindparam("map"), among(_P.number, "numbers")))
+_DELETE_PICTURES = Statement(delete(PICTURES).where(_P.map == bindparam("map"), among(_P.number, "numbers")))
 _PUT_PICTURE = Statement(
-    lambda insert: insert(_PICTURES).values({name: bindparam(name) for name in ("map", "number", "bytes")})
+    lambda insert: insert(PICTURES).values({name: bindparam(name) for name in ("map", "number", "bytes")})
 )
 _PICTURE = Statement(select(_P.bytes).where(_P.map == bindparam("map"), _P.number == bindparam("number")))
 _FIRST_AFTER = Statement(
     select(_F.number, _F.digest, _P.bytes)
-    .outerjoin(_PICTURES, (_P.map == _F.map) & (_P.number == _F.number))
+    .outerjoin(PICTURES, (_P.map == _F.map) & (_P.number == _F.number))
     .where(_OF_MAP, _F.number > bindparam("after"))
     .order_by(_F.number)
     .limit(1)
 )
 _NEXT = Statement(
     lambda insert: (
-        insert(_NUMBERS)
+        insert(NUMBERS)
         .values(map=bindparam("map"), next=2)
-        .on_conflict_do_update(index_elements=["map"], set_={"next": _NUMBERS.c.next + 1})
-        .returning(_NUMBERS.c.next - 1)
+        .on_conflict_do_update(index_elements=["map"], set_={"next": NUMBERS.c.next + 1})
+        .returning(NUMBERS.c.next - 1)
     )
 )
 
 
-class ReviewTable(ABC):
-    """The frames of one map that are stored for review (:class:`core.maps.review.Review`).  Any thread may use it."""
+class Review:
+    """The frames of one map that are stored for review.  Any thread may use it.
 
-    def __init__(self) -> None:
+    They are not part of what a search needs, so the revision of the map does not count them.  Every method may raise
+    what ``reading`` and ``writing`` raise.
+
+    Args:
+        reading: begins a transaction that reads the map.
+        writing: begins one that writes, in which nobody else writes to the map.
+    """
+
+    def __init__(self, reading: Reading, writing: Reading) -> None:
+        self._reading, self._writing = reading, writing
         self._held: set[int] = set()
 
-    @abstractmethod
-    def _reading(self) -> AbstractContextManager[MapConnection]:
-        """A transaction that reads, and raises if the map is gone."""
-
-    @abstractmethod
-    def _writing(self) -> AbstractContextManager[MapConnection]:
-        """A transaction that writes, and raises if the map is gone."""
-
     def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting, renew: bool = False) -> bool:
+        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
+
+        Args:
+            renew: if the same file is stored already, and has no label, it gets this answer in place of its former one.
+
+        Returns:
+            Whether it was stored: not if the same file is stored already, or is larger than all frames may be together.
+        """
         if len(data) > setting.most_bytes:
             return False
         digest = hashlib.sha256(data).digest()
@@ -170,7 +148,6 @@ class ReviewTable(ABC):
             "size": len(data),
             "answer": json.dumps(answer),
             "label": None if label is None else json.dumps(label),
-            "object": None,
         }
         if not connection.execute(_PUT, **sealed(_COLUMNS, values)):
             return False
@@ -183,6 +160,7 @@ class ReviewTable(ABC):
             return tuple(connection.execute(_LABEL_SEALS))
 
     def shrink(self, setting: ReviewSetting) -> None:
+        """Drop the oldest frames beyond new limits, and give back the room."""
         with self._writing() as connection:
             self._drop_oldest(connection, setting)
 
@@ -197,29 +175,48 @@ class ReviewTable(ABC):
             drop(connection, frames_to_drop(by_age, count, size, setting, self._held))
 
     def drop_before(self, moment: datetime) -> int:
+        """Drop the frames that were asked before a moment, with their labels; returns how many."""
+        with self._reading() as connection:
+            if not connection.execute(_BEFORE, moment=moment_text(moment)):
+                return 0
         with self._writing() as connection:
-            return self._drop_before(connection, moment)
-
-    def _drop_before(self, connection: MapConnection, moment: datetime) -> int:
-        old = [int(number) for (number,) in connection.execute(_BEFORE, moment=moment_text(moment))]
-        if going := [number for number in old if number not in self._held]:
-            drop(connection, going)
-        return len(going)
+            old = [int(number) for (number,) in connection.execute(_BEFORE, moment=moment_text(moment))]
+            if going := [number for number in old if number not in self._held]:
+                drop(connection, going)
+            return len(going)
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
+        """The latest frames, newest first, and how many are stored in all, as of one moment.
+
+        Args:
+            before: only frames with a smaller number; None: all.
+            labelled: only frames with a label, or without one; None: all.
+        """
         with self._reading() as connection:
             found = connection.execute(_PAGES[labelled], before=2**62 if before is None else before, most=limit)
             return StoredReviews([_frame(values) for values in found], *_size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
+        """All frames with a label, oldest first."""
         with self._reading() as connection:
             return [_frame(values) for values in connection.execute(_LABELLED)]
 
     def find(self, number: int) -> ReviewFrame:
+        """One frame.
+
+        Raises:
+            UnknownFrame: it is not stored.
+        """
         with self._reading() as connection:
             return _frame(_expect(connection, number))
 
     def picture(self, number: int) -> bytes:
+        """The file of a frame.
+
+        Raises:
+            UnknownFrame: it is not stored.
+            StorageFailure: it is damaged.
+        """
         with self._reading() as connection:
             frame, stored = _frame(_expect(connection, number)), connection.one(_PICTURE, number=number)
         if stored is None or hashlib.sha256(stored[0]).digest() != frame.digest:
@@ -236,6 +233,11 @@ class ReviewTable(ABC):
             self._held.discard(number)
 
     def label(self, number: int, label: Mapping[str, Any] | None) -> ReviewFrame:
+        """Label a frame; the label replaces an earlier one, and None takes it back.
+
+        Raises:
+            UnknownFrame: it is not stored.
+        """
         with self._writing() as connection:
             values = _expect(connection, number)
             if not _labelled(connection, _LABEL, values, label):
@@ -244,13 +246,46 @@ class ReviewTable(ABC):
         return replace(before, label=label, replaced=before.label)
 
     def label_first(self, number: int, label: Mapping[str, Any]) -> bool:
+        """Label a frame that has no label, whoever else labels it at the same time; whether it had none.
+
+        Raises:
+            UnknownFrame: it is not stored.
+        """
         with self._writing() as connection:
             return _labelled(connection, _LABEL_FIRST, _expect(connection, number), label)
 
     def discard(self, number: int) -> None:
+        """Throw a frame away.
+
+        Raises:
+            UnknownFrame: it is not stored.
+        """
         with self._writing() as connection:
             _expect(connection, number)
             drop(connection, [number])
+
+
+PAGE = 500
+"""Frames that are read at a time."""
+
+
+def stored_frames(
+    review: Review, labelled: bool | None = None, look: Callable[[], None] = lambda: None
+) -> Iterator[ReviewFrame]:
+    """All frames that a map has stored for review, the newest first; those that are read may be discarded meanwhile.
+
+    Args:
+        labelled: only frames with a label, or without one; None: all.
+        look: is called before each page.
+    """
+    before: int | None = None
+    while True:
+        look()
+        page = review.page(before, PAGE, labelled).frames
+        yield from page
+        if len(page) < PAGE:
+            return
+        before = page[-1].number
 
 
 def _labelled(

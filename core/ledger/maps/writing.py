@@ -1,9 +1,8 @@
-"""One write to a map: places, sequences, pictures and keypoints; an engine of vectors adds what it has to do."""
+"""One write to a map: places with all that is stored of their frames, and sequences."""
 
 from __future__ import annotations
 
 import secrets
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -15,12 +14,24 @@ from numpy.typing import NDArray
 
 from core.errors import LookNameTaken, RepeatedLook, TooManyLooks, UnknownPlace
 from core.geometry.keypoints import Keypoints
-from core.ledger.maps import frames, places, record, sequences
+from core.index import Coder
+from core.ledger.maps import frames, places, record, rows, sequences
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace
 from core.ledger.maps.record import MapState
 from core.maps.enrolling import picture_of
-from core.maps.records import MOST_LOOKS, Change, Enrolment, History, Keep, MapRecord, PicturedPlace, SameFrame
+from core.maps.forms import Form
+from core.maps.records import (
+    COMPACT_FROM,
+    MOST_LOOKS,
+    Change,
+    Enrolment,
+    History,
+    Keep,
+    MapRecord,
+    PicturedPlace,
+    SameFrame,
+)
 from core.maps.stored_fields import moment_text, same_fields
 from core.maps.views import MOST_HIDDEN, LatestViews, ViewedFrame, latest_views, leaves_view, reach_of
 from core.places import NO_SEQUENCE, Place, PlaceFields, Pose, PoseKind, check_coordinates, place_and_look
@@ -29,7 +40,7 @@ Descriptors = tuple[NDArray[np.float32], NDArray[np.int8]]
 """The descriptor, float32 [D], and the local descriptors, int8 [C, L], of one frame."""
 
 
-class Write(ABC):
+class Write:
     """Collects the changes of one write within a transaction; ``finish`` comes before its COMMIT.
 
     New places, pictures and keypoints are stored many at a time: when something else is to be read or written, and at
@@ -41,6 +52,8 @@ class Write(ABC):
 
     def __init__(self, connection: MapConnection, state: MapState) -> None:
         self._connection, self.state, self.changed = connection, state, False
+        self._form = Form.of(state.record)
+        self._new: dict[int, tuple[bytes, bytes]] = {}  # descriptor and local descriptors by row, in stored form
         self._before = state
         self._found: dict[str, StoredPlace | None] = {}  # by id, as they are now
         self._codes: dict[str, int] = {}  # of sequences
@@ -74,40 +87,20 @@ class Write(ABC):
         for code, following in ordinals.items():
             sequences.keep_free(connection, code, following)
 
-    # An engine of vectors
+    def add_stored(self, frame: NDArray[np.void]) -> int:
+        """Take the next row's descriptors as an export file has them (``core.maps.forms.Form.frame``); the row."""
+        row = self.state.rows
+        self._new[row] = self._form.divided(frame.tobytes())
+        self.state = replace(self.state, rows=row + 1)
+        return row
 
-    @abstractmethod
-    def expect(self, count: int) -> None:
-        """Allocate room for more frames at once."""
-
-    @abstractmethod
-    def _add_descriptors(self, row: int, item: Enrolment) -> int:
-        """Take the descriptors of a new row; returns the checksum by which its place knows them, 0 if by none."""
-
-    @abstractmethod
-    def _descriptors_at(self, rows: Sequence[int]) -> list[Descriptors]:
+    def _descriptors_at(self, wanted: Sequence[int]) -> list[Descriptors]:
         """The descriptors of rows, those of this write included."""
-
-    @abstractmethod
-    def _let_go(self, stored: StoredPlace) -> None:
-        """Note that the row of a place, as it was, is no place's any more."""
-
-    def _prepared(self, stored: StoredPlace, before: StoredPlace | None, searched: bool) -> StoredPlace:
-        """A place as it is to be stored.
-
-        Args:
-            before: its state before; None: it is new.
-            searched: whether something has changed by which an engine searches.
-        """
-        return stored
-
-    @abstractmethod
-    def _note(self, stored: StoredPlace) -> None:
-        """Note a place that was stored, new or changed."""
-
-    @abstractmethod
-    def _finish(self) -> None:
-        """Make the descriptors durable, before the COMMIT that refers to them."""
+        old = [row for row in wanted if row not in self._new]
+        descriptors, local = (rows.at(self.connection, kind, old) if old else {} for kind in rows.OF_FRAMES)
+        stored = [self._new.get(row) or (descriptors[row], local[row]) for row in wanted]
+        unpacked = self._form.descriptors([one for one, _ in stored]), self._form.locals([one for _, one in stored])
+        return list(zip(*unpacked, strict=True))
 
     # Changes
 
@@ -154,12 +147,10 @@ class Write(ABC):
         if name is None:
             self._expect_coordinates(item.id, item.fields.pose, stored)
         row, (kind, picture) = self.state.rows, picture_of(item, self.record.keep if keep is None else keep)
-        checksum = self._add_descriptors(row, item)
+        self._new[row] = self._form.packed(item.descriptor, item.local)
         self.state = replace(self.state, rows=row + 1)
         least = None if item.least is None else item.least + 0.0
-        frame: dict[str, Any] = {
-            "row": row, "checksum": checksum, "digest": item.digest, "run": item.run, "least": least
-        }  # fmt: skip
+        frame: dict[str, Any] = {"row": row, "digest": item.digest, "run": item.run, "least": least}
         shape: dict[str, Any] = {**frame, "regions": item.regions, "picture": kind}
         look = ViewedFrame(item.descriptor, item.local, item.fields.pose)
         if place is not None:
@@ -229,7 +220,7 @@ class Write(ABC):
         """Store a new look of a place, whose row counts already."""
         made = self.insert(look)
         now = self.find(place.place.id) or place
-        self._put(places.with_place(now, looks=now.place.looks + 1), now, searched=False)
+        self._put(places.with_place(now, looks=now.place.looks + 1), now)
         return made
 
     def _without_void_looks(self, stored: StoredPlace) -> StoredPlace:
@@ -257,13 +248,11 @@ class Write(ABC):
 
     def insert(self, stored: StoredPlace) -> StoredPlace:
         """Store a new place, whose row counts already."""
-        made = self._prepared(stored, None, True)
-        self._places.append(made)
-        self._found[made.place.id] = made
-        self.state = replace(self.state, numbers=made.number + 1)
-        self._count(made, 1)
-        self._note(made)
-        return made
+        self._places.append(stored)
+        self._found[stored.place.id] = stored
+        self.state = replace(self.state, numbers=stored.number + 1)
+        self._count(stored, 1)
+        return stored
 
     def _count(self, stored: StoredPlace, more: int) -> None:
         """Count a place or a look that comes or, with -1, goes."""
@@ -272,17 +261,16 @@ class Write(ABC):
         else:
             self.state = replace(self.state, looks=self.state.looks + more)
 
-    def _put(self, stored: StoredPlace, before: StoredPlace, searched: bool = True) -> StoredPlace:
-        made = self._prepared(replace(stored, revision=self._revision), before, searched)
+    def _put(self, stored: StoredPlace, before: StoredPlace) -> StoredPlace:
+        made = replace(stored, revision=self._revision)
         places.put(self.connection, made, before)
         self._found[made.place.id] = made
         if made.sequence != before.sequence:
             self._drop_if_empty(before.sequence)
         self.changed = True
-        self._note(made)
         for look in places.looks_of(self.connection, made):
             if (moved := places.as_look(look, made)) != look:
-                self._put(moved, look, searched)
+                self._put(moved, look)
         return made
 
     def _code_of(self, sequence: str | None) -> int:
@@ -311,8 +299,9 @@ class Write(ABC):
         return self._before.revision + 1
 
     def _leave(self, stored: StoredPlace) -> None:
+        """Note that the row of a place, as it was, is no place's any more."""
         self.changed = True
-        self._let_go(stored)
+        rows.leave(self.connection, stored.row, self._revision)
 
     def _position(self, sequence: str | None, look: ViewedFrame) -> int | None:
         """The position at the end of a sequence of a frame that shows a view which is there already, else None."""
@@ -324,12 +313,12 @@ class Write(ABC):
             self._latest[sequence] = latest_views(last, first, positions, self._reach, self._looks)
         return self._latest[sequence].position_of(look)
 
-    def _looks(self, rows: list[int]) -> list[ViewedFrame]:
+    def _looks(self, shown: list[int]) -> list[ViewedFrame]:
         """The content of the frames in some rows, those of this write included."""
-        poses = {row: stored.place.pose for row, stored in places.at_rows(self.connection, rows).items()}
+        poses = {row: stored.place.pose for row, stored in places.at_rows(self.connection, shown).items()}
         return [
             ViewedFrame(descriptor, local, poses[row])
-            for row, (descriptor, local) in zip(rows, self._descriptors_at(rows), strict=True)
+            for row, (descriptor, local) in zip(shown, self._descriptors_at(shown), strict=True)
         ]
 
     @property
@@ -369,8 +358,8 @@ class Write(ABC):
         first = sequences.first_at(self.connection, code, ordinal, before=number)
         if first is None:
             return False
-        rows = [] if look is None else sequences.beside(self.connection, code, ordinal, number, stored.row)
-        began, *others = self._looks([first, *rows])
+        beside = [] if look is None else sequences.beside(self.connection, code, ordinal, number, stored.row)
+        began, *others = self._looks([first, *beside])
         return leaves_view(fields.pose, look, began, others, self._reach)
 
     def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
@@ -414,7 +403,7 @@ class Write(ABC):
     def count_served(self, stored: StoredPlace, right: int, wrong: int, passed: int) -> None:
         """Add to how a look has served."""
         counted = replace(stored, right=stored.right + right, wrong=stored.wrong + wrong, passed=stored.passed + passed)
-        self._put(counted, stored, searched=False)
+        self._put(counted, stored)
 
     def adopt(self, item: Enrolment, history: History) -> bool:
         """Store a place of another map, or a look of a place, with its history.
@@ -431,11 +420,11 @@ class Write(ABC):
             return False
         moments = {"created_at": history.created_at, "updated_at": history.updated_at}
         if stored.look_of is not None:
-            self._put(places.with_place(stored, **moments), stored, searched=False)
+            self._put(places.with_place(stored, **moments), stored)
             return True
         ordinal = stored.ordinal if history.ordinal is None else history.ordinal
         changed = replace(places.with_place(stored, **moments), ordinal=ordinal)
-        self._put(changed, stored, searched=ordinal != stored.ordinal)
+        self._put(changed, stored)
         sequences.keep_free(self.connection, stored.sequence, max(ordinal + 1, history.behind))
         return True
 
@@ -446,15 +435,15 @@ class Write(ABC):
         if (track, station) == (stored.sequence, stored.ordinal):
             track = station = None
         fields: dict[str, Any] = {"pose_of": pose_of}
-        if moved := pose != stored.place.pose:
+        if pose != stored.place.pose:
             fields |= {"pose": pose, "updated_at": self._now}
         changed = replace(places.with_place(stored, **fields), track=track, station=station)
-        self._put(changed, stored, searched=moved)
+        self._put(changed, stored)
 
     def drop_picture(self, stored: StoredPlace) -> None:
         """Delete the picture of a place."""
         frames.delete_pictures(self.connection, [stored.row])
-        self._put(places.with_place(stored, picture="none"), stored, searched=False)
+        self._put(places.with_place(stored, picture="none"), stored)
 
     def forget(self, stored: StoredPlace) -> None:
         """Delete a place with its looks, or one look of a place."""
@@ -465,13 +454,17 @@ class Write(ABC):
             self._drop_if_empty(stored.sequence)
             self._latest.clear()
         elif (place := self.find(place_and_look(stored.place.id)[0])) is not None:
-            self._put(places.with_place(place, looks=place.place.looks - 1), place, searched=False)
+            self._put(places.with_place(place, looks=place.place.looks - 1), place)
 
     def _remove(self, stored: StoredPlace) -> None:
         places.remove(self.connection, stored)
         self._found[stored.place.id] = None
         self._count(stored, -1)
         self._leave(stored)
+
+    def note_recall(self, recall: str | None) -> None:
+        """Store the recall of the codes, as it was measured, in JSON."""
+        self.state = replace(self.state, recall=recall)
 
     def edit(self, changed: MapRecord) -> None:
         """Replace the map's record, with the next revision."""
@@ -480,14 +473,17 @@ class Write(ABC):
         record.put_record(self._connection, made)
 
     def finish(self) -> None:
-        """Store the state of the map, after what the engine of vectors has to do; nothing is left out of the COMMIT.
-
-        Raises:
-            StorageFull, StorageFailure, OSError, sqlite3.Error: one of them refuses.
-        """
+        """Store the state of the map and the descriptors; nothing is left out of the COMMIT that follows."""
         if self.changed or self.state != self._before:
-            self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8), recent=True)
+            self.state = replace(self.state, revision=self._revision, stamp=secrets.token_hex(8))
         self._store_waiting()
-        self._finish()
+        if self._new:
+            descriptors, local = ({row: both[at] for row, both in self._new.items()} for at in (0, 1))
+            rows.put(self._connection, "descriptors", descriptors)
+            rows.put(self._connection, "locals", local)
+            if self.state.searched >= COMPACT_FROM or self.record.index == "compact":
+                codes = Coder.of(self._form.dimension).encode(self._form.descriptors(list(descriptors.values())))
+                rows.put(self._connection, "codes", dict(zip(self._new, map(bytes, codes), strict=True)))
         if self.state != self._before:
             record.put_counters(self._connection, self.state)
+            rows.note_revision(self._connection, self.state.revision, self.state.stamp)

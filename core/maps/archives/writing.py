@@ -70,7 +70,6 @@ class ArchivedPlace:
 
     text: the line.
     number, row: of the place and its descriptor in the store.
-    checksum: of its descriptor, where the store has one.
     picture_bytes: size of the stored picture of its frame; 0 without one.
     keypoints_bytes: size of the record of its keypoints; 0 without one.
     """
@@ -79,7 +78,6 @@ class ArchivedPlace:
     text: bytes
     number: int
     row: int
-    checksum: int
     picture_bytes: int
     keypoints_bytes: int
 
@@ -129,8 +127,9 @@ class ArchiveSource(Protocol):
     def keypoints(self, group: Sequence[ArchivedPlace]) -> Chunks:
         """The records of keypoints of those of the places that have them."""
 
-    def expect_there(self) -> None:
-        """Raise if the map is gone."""
+    @property
+    def expect_there(self) -> Callable[[], object]:
+        """Raises if the map is gone."""
 
 
 def write_archive(source: ArchiveSource, path: Path, advance: Advance, expect: Expect) -> Exported:

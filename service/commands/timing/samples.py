@@ -14,7 +14,7 @@ from core.frames.preprocessing import Pixels
 from core.maps import Enrolment, MapSettings, Precision
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas
+from core.store import Directory
 
 BATCH = 64
 """Places that are written together."""
@@ -103,7 +103,7 @@ def write_map(
     Raises:
         StorageFailure: the directory cannot be written.
     """
-    atlas = Atlas(data_dir)
+    atlas = Directory(data_dir)
     settings = MapSettings(keep="none")
     made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape, precision=precision)
     batch: list[Enrolment] = []

@@ -19,7 +19,7 @@ from core.networks.network import ShallowNetwork
 from core.networks.torch_network import TorchNetwork, as_tensor, follow_threads
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
-from core.storage import Atlas
+from core.store import Directory
 from core.threads import allowed_threads, each
 from service.commands.timing.samples import fill_map, sample_frame
 
@@ -100,7 +100,7 @@ def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
     query = Query(encoder.encode(sample_frame(0)), Question(MATCHES))
     with tempfile.TemporaryDirectory() as folder:
         fill_map(Path(folder), "sample", encoder, places)
-        atlas = Atlas(Path(folder))
+        atlas = Directory(Path(folder))
         try:
             map_ = atlas.get("sample")
             yield lambda: locate(map_, encoder, [query])

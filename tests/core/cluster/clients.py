@@ -22,7 +22,7 @@ from core.milvus import open_store
 from core.postgres import open_database
 from core.postgres.map import PostgresMap
 from core.postgres.store import PostgresStore
-from tests.core.storage.frames import descriptor_of, frame
+from tests.core.store.frames import descriptor_of, frame
 
 ROOT = Path(__file__).parents[3]
 

@@ -29,7 +29,7 @@ from tests.campaigns import read_arguments
 from tests.core.cluster.clients import ProcessClient, StoreClient
 from tests.core.cluster.load import May, PlaceLoad, check, running
 from tests.core.cluster.parts import POSTGRES, ClusterPart, KillableCluster, ServersT
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 
 MOST_SECONDS = 60.0
 """From the start of a server, or the end of its silence, until both clients are served again."""

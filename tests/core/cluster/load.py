@@ -13,7 +13,7 @@ import numpy as np
 from core.errors import StorageFailure, UnknownPlace
 from core.postgres.map import PostgresMap
 from tests.core.cluster.clients import ProcessClient, StoreClient
-from tests.core.storage.frames import descriptor_of, digest_of
+from tests.core.store.frames import descriptor_of, digest_of
 
 May = dict[str, set[str | None]]
 """By id, the pictures that the place may show, None for no place: one, unless a write got no answer."""

@@ -9,17 +9,17 @@ import pytest
 
 from core.errors import StorageFailure
 from core.postgres import open_database
-from core.postgres.search.store import CodedStore
+from core.store.cluster import Cluster
 from tests.core.cluster.clients import StoreClient
 from tests.core.cluster.load import May, PlaceLoad, check, running
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.postgres import Postgres
 
 pytestmark = pytest.mark.postgres
 
 
 @pytest.fixture
-def store(postgres: Postgres) -> Iterator[CodedStore]:
+def store(postgres: Postgres) -> Iterator[Cluster]:
     """With two places."""
     postgres.empty()
     store = open_database(postgres.address)
@@ -29,7 +29,7 @@ def store(postgres: Postgres) -> Iterator[CodedStore]:
     store.close()
 
 
-def test_places_as_they_may_be(store: CodedStore) -> None:
+def test_places_as_they_may_be(store: Cluster) -> None:
     may: May = {"a": {"picture 1", None}, "b": {"picture 3", "picture 2"}, "c": {None, "picture 4"}}
     check(store.get("lab"), may)
     assert may == {"a": {"picture 1"}, "b": {"picture 2"}, "c": {None}}  # known from now on
@@ -43,7 +43,7 @@ def test_places_as_they_may_be(store: CodedStore) -> None:
         ({"a": {"picture 1"}}, "'b'.* are there, and should not"),
     ],
 )
-def test_places_as_they_may_not_be(store: CodedStore, may: May, said: str) -> None:
+def test_places_as_they_may_not_be(store: Cluster, may: May, said: str) -> None:
     with pytest.raises(AssertionError, match=said):
         check(store.get("lab"), may)
 
@@ -63,7 +63,7 @@ class Loser(StoreClient):
 
 
 @pytest.mark.parametrize(("kind", "said"), [(HalfWriter, "half of "), (Loser, "is not among")])
-def test_a_defect_is_seen_under_the_load(store: CodedStore, kind: type[StoreClient], said: str) -> None:
+def test_a_defect_is_seen_under_the_load(store: Cluster, kind: type[StoreClient], said: str) -> None:
     load = PlaceLoad(kind(store), "1", {name: {None} for name in "pqrs"})
     with running([load]):
         while not load.wrong:

@@ -14,8 +14,8 @@ from core.errors import StoreUnavailable
 from core.index import FirstStage, milvus
 from core.index.milvus import MOST_FOUND, MOST_LISTED, Milvus, MilvusCodes, indexing_for, search_settings
 from core.places import NO_POSE, NO_SEQUENCE
-from core.storage.search.segment import Location
-from core.storage.search.snapshot import SHORTLIST, Snapshot
+from core.store.segment import Location
+from core.store.snapshot import SHORTLIST, Snapshot
 from tests.core.index.made_up import Array
 from tests.servers.milvus import MilvusServer, running_milvus
 from tests.service.stores.door import Door

@@ -14,12 +14,13 @@ from core.belief import OdometryPose, PlaceGraph
 from core.judgement.trials import StagedTrials
 from core.learning import PlacedFrame, RunFrame, lesson_of, placed_frames, trials_of
 from core.learning.known_frames import MOST_ASKED, STRANGERS
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields, Pose
-from core.storage import Atlas
+from core.store import Directory
 from tests.core.learning.runs import covered, except_at, missed, recognized, walked, way
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 
@@ -89,7 +90,7 @@ def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
 @pytest.fixture
 def street(tmp_path: Path, encoder: Encoder) -> Iterator[Map]:
     """Places four metres apart, of which each looks like the next one."""
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     made = atlas.create("street", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     made.enrol(
         [

@@ -22,12 +22,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from core import errors
 from core.frames.masks import Mask, with_range
 from core.judgement.priors import Disc, Period
-from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, SameFrame, Selection, Store
+from core.maps import Correspondence, History, PlaceFilter, ReviewSetting, SameFrame, Selection
 from core.maps.archives.reading import Archive, check
 from core.maps.records import Outline
 from core.maps.selection import Conditions, RecentFrames
 from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, level_code, look_address, microseconds
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
+from core.store import Map, Store
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
 from tests.durability.contents import sha
 from tests.durability.model import GONE, MapModel, PlaceModel, Refused, changed, differences
 from tests.durability.storage.operations import DEFAULTS, enrolment, look_enrolment, shown

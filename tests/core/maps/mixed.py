@@ -11,9 +11,10 @@ from unittest.mock import patch
 
 from core.errors import MixedCoordinates
 from core.ledger.maps.writing import Write
-from core.maps import Enrolment, Map
+from core.maps import Enrolment
 from core.places import PlaceFields, Pose
-from tests.core.storage.frames import frame
+from core.store import Map
+from tests.core.store.frames import frame
 
 
 @contextmanager

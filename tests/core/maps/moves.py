@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.maps import Map, MapSettings, Store
+from core.maps import MapSettings
 from core.maps.archives.reading import Archive
-from core.storage import Atlas
-from core.storage.files.row_formats import COMPRESSED
+from core.maps.forms import COMPRESSED
+from core.store import Directory, Map, Store
 from tests.core.storage.archives.conftest import filled
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 ID = "moved"
 
@@ -38,7 +38,7 @@ def answers(map_: Map) -> list[list[tuple[str, float]]]:
 
 def check_moves(there: Store, folder: Path, precision: str) -> None:
     """A map of a data directory moves to another store and back: three equal files, and the same answers."""
-    here, back = Atlas(folder / "here"), Atlas(folder / "back")
+    here, back = Directory(folder / "here"), Directory(folder / "back")
     files = [folder / f"{number}.tar" for number in range(3)]
     if precision == "half":
         first = filled(here.create(ID, ENCODER, DIMENSION, MapSettings(), LOCAL_SHAPE))
@@ -66,7 +66,7 @@ def check_moves(there: Store, folder: Path, precision: str) -> None:
 
 def check_a_refused_import_leaves_nothing(store: Store, folder: Path) -> None:
     """An import that is refused at its very end leaves no map, and can be done again."""
-    here, file = Atlas(folder), folder / "lab.tar"
+    here, file = Directory(folder), folder / "lab.tar"
     filled(here.create(ID, ENCODER, DIMENSION, MapSettings(), LOCAL_SHAPE)).exporter.write(file)
 
     def refuse(_places: int) -> None:

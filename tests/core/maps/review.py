@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+from core.ledger.maps.review import Review
 from core.maps import ReviewSetting
-from core.maps.review import Review
 
 WRITES = 60
 

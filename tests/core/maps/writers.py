@@ -8,9 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from core.errors import RevisionMismatch
-from core.maps import PlaceFilter, Store
+from core.maps import PlaceFilter
 from core.maps.views import ViewedFrame, shows_same
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
+from core.store import Store
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 
 BATCHES = 8
 

@@ -8,7 +8,7 @@ import pytest
 from core.maps.records import Precision
 from core.method.equations import Normalization, matching_score, vlad
 from core.method.vlad import aggregate, are_normalized, scores
-from core.storage.files.row_formats import pack_descriptors, unpack_descriptors
+from core.maps.forms import pack_descriptors, unpack_descriptors
 from service.maps.imports import LENGTH_TOLERANCES
 
 

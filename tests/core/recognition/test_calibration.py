@@ -15,7 +15,7 @@ from core.maps import Enrolment, MapSettings
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import calibration_warnings, queries_from_map, run_trials
-from core.storage import Atlas
+from core.store import Directory
 from tests.core.judgement.test_calibration import BASE, PRECISE, drawn
 
 PLACES, QUERIES = 400, 30
@@ -38,7 +38,7 @@ def walk(encoder: Encoder) -> list[Enrolment]:
 
 
 def trials(folder: Path, encoder: Encoder, index: str) -> Trials:
-    atlas = Atlas(folder)
+    atlas = Directory(folder)
     settings = MapSettings(keep="none", index=index)  # type: ignore[arg-type]
     dense = atlas.create("dense", encoder.identity, encoder.dimension, settings, encoder.local_shape)
     dense.enrol(walk(encoder))
@@ -55,7 +55,7 @@ def trials(folder: Path, encoder: Encoder, index: str) -> Trials:
 def test_a_place_without_its_surroundings_is_tried_in_a_dense_map(
     tmp_path: Path, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("core.storage.search.snapshot.SHORTLIST", 40)
+    monkeypatch.setattr("core.store.snapshot.SHORTLIST", 40)
     exact, compact = trials(tmp_path / "exact", encoder, "exact"), trials(tmp_path / "compact", encoder, "compact")
     assert len(compact) == len(exact) == 2 * QUERIES
     np.testing.assert_array_equal(compact.known, exact.known)

@@ -23,7 +23,7 @@ from core.recognition.framings import FramedView, doubted, shrunk
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, enrol, recognize
 from core.recognition.stages import rank_places
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 
 DATASETS = Path(__file__).parents[3] / "../shared/datasets"
 PLACES, FRAMES = 60, range(6, 50, 3)
@@ -59,7 +59,7 @@ def lens(width: int, height: int) -> Intrinsics:
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
-    encoder, atlas = EncoderCatalogue().get(DEFAULT_ENCODER), Atlas(tmp_path_factory.mktemp("maps"))
+    encoder, atlas = EncoderCatalogue().get(DEFAULT_ENCODER), Directory(tmp_path_factory.mktemp("maps"))
     map_ = atlas.create("walk", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     pair = corridor(DATASETS)
     map_.cameras.put("whole", None, lens(160, 120))

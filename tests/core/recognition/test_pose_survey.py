@@ -12,13 +12,14 @@ from benchmarks.geometry.pose import CAMERA, Hall, rotation
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.maps import Map, MapSettings
+from core.store import Map
+from core.maps import MapSettings
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import load_xfeat
 from core.places import PlaceFields, Pose, Whereabouts
 from core.recognition.pose_survey import SATELLITES, place_errors, pose_survey, turned_note
 from core.recognition.recognition import describe
-from core.storage import Atlas
+from core.store import Directory
 from tests.service.scenes import scene
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ def ahead(encoder: Encoder) -> tuple[list[Frame], Array]:
 
 
 def mapped(folder: Path, encoder: Encoder, frames: list[Frame], poses: Array) -> Map:
-    map_ = Atlas(folder).create("hall", encoder.identity, encoder.dimension, MapSettings(), encoder.local_shape)
+    map_ = Directory(folder).create("hall", encoder.identity, encoder.dimension, MapSettings(), encoder.local_shape)
     map_.cameras.put("front", None, CAMERA)
     enrolled = []
     for number, ((picture, encoding, keypoints), (x, y, heading)) in enumerate(zip(frames, poses, strict=True)):

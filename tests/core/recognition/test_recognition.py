@@ -21,7 +21,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
 from core.recognition.stages import likeness, rank_places
-from core.storage import Atlas, Map, Snapshot
+from core.store import Directory, Map, Snapshot
 from tests.service.encoders import SECOND_STAGE
 from tests.service.scenes import jpeg, scene, seen_again
 
@@ -46,7 +46,7 @@ def query(encoder: Encoder) -> Encoding:
 @pytest.fixture
 def lab(tmp_path: Path, encoder: Encoder, seen: list[Encoding]) -> Iterator[Map]:
     """A map of all places, ten metres apart, over several segments."""
-    atlas = Atlas(tmp_path, rows_per_segment=3)
+    atlas = Directory(tmp_path, rows_per_segment=3)
     lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     lab.enrol([enrolment(f"p{i}", encoding) for i, encoding in enumerate(seen)])
     yield lab
@@ -69,8 +69,8 @@ def enrolment(place_id: str, encoding: Encoding) -> Enrolment:
 def test_neighbours_that_fill_the_shortlist_do_not_hide_rivals(
     tmp_path: Path, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("core.storage.search.snapshot.SHORTLIST", 20)
-    atlas = Atlas(tmp_path)
+    monkeypatch.setattr("core.store.snapshot.SHORTLIST", 20)
+    atlas = Directory(tmp_path)
     crowded = atlas.create(
         "crowded", encoder.identity, encoder.dimension, MapSettings(keep="none", index="compact"), encoder.local_shape
     )
@@ -241,7 +241,7 @@ def test_a_camera_must_be_known(lab: Map, encoder: Encoder) -> None:
 def rooms(tmp_path: Path) -> Iterator[tuple[Map, Encoder]]:
     """An empty map of the packaged default."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     yield atlas.create("rooms", encoder.identity, encoder.dimension, local_shape=encoder.local_shape), encoder
     atlas.close()
 

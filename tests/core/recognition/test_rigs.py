@@ -20,7 +20,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, enrol
 from core.recognition.rigs import locate_rig
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
 PLACES = 30
@@ -34,7 +34,7 @@ def encoder() -> Encoder:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory, encoder: Encoder) -> Iterator[Map]:
     """A map of places of which each camera sees another side; one of them looks the same somewhere else."""
-    atlas = Atlas(tmp_path_factory.mktemp("maps"))
+    atlas = Directory(tmp_path_factory.mktemp("maps"))
     made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for seed in range(PLACES):
         for side, number in (("left", seed), ("right", seed + 100)):

@@ -19,9 +19,9 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.upkeep.redundancy import neighbour_pairs, stops
-from tests.core.storage.search.test_indexing import settled
+from tests.core.store.settled import settled
 from tests.service.scenes import scene
 
 PLACES, SPOT, LOOKS = 12, 5, 120
@@ -54,14 +54,14 @@ def looks(encoder: Encoder) -> list[Encoding]:
 
 
 @pytest.fixture
-def atlas(tmp_path: Path) -> Iterator[Atlas]:
-    opened = Atlas(tmp_path)
+def atlas(tmp_path: Path) -> Iterator[Directory]:
+    opened = Directory(tmp_path)
     yield opened
     opened.close()
 
 
 def enrolled(
-    atlas: Atlas, encoder: Encoder, frames: Sequence[tuple[str, Encoding]], poses: Sequence[float] | None = None
+    atlas: Directory, encoder: Encoder, frames: Sequence[tuple[str, Encoding]], poses: Sequence[float] | None = None
 ) -> Map:
     """A map of frames in their order; a name is that of a place, a dot and the number of the frame."""
     made = atlas.create("stood", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
@@ -102,7 +102,7 @@ def place_of(answer: Answer) -> str | None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("count", [1, 5, 20, LOOKS])
 def test_a_stop_is_recognized_however_long_it_was(
-    atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding], count: int
+    atlas: Directory, encoder: Encoder, walk: list[Encoding], looks: list[Encoding], count: int
 ) -> None:
     map_ = enrolled(atlas, encoder, with_stop(walk, looks[:count]))
     assert map_.snapshot().whereabouts.ordinal.max() == PLACES - 1
@@ -113,7 +113,7 @@ def test_a_stop_is_recognized_however_long_it_was(
 
 
 @pytest.mark.thorough
-def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Encoder, walk: list[Encoding]) -> None:
+def test_several_stops_hide_none_of_the_other_places(atlas: Directory, encoder: Encoder, walk: list[Encoding]) -> None:
     """Their looks are more than a compact search finds; a verdict needs the others, and a session the neighbours."""
     spots = (1, 5, 9, 10, 11)
     looks = {spot: [walk[spot]] * LOOKS for spot in spots}
@@ -131,7 +131,7 @@ def test_several_stops_hide_none_of_the_other_places(atlas: Atlas, encoder: Enco
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("apart", [20.0, 400.0])
-def test_equal_doors_one_after_the_other_are_rivals(atlas: Atlas, encoder: Encoder, apart: float) -> None:
+def test_equal_doors_one_after_the_other_are_rivals(atlas: Directory, encoder: Encoder, apart: float) -> None:
     """Where the second stage does not examine all frames, either."""
     count = encoder.candidates + 60
     frames = [(f"{n}.0", encoder.encode(scene(n))) for n in range(count)]
@@ -143,7 +143,7 @@ def test_equal_doors_one_after_the_other_are_rivals(atlas: Atlas, encoder: Encod
 
 @pytest.mark.thorough
 def test_a_stop_is_one_place_of_a_session(
-    atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
+    atlas: Directory, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
 ) -> None:
     map_ = enrolled(atlas, encoder, with_stop(walk, looks[:40]))
     snapshot, neighborhood = map_.snapshot(), neighborhood_of(map_)
@@ -159,21 +159,21 @@ def test_a_stop_is_one_place_of_a_session(
 
 
 def test_one_picture_at_two_places_stays_ambiguous(
-    atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
+    atlas: Directory, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
 ) -> None:
     frames = [(f"{number}.0", one) for number, one in enumerate([*walk, looks[0]])]
     assert ask(enrolled(atlas, encoder, frames), encoder, looks[1]).judgement.verdict == "ambiguous"
 
 
 def test_one_picture_at_two_poses_stays_ambiguous(
-    atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
+    atlas: Directory, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]
 ) -> None:
     frames = [*((f"{number}.0", one) for number, one in enumerate(walk)), ("twin.0", looks[0]), ("twin.1", looks[1])]
     poses = [10.0 * number for number in range(PLACES)] + [400.0, 800.0]
     assert ask(enrolled(atlas, encoder, frames, poses), encoder, looks[2]).judgement.verdict == "ambiguous"
 
 
-def test_upkeep_finds_the_stop(atlas: Atlas, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]) -> None:
+def test_upkeep_finds_the_stop(atlas: Directory, encoder: Encoder, walk: list[Encoding], looks: list[Encoding]) -> None:
     map_ = enrolled(atlas, encoder, with_stop(walk, looks[:30]))
     where = map_.snapshot().whereabouts
     (stop,) = stops(where)

@@ -26,7 +26,7 @@ from core.recognition.question import Query, Question, Verifier, Verify
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
 from core.recognition.stages import Candidates
 from core.recognition.verification import AT_FIRST, CANDIDATES, VerificationState, verify_candidates
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
 PLACES = 12
@@ -38,14 +38,14 @@ def encoder() -> Encoder:
 
 
 @pytest.fixture(scope="module")
-def atlas(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Atlas]:
-    made = Atlas(tmp_path_factory.mktemp("maps"))
+def atlas(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Directory]:
+    made = Directory(tmp_path_factory.mktemp("maps"))
     yield made
     made.close()
 
 
 @pytest.fixture(scope="module")
-def lab(atlas: Atlas, encoder: Encoder) -> Map:
+def lab(atlas: Directory, encoder: Encoder) -> Map:
     """A map of places of their own, with keypoints."""
     lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for seed in range(PLACES):
@@ -209,7 +209,7 @@ def test_auto_verifies_as_always_does_where_doubt_is_left(lab: Map, encoder: Enc
     assert sum(one is not None for one in answer.candidates.verifications) > 1, "not the best match alone"
 
 
-def test_places_without_keypoints_are_left_where_two_stages_put_them(atlas: Atlas, encoder: Encoder) -> None:
+def test_places_without_keypoints_are_left_where_two_stages_put_them(atlas: Directory, encoder: Encoder) -> None:
     bare = atlas.create(
         "plain", encoder.identity, encoder.dimension, MapSettings(keep="none", verification=False), encoder.local_shape
     )
@@ -233,7 +233,7 @@ def test_places_without_keypoints_are_left_where_two_stages_put_them(atlas: Atla
 
 @pytest.mark.parametrize("verify", ["auto", "always"])
 def test_a_best_match_without_keypoints_loses_nothing_to_places_that_have_some(
-    atlas: Atlas, encoder: Encoder, verify: Verify
+    atlas: Directory, encoder: Encoder, verify: Verify
 ) -> None:
     """As in a map whose setting was changed: what places beside it share with the frame says nothing against it."""
     mixed = atlas.create(
@@ -269,7 +269,7 @@ def test_recognize_verifies_by_itself(lab: Map, encoder: Encoder, tmp_path: Path
     assert recognize(lab, jpeg(5), encoder, Question(verify="never")).third_stage.state == "never"
 
 
-def test_twins_are_ambiguous_however_well_they_fit(atlas: Atlas, encoder: Encoder) -> None:
+def test_twins_are_ambiguous_however_well_they_fit(atlas: Directory, encoder: Encoder) -> None:
     twins = atlas.create("twins", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for place in ("here", "there"):
         enrol(twins, place, jpeg(5), encoder)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from core.maps import MapSettings
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 
 ROWS = 4
 
@@ -18,13 +18,13 @@ def directory(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def atlas(directory: Path) -> Iterator[Atlas]:
+def atlas(directory: Path) -> Iterator[Directory]:
     """With segments of four rows, so that a few places fill some."""
-    atlas = Atlas(directory, rows_per_segment=ROWS)
+    atlas = Directory(directory, rows_per_segment=ROWS)
     yield atlas
     atlas.close()
 
 
 @pytest.fixture
-def lab(atlas: Atlas) -> Map:
+def lab(atlas: Directory) -> Map:
     return atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)

@@ -24,8 +24,8 @@ from core.errors import (
 )
 from core.ledger.maps.checksums import checksum_of
 from core.maps import MapSettings
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -36,14 +36,14 @@ def names(folder: Path) -> list[str]:
 
 def test_the_directory_is_made_with_all_above_it(tmp_path: Path) -> None:
     directory = tmp_path / "a" / "b" / "data"
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     assert names(directory) == ["FORMAT", "LOCK", "maps"]
     assert atlas.records(None, 10) == ([], None)
     atlas.close()
     atlas.close()
 
 
-def test_a_map_is_made_whole(atlas: Atlas, directory: Path) -> None:
+def test_a_map_is_made_whole(atlas: Directory, directory: Path) -> None:
     settings = MapSettings(description="the lab", keep="none", same_place_radius=2.5, same_place_frames=0)
     lab = atlas.create("lab", ENCODER, DIMENSION, settings, local_shape=LOCAL_SHAPE)
     assert atlas.get("lab") is lab
@@ -56,13 +56,13 @@ def test_a_map_is_made_whole(atlas: Atlas, directory: Path) -> None:
 
 
 def test_the_shape_of_the_local_descriptors_is_the_maps_for_life(directory: Path) -> None:
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=(7, 2)).enrol([frame("p", local_shape=(7, 2))])
     atlas.create("hall", ENCODER, DIMENSION).enrol([frame("p", local_shape=(0, 0))])
     with pytest.raises(ValueError, match="cannot have"):
         atlas.create("none", ENCODER, DIMENSION, local_shape=(7, 0))
     atlas.close()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     assert [atlas.get(name).record.local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
     assert [atlas.get(name).snapshot().local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
     for name in ("lab", "hall"):
@@ -74,7 +74,7 @@ def test_the_shape_of_the_local_descriptors_is_the_maps_for_life(directory: Path
 
 
 @pytest.mark.parametrize("name", ["import", "Lab", "", "../lab", ".making-x", "a/b", "x" * 65])
-def test_what_cannot_name_a_map(atlas: Atlas, directory: Path, name: str) -> None:
+def test_what_cannot_name_a_map(atlas: Directory, directory: Path, name: str) -> None:
     with pytest.raises(InvalidIdentifier):
         atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     assert names(directory / "maps") == []
@@ -83,7 +83,7 @@ def test_what_cannot_name_a_map(atlas: Atlas, directory: Path, name: str) -> Non
             call(name)
 
 
-def test_maps_are_listed_page_by_page(atlas: Atlas) -> None:
+def test_maps_are_listed_page_by_page(atlas: Directory) -> None:
     for name in ("b", "a", "d", "c"):
         atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     first, cursor = atlas.records(None, 3)
@@ -96,7 +96,7 @@ def test_maps_are_listed_page_by_page(atlas: Atlas) -> None:
         atlas.records(None, 0)
 
 
-def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Atlas, directory: Path) -> None:
+def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Directory, directory: Path) -> None:
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     atlas.delete("lab")
     assert names(directory / "maps") == []
@@ -109,13 +109,13 @@ def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Atlas, directory: Pat
 
 
 def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path) -> None:
-    with_places = Atlas(directory, rows_per_segment=4)
+    with_places = Directory(directory, rows_per_segment=4)
     for name in ("hall", "lab"):
         with_places.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
             [frame(f"{name}{i}") for i in range(6)]
         )
     with_places.close()
-    atlas = Atlas(directory, rows_per_segment=100)  # the maps there are keep theirs
+    atlas = Directory(directory, rows_per_segment=100)  # the maps there are keep theirs
     assert [record.id for record in atlas.records(None, 10)[0]] == ["hall", "lab"]
     assert all(found._opened is None for found in atlas._maps.values())
     assert (atlas.find("hall").record.id, atlas.find("hall").count_places()) == ("hall", 6)
@@ -129,7 +129,7 @@ def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path)
 
 
 def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     maps = directory / "maps"
@@ -137,7 +137,7 @@ def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
     shutil.copytree(maps / "lab", maps / ".removing-lab-4567")
     (maps / "lab" / "index-000001.faiss.tmp").write_bytes(b"half")
     (maps / "README").write_text("somebody's note")
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     assert names(maps) == ["README", "lab"]
     assert [record.id for record in atlas.records(None, 10)[0]] == ["lab"]
     atlas.get("lab").enrol([frame("p")])
@@ -152,18 +152,18 @@ def test_one_process_at_a_time(directory: Path) -> None:
         assert other.stdout is not None
         assert other.stdout.readline() == b"ack holding\n"
         with pytest.raises(DataDirectoryLocked, match="Another process"):
-            Atlas(directory)
+            Directory(directory)
         other.kill()  # even a process that is killed lets go
-    Atlas(directory).close()
+    Directory(directory).close()
 
 
-def test_a_second_atlas_in_this_process_is_refused_too(atlas: Atlas, directory: Path) -> None:
+def test_a_second_atlas_in_this_process_is_refused_too(atlas: Directory, directory: Path) -> None:
     with pytest.raises(DataDirectoryLocked):
-        Atlas(directory)
+        Directory(directory)
 
 
 def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     for call in (
@@ -179,30 +179,30 @@ def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
 
 
 def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
-    Atlas(directory).close()
+    Directory(directory).close()
     (directory / "FORMAT").write_text("placerec data 1\n")
-    Atlas(directory).close()
+    Directory(directory).close()
     assert (directory / "FORMAT").read_text() == "placerec data 2\n"
     (directory / "FORMAT").write_text("placerec data 3\n")
     with pytest.raises(DataDirectoryTooNew):
-        Atlas(directory)
+        Directory(directory)
     (directory / "FORMAT").write_text("something else")
     with pytest.raises(StorageFailure, match="right directory"):
-        Atlas(directory)
+        Directory(directory)
     (directory / "FORMAT").unlink()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     edit(directory, "PRAGMA user_version = 99")
     edit(directory, "ALTER TABLE places ADD COLUMN floor INTEGER")
     with pytest.raises(DataDirectoryTooNew, match="schema 99"):
-        Atlas(directory)
+        Directory(directory)
     edit(directory, "ALTER TABLE places DROP COLUMN floor")
-    Atlas(directory).close()  # and it let go of the lock each time
+    Directory(directory).close()  # and it let go of the lock each time
 
 
 def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: Path) -> None:
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     for name in ("hall", "lab"):
         atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
@@ -210,13 +210,13 @@ def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: 
     edit(directory, "PRAGMA user_version = 9")
     before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
     with pytest.raises(DataDirectoryTooOld) as error:
-        Atlas(directory)
+        Directory(directory)
     assert str(error.value).startswith(f"{directory / 'maps' / 'lab' / 'map.sqlite'} was written before the first")
     assert "enrol again in a new data directory" in str(error.value)
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
-def test_the_disk_can_be_written_or_not(atlas: Atlas, directory: Path) -> None:
+def test_the_disk_can_be_written_or_not(atlas: Directory, directory: Path) -> None:
     before = names(directory)
     atlas.check_writable()
     assert names(directory) == before
@@ -311,12 +311,12 @@ def somebody_elses(folder: Path) -> None:
 def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
     directory: Path, spoil: Callable[[Path], None]
 ) -> None:
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     for name in ("hall", "lab"):
         atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
     atlas.close()
     spoil(directory / "maps" / "lab")
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     try:
         with pytest.raises(MapQuarantined, match="damaged and out of service"):
             atlas.get("lab")
@@ -336,7 +336,7 @@ def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
         atlas.close()
 
 
-def test_a_database_damaged_in_use_takes_its_map_out_of_service(atlas: Atlas, lab: Map, directory: Path) -> None:
+def test_a_database_damaged_in_use_takes_its_map_out_of_service(atlas: Directory, lab: Map, directory: Path) -> None:
     lab.enrol([frame(f"p{i}", metadata={"text": "x" * 3000}) for i in range(200)])
     opened = lab._opened
     assert opened is not None

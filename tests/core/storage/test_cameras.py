@@ -14,7 +14,7 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.writing import Write
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 
 MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
 INTRINSICS = Intrinsics(width=64, height=48, fx=50.1, fy=50.2, cx=31.5, cy=23.5)
@@ -32,11 +32,11 @@ def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -
         lab.cameras.mask("front")
 
 
-def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Atlas, lab: Map) -> None:
+def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Directory, lab: Map) -> None:
     lab.cameras.put("front", MASK, INTRINSICS)
     lab.cameras.put("back", None)
     atlas.close()
-    opened = Atlas(directory)
+    opened = Directory(directory)
     again = opened.get(lab.record.id).cameras
     assert again.find("front").intrinsics == again.intrinsics("front") == INTRINSICS
     assert again.intrinsics("back") is again.intrinsics("gone") is again.intrinsics(None) is None
@@ -47,13 +47,13 @@ def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Atlas, la
 
 @pytest.mark.parametrize("mask", [None, MASK])
 def test_a_range_of_values_goes_with_the_mask_of_frames(
-    mask: Mask | None, directory: Path, atlas: Atlas, lab: Map
+    mask: Mask | None, directory: Path, atlas: Directory, lab: Map
 ) -> None:
     lab.cameras.put("front", mask, None, (0, 1023))
     before = lab.cameras.mask("front")
     lab.cameras.put("front", mask, None, (0, 4095))
     atlas.close()
-    with closing(Atlas(directory)) as opened:
+    with closing(Directory(directory)) as opened:
         cameras = opened.get(lab.record.id).cameras
         assert cameras.find("front").settings() == (mask, None, (0, 4095))
         used = cameras.mask("front")

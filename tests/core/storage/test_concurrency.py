@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from core.errors import MapExists, StorageFailure, UnknownMap, UnknownPlace
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 
 
 def run_together(*works: Callable[[], None]) -> None:
@@ -87,7 +87,7 @@ def test_writers_and_searchers(lab: Map) -> None:
     assert lab.verify().ok
 
 
-def test_a_map_is_deleted_under_its_users(atlas: Atlas, directory: Path) -> None:
+def test_a_map_is_deleted_under_its_users(atlas: Directory, directory: Path) -> None:
     for _ in range(5):
         lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
         lab.enrol([frame("p")])
@@ -112,7 +112,7 @@ def test_a_map_is_deleted_under_its_users(atlas: Atlas, directory: Path) -> None
         assert list((directory / "maps").iterdir()) == []
 
 
-def test_one_of_many_makes_a_map(atlas: Atlas) -> None:
+def test_one_of_many_makes_a_map(atlas: Directory) -> None:
     made: list[Map] = []
 
     def make() -> None:
@@ -126,10 +126,10 @@ def test_one_of_many_makes_a_map(atlas: Atlas) -> None:
 
 
 def test_a_map_is_opened_once_by_many(directory: Path) -> None:
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(9)])
     atlas.close()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     seen: list[object] = []
 
     def use() -> None:
@@ -143,7 +143,7 @@ def test_a_map_is_opened_once_by_many(directory: Path) -> None:
 
 
 def test_closing_under_load(directory: Path) -> None:
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     taken: list[str] = []
     started = threading.Barrier(3)
@@ -176,6 +176,6 @@ def test_closing_under_load(directory: Path) -> None:
         atlas.close()
 
     run_together(write, read, close)
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     assert [place.id for place in atlas.get("lab").places(None, 10_000)[0]] == taken
     atlas.close()

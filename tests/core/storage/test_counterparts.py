@@ -9,8 +9,8 @@ import pytest
 
 from core.maps import Correspondence, History, MapSettings
 from core.places import Neighborhood
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 
 def row(map_: Map, place_id: str) -> int:
@@ -53,17 +53,17 @@ EXPECTED = {
 }
 
 
-def test_places_at_one_station_are_the_same_also_after_a_restart(atlas: Atlas, aligned: Map) -> None:
+def test_places_at_one_station_are_the_same_also_after_a_restart(atlas: Directory, aligned: Map) -> None:
     assert {name: same_place(aligned, name) for name in EXPECTED} == EXPECTED
     assert aligned.verify().ok
     atlas.close()
-    again = Atlas(atlas._directory)
+    again = Directory(atlas._directory)
     assert {name: same_place(again.get("lab"), name) for name in EXPECTED} == EXPECTED
     again.close()
 
 
 @pytest.fixture
-def hall(atlas: Atlas) -> Map:
+def hall(atlas: Directory) -> Map:
     return atlas.create("hall", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
 
 

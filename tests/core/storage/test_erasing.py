@@ -14,12 +14,12 @@ from core.disk.files import write_at
 from core.errors import MapBusy
 from core.maps import MapSettings, PlaceFilter, ReviewSetting
 from core.maps.records import Enrolment
-from core.storage import Atlas, Map, erasing
+from core.store import Directory, Map, erasing
 from core.storage.files import segment_files
-from core.storage.files.row_formats import pack_descriptors, pack_local
+from core.maps.forms import pack_descriptors, pack_local
 from core.storage.files.segment_files import ERASING, HEADER_BYTES
 from core.storage.opening import open_map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.core.storage.search.test_tier_memory import become
 
 SETTING = ReviewSetting(most_frames=100, most_bytes=1 << 24)
@@ -60,14 +60,14 @@ def found(directory: Path, place_id: str) -> set[str]:
 
 
 @pytest.fixture
-def pictures(atlas: Atlas) -> Map:
+def pictures(atlas: Directory) -> Map:
     """Forty places in segments of four rows, with whole images."""
     made = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     made.enrol([pictured(f"p{i}", sequence="monday" if i % 4 else "tuesday") for i in range(40)])
     return made
 
 
-def test_nothing_of_a_deleted_place_is_left_in_any_file(pictures: Map, atlas: Atlas, directory: Path) -> None:
+def test_nothing_of_a_deleted_place_is_left_in_any_file(pictures: Map, atlas: Directory, directory: Path) -> None:
     assert any("descriptor" in one for one in found(directory, "p7"))
     assert any("picture" in one for one in found(directory, "p7"))
     pictures.forget("p7")
@@ -79,7 +79,7 @@ def test_nothing_of_a_deleted_place_is_left_in_any_file(pictures: Map, atlas: At
         assert {one.split()[0] for one in found(directory, beside)} == {"descriptor", "cells", "keypoints", "picture"}
     assert pictures.verify().ok and pictures.picture("p6") == picture_of("p6")
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     try:
         lab = again.get("lab")
         assert lab.verify().ok and lab.count_places() == 39
@@ -160,7 +160,7 @@ def test_a_reader_is_waited_for(pictures: Map, directory: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("stop_after", ["mark", "half"])
 def test_an_erasure_that_a_crash_ends_harms_nothing(
-    pictures: Map, atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch, stop_after: str
+    pictures: Map, atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch, stop_after: str
 ) -> None:
     """The record is marked and, in the second case, half of it is overwritten; the next erasure ends it."""
     pictures.forget("p7")
@@ -180,7 +180,7 @@ def test_an_erasure_that_a_crash_ends_harms_nothing(
         pictures.erase()
     monkeypatch.undo()
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     try:
         lab = again.get("lab")
         assert lab.verify().ok and lab.count_places() == 39
@@ -190,7 +190,7 @@ def test_an_erasure_that_a_crash_ends_harms_nothing(
         again.close()
 
 
-def test_a_living_place_whose_record_is_marked_is_damage(pictures: Map, atlas: Atlas, directory: Path) -> None:
+def test_a_living_place_whose_record_is_marked_is_damage(pictures: Map, atlas: Directory, directory: Path) -> None:
     layout = pictures._expect_open().layout
     atlas.close()
     assert layout.record.fields is not None

@@ -12,10 +12,10 @@ from core.geometry.keypoints import Keypoints
 from core.ledger.maps import frames
 from core.maps import Enrolment, SameFrame
 from core.places import PlaceFields
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.database.schema import driver_of
 from tests.core.storage.conftest import ROWS
-from tests.core.storage.frames import frame, keypoints_of
+from tests.core.store.frames import frame, keypoints_of
 
 
 def same(found: Keypoints | None, expected: Keypoints | None) -> bool:
@@ -39,12 +39,12 @@ def records(map_: Map) -> int:
         return frames.room(connection)[0]
 
 
-def test_they_are_read_in_the_order_of_the_rows_also_after_a_restart(atlas: Atlas, lab: Map) -> None:
+def test_they_are_read_in_the_order_of_the_rows_also_after_a_restart(atlas: Directory, lab: Map) -> None:
     lab.enrol([frame("a"), bare("b"), frame("c")])
     for map_ in (lab, None):
         if map_ is None:
             atlas.close()
-            atlas = Atlas(atlas._directory, rows_per_segment=ROWS)
+            atlas = Directory(atlas._directory, rows_per_segment=ROWS)
             map_ = atlas.get("lab")
         found = map_.keypoints_at([2, 1, 0, 7])
         expected = [keypoints_of("c"), None, keypoints_of("a"), None]
@@ -149,7 +149,7 @@ def test_those_of_no_place_are_reported(lab: Map) -> None:
     assert any("pictures or keypoints of 1 rows belong to no place" in problem for problem in lab.verify().problems)
 
 
-def test_the_status_of_a_map_counts_them(atlas: Atlas, lab: Map) -> None:
+def test_the_status_of_a_map_counts_them(atlas: Directory, lab: Map) -> None:
     assert lab.storage_status().keypoints is None, "the map was not read from disk"
     lab.enrol([frame("a"), frame("b"), bare("c")])
     size = sum(len(keypoints_of(name).record()) for name in "ab")

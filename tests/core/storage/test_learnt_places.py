@@ -11,8 +11,8 @@ import pytest
 from core.errors import LookNameTaken, TooManyLooks
 from core.maps import Enrolment
 from core.places import look_address
-from core.storage import Atlas, Map
-from tests.core.storage.frames import digest_of, frame
+from core.store import Directory, Map
+from tests.core.store.frames import digest_of, frame
 
 
 def learnt(place_id: str, run: str = "s-1", least: float | None = 0.25) -> Enrolment:
@@ -31,11 +31,11 @@ def test_they_go_with_their_run(lab: Map) -> None:
     assert lab.verify().ok
 
 
-def test_their_score_is_searched_with_and_survives(atlas: Atlas, directory: Path, lab: Map) -> None:
+def test_their_score_is_searched_with_and_survives(atlas: Directory, directory: Path, lab: Map) -> None:
     lab.enrol([frame("a"), learnt("b")])
     assert lab.snapshot().whereabouts.least.tolist() == [-np.inf, 0.25]
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     found = again.get("lab")
     assert found.snapshot().whereabouts.least.tolist() == [-np.inf, 0.25] and found.verify().ok
     assert found.forget_new_ground("s-1") == 1

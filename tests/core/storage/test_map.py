@@ -31,11 +31,11 @@ from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.database import connections
 from core.storage.database.schema import driver_of
 from tests.core.maps.mixed import POSES, both_kinds, check_one_kind_wins, posed
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
 
@@ -103,11 +103,11 @@ def test_a_geographic_pose_and_its_position(lab: Map) -> None:
     np.testing.assert_array_equal(there.position[0], pose.position())
 
 
-def test_a_height_on_the_earth_is_there_when_the_map_is_opened_again(atlas: Atlas, lab: Map, directory: Path) -> None:
+def test_a_height_on_the_earth_is_there_when_the_map_is_opened_again(atlas: Directory, lab: Map, directory: Path) -> None:
     poses = {"hill": Pose(latitude=48.9, longitude=2.35, z=130.5), "plain": Pose(latitude=48.8, longitude=2.35)}
     lab.enrol([replace(frame(name), fields=PlaceFields(pose=pose)) for name, pose in poses.items()])
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     try:
         map_ = again.get("lab")
         map_.open()
@@ -364,7 +364,7 @@ def test_a_sequence_is_forgotten_as_a_whole(lab: Map) -> None:
 CALIBRATION = Calibration(source="measured", threshold=3.0, margin=0.1, background_mean=0.1, background_deviation=0.02)
 
 
-def test_a_map_is_edited_by_revision(lab: Map, atlas: Atlas) -> None:
+def test_a_map_is_edited_by_revision(lab: Map, atlas: Directory) -> None:
     before = lab.record
     assert (before.revision, before.encoder, before.dimension, before.calibration) == (1, ENCODER, DIMENSION, None)
     after = lab.edit({"description": "x", "calibration": CALIBRATION}, expected_revision=1)
@@ -386,7 +386,7 @@ def photograph() -> bytes:
     return encode_png(cv2.blur(pixels, (31, 31)).astype(np.uint8))
 
 
-def test_the_stored_picture_of_a_frame(atlas: Atlas) -> None:
+def test_the_stored_picture_of_a_frame(atlas: Directory) -> None:
     hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     hall.enrol([frame("a")])
     assert hall.place("a").picture == "none"
@@ -408,7 +408,7 @@ def test_the_stored_picture_of_a_frame(atlas: Atlas) -> None:
         hall.thumbnail("b")
 
 
-def test_all_of_it_is_there_after_a_restart(lab: Map, atlas: Atlas, directory: Path) -> None:
+def test_all_of_it_is_there_after_a_restart(lab: Map, atlas: Directory, directory: Path) -> None:
     lab.enrol([frame(f"p{i}", sequence="s", x=i, metadata={"i": i}) for i in range(11)])
     lab.enrol([frame("p2", "other"), frame("p3", sequence="t")])
     lab.forget("p5")
@@ -417,7 +417,7 @@ def test_all_of_it_is_there_after_a_restart(lab: Map, atlas: Atlas, directory: P
     atlas.close()
     with pytest.raises(StorageFailure):
         lab.place("p1")
-    again = Atlas(directory)
+    again = Directory(directory)
     lab = again.get("lab")
     try:
         assert lab.places(None, 100) == places
@@ -443,7 +443,7 @@ def test_all_of_it_is_there_after_a_restart(lab: Map, atlas: Atlas, directory: P
         again.close()
 
 
-def test_a_deleted_map_answers_no_more(lab: Map, atlas: Atlas) -> None:
+def test_a_deleted_map_answers_no_more(lab: Map, atlas: Directory) -> None:
     lab.enrol([frame("p")])
     held = lab.snapshot()
     atlas.delete("lab")
@@ -492,11 +492,11 @@ def test_a_stored_picture_that_cannot_be_shown_is_no_thumbnail(lab: Map, content
 @pytest.mark.parametrize("name", ["..", ".", "\u202e", "\x85"])
 def test_a_sequence_of_an_older_map_keeps_its_name(directory: Path, name: str) -> None:
     """No sequence is given such a name any more; a map that has one is read, edited and emptied as ever."""
-    with closing(Atlas(directory)) as atlas:
+    with closing(Directory(directory)) as atlas:
         lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
         old = PlaceFields.model_construct(sequence=name)
         lab.enrol([replace(frame(one), fields=old) for one in ("p0", "p1", "p2")])
-    with closing(Atlas(directory)) as atlas:
+    with closing(Directory(directory)) as atlas:
         lab = atlas.get("lab")
         assert lab.verify().ok and [one.name for one in lab.sequences(None, 10)[0]] == [name]
         assert lab.patch("p0", {"pose": {"x": 1, "y": 2}}).sequence == lab.place("p1").sequence == name

@@ -15,8 +15,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from core.errors import UnknownPlace, UnknownSequence
 from core.places import PlaceFields, Pose
-from core.storage import Atlas
-from tests.core.storage.frames import (
+from core.store import Directory
+from tests.core.store.frames import (
     DIMENSION,
     ENCODER,
     LOCAL_SHAPE,
@@ -45,7 +45,7 @@ class MapHistory(RuleBasedStateMachine):
     @initialize()
     def start(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="placerec-history-"))
-        self.atlas = Atlas(self.folder / "data", rows_per_segment=3)
+        self.atlas = Directory(self.folder / "data", rows_per_segment=3)
         self.lab = self.atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
         self.model: dict[str, Known] = {}
         self.count = 0
@@ -129,7 +129,7 @@ class MapHistory(RuleBasedStateMachine):
     @rule()
     def restart(self) -> None:
         self.atlas.close()
-        self.atlas = Atlas(self.folder / "data", rows_per_segment=3)
+        self.atlas = Directory(self.folder / "data", rows_per_segment=3)
         self.lab = self.atlas.get("lab")
 
     @invariant()

@@ -13,9 +13,9 @@ import pytest
 from core.errors import MapQuarantined
 from core.ledger.maps import places
 from core.ledger.maps.places import token_of
-from core.storage import Atlas
+from core.store import Directory
 from core.storage.files.segment_files import HEADER_BYTES
-from tests.core.storage.frames import (
+from tests.core.store.frames import (
     DESCRIPTOR_BYTES,
     DIMENSION,
     ENCODER,
@@ -32,7 +32,7 @@ PLACES = 10  # two full segments of four rows and a tail of two
 @pytest.fixture
 def folder(directory: Path) -> Path:
     """Of a map of ten places, closed; beside it a map that must always serve."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("h")])
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
         [frame(f"p{i}", sequence="s" if i == PLACES - 1 else None) for i in range(PLACES)]
@@ -43,7 +43,7 @@ def folder(directory: Path) -> Path:
 
 def check(directory: Path) -> None:
     """All places are there, and found."""
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     try:
         lab = atlas.get("lab")
         assert [place.id for place in lab.places(None, 100)[0]] == [f"p{i}" for i in range(PLACES)]
@@ -96,17 +96,17 @@ def test_rows_that_nobody_named_are_cut_off(directory: Path, folder: Path) -> No
 def test_a_write_that_ended_before_its_commit_is_as_if_it_had_not_been(directory: Path, folder: Path) -> None:
     names = ("map.sqlite", "descriptors-000003.seg")
     before = {name: (folder / name).read_bytes() for name in names}
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.get("lab").enrol([frame(f"q{i}") for i in range(5)])  # fills the third segment, begins a fourth
     atlas.close()
     (folder / "map.sqlite").write_bytes(before["map.sqlite"])
     check(directory)
     assert (folder / "descriptors-000003.seg").read_bytes() == before["descriptors-000003.seg"]
     assert not (folder / "descriptors-000004.seg").exists()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.get("lab").enrol([frame(f"r{i}") for i in range(3)])
     atlas.close()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     assert atlas.get("lab").verify().stale_caches == []
     assert [place and place.id for place in atlas.get("lab").places_at([10, 11, 12])] == ["r0", "r1", "r2"]
     atlas.close()
@@ -212,7 +212,7 @@ def test_a_damaged_map_is_quarantined_and_the_others_serve(
     directory: Path, folder: Path, spoil: Callable[[Path], None], reason: str
 ) -> None:
     spoil(folder)
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     try:
         assert atlas.quarantined() == {}  # it is read on first use
         for _ in range(2):
@@ -231,14 +231,14 @@ def test_a_damaged_map_is_quarantined_and_the_others_serve(
 
 def test_an_index_of_metadata_that_is_wrong_is_rebuilt(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What places are found by follows from the places, and another SQLite may make it otherwise."""
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}", metadata={"floor": i, "note": "a"}) for i in range(3)])
     atlas.close()
     folder = directory / "maps" / "lab"
     run(folder, f"UPDATE tokens SET token = '{token_of('floor', 7)}' WHERE token = '{token_of('floor', 1)}'")
     run(folder, f"DELETE FROM tokens WHERE token = '{token_of('note', 'a')}' AND row = 2")
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     assert "is rebuilt" in caplog.text and "map lab" in caplog.text.lower()
     with lab._reading() as connection:
@@ -248,7 +248,7 @@ def test_an_index_of_metadata_that_is_wrong_is_rebuilt(directory: Path, caplog: 
     assert lab.verify().ok
     atlas.close()
     caplog.clear()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     atlas.get("lab")
     assert "is rebuilt" not in caplog.text
     atlas.close()

@@ -12,9 +12,9 @@ from core.ledger.maps import places
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace
 from core.places import PlaceFields, Pose
-from core.storage import Map
+from core.store import Map
 from core.storage.map import LONGEST_METADATA, MOST_RECENT, RecentPlaces
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 
 @contextmanager

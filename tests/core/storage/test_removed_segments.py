@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, UnknownPlace
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.database.connections import FILE
 from core.storage.database.schema import driver_of
 from core.storage.files.segment_files import segment_name
 from core.storage.opening import open_map
 from core.storage.removed_segments import RemovedSegments
-from core.storage.search.snapshot import Snapshot
-from tests.core.storage.frames import frame
+from core.store.snapshot import Snapshot
+from tests.core.store.frames import frame
 from tests.core.storage.search.test_tier_memory import become
 
 
@@ -45,7 +45,7 @@ def forget(lab: Map, *numbers: int) -> None:
         lab.forget(f"p{number}")
 
 
-def test_the_file_of_a_dead_segment_goes_and_the_rest_stays(three: Map, atlas: Atlas, directory: Path) -> None:
+def test_the_file_of_a_dead_segment_goes_and_the_rest_stays(three: Map, atlas: Directory, directory: Path) -> None:
     forget(three, 4, 5, 6)
     assert files(directory) == names(0, 1, 2)
     before = three.storage_status().descriptors
@@ -62,7 +62,7 @@ def test_the_file_of_a_dead_segment_goes_and_the_rest_stays(three: Map, atlas: A
 
     found = answers(three.snapshot())
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     assert answers(again.get("lab").snapshot()) == found
     assert again.get("lab").verify().ok
     again.get("lab").enrol([frame("newer"), frame("newest")])
@@ -104,7 +104,7 @@ def test_who_began_to_read_reads_to_the_end(three: Map, directory: Path, tier: s
     assert sorted(answers(three.snapshot())) == [4, 5, 6, 7, 8, 9, 10, 11]
 
 
-def test_other_tiers_do_without_the_rows(three: Map, atlas: Atlas, directory: Path) -> None:
+def test_other_tiers_do_without_the_rows(three: Map, atlas: Directory, directory: Path) -> None:
     forget(three, 0, 1, 2, 3)
     three.enrol([frame("new")])
     expected = answers(three.snapshot())
@@ -115,7 +115,7 @@ def test_other_tiers_do_without_the_rows(three: Map, atlas: Atlas, directory: Pa
     atlas.close()
     for cache in (directory / "maps/lab").glob("*.index"):
         cache.unlink()
-    again = Atlas(directory)
+    again = Directory(directory)
     become(again.get("lab"), "compact")
     assert answers(again.get("lab").snapshot()) == expected
     again.close()
@@ -128,14 +128,14 @@ def test_a_crash_before_the_file_goes_leaves_work_for_the_start(three: Map, dire
     shutil.copytree(directory, crashed)
     assert len(reading) == 10
     assert files(crashed) == names(0, 1, 2)
-    atlas = Atlas(crashed)
+    atlas = Directory(crashed)
     assert sorted(answers(atlas.get("lab").snapshot())) == [4, 5, 6, 7, 8, 9]
     assert files(crashed) == names(1, 2)
     assert atlas.get("lab").verify().ok
     atlas.close()
 
 
-def test_a_transaction_that_fails_takes_no_file(three: Map, atlas: Atlas, directory: Path) -> None:
+def test_a_transaction_that_fails_takes_no_file(three: Map, atlas: Directory, directory: Path) -> None:
     atlas.close()
     folder = directory / "maps/lab"
     opened, before = open_map(folder)
@@ -147,18 +147,18 @@ def test_a_transaction_that_fails_takes_no_file(three: Map, atlas: Atlas, direct
     removed_segments.clear(before)
     opened.database.close()
     assert files(directory) == names(0, 1, 2)
-    again = Atlas(directory)
+    again = Directory(directory)
     assert len(again.get("lab").snapshot()) == 10 and again.get("lab").verify().ok
     again.close()
 
 
-def test_places_are_never_given_up_for_a_flipped_bit(three: Map, atlas: Atlas, directory: Path) -> None:
+def test_places_are_never_given_up_for_a_flipped_bit(three: Map, atlas: Directory, directory: Path) -> None:
     atlas.close()
     connection = sqlite3.connect(directory / "maps/lab" / FILE)
     connection.execute("UPDATE segments SET removed = 1 WHERE number = 1")
     connection.commit()
     connection.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     with pytest.raises(MapQuarantined):
         again.get("lab").open()
     assert files(directory) == names(0, 1, 2)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from core.errors import StorageFailure, UnknownFrame, UnknownMap
 from core.maps import MapSettings, ReviewSetting
 from core.maps.review import StoredReviews
-from core.storage import Atlas
+from core.store import Directory
 from core.storage.review import FILE, ReviewFrames
 from core.storage.verification import inspect_folder
 from tests.core.maps.review import check_pages_are_of_one_moment
@@ -148,7 +148,7 @@ def test_a_damaged_file_is_put_aside_and_the_map_goes_on(tmp_path: Path) -> None
 
 def test_frames_of_another_map_are_not_shown(tmp_path: Path) -> None:
     """Two maps whose files change places, as a careless restore may do it."""
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     for name in ("lab", "hall"):
         review = atlas.create(name, ENCODER, 8, MapSettings(review=SETTING)).review
         assert review.keep(f"a frame of {name}".encode(), ANSWER, SETTING)
@@ -159,7 +159,7 @@ def test_frames_of_another_map_are_not_shown(tmp_path: Path) -> None:
         target.mkdir(exist_ok=True)
         (source / FILE).rename(target / FILE)
     aside.rmdir()
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     report = atlas.verify("lab")
     assert not report.ok and report.problems == [f"{FILE}: it belongs to the map 'hall'"]
     for name, folder in (("lab", lab), ("hall", hall)):
@@ -189,7 +189,7 @@ def test_a_file_that_names_no_map_yet_is_taken(tmp_path: Path, statement: str) -
 
 def test_verify_reads_the_frames(tmp_path: Path) -> None:
     """In service and out of it; nothing is mended by looking."""
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
     for number in range(4):
         assert map_.review.keep(bytes([number]) * 100, ANSWER, SETTING)
@@ -203,7 +203,7 @@ def test_verify_reads_the_frames(tmp_path: Path) -> None:
         f"{FILE}: frame 1 does not match its checksum",
         *(f"{FILE}: the picture of frame {number} does not match its digest" for number in (2, 3)),
     ]
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     assert atlas.verify("lab").problems == atlas.verify("lab").problems == found
     assert inspect_folder(path.parent).problems == found
     atlas.close()
@@ -213,7 +213,7 @@ def test_verify_reads_the_frames(tmp_path: Path) -> None:
 
 
 def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
     assert map_.review.keep(b"one", ANSWER, SETTING)
     folder = tmp_path / "data" / "maps" / "lab"
@@ -228,12 +228,12 @@ def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
 
 
 def test_the_setting_survives_a_restart(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     atlas.create("lab", ENCODER, 8)
     setting = ReviewSetting(verdicts=("recognized",), most_frames=7)
     assert atlas.get("lab").edit({"review": setting}).revision == 2
     atlas.close()
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     assert atlas.get("lab").record.review == setting
     assert atlas.get("lab").edit({"review": None}).review is None
     atlas.close()

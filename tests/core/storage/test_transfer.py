@@ -13,15 +13,15 @@ import pytest
 from core.maps import Enrolment, History, MapSettings
 from core.maps.records import MOST_LOOKS, Outline
 from core.places import PlaceFields, look_address
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
 EARLIER = datetime(2026, 1, 2, 3, 4, 5, 678, tzinfo=UTC)
 LATER = datetime(2026, 2, 3, tzinfo=UTC)
 
 
 @pytest.fixture
-def hall(atlas: Atlas) -> Map:
+def hall(atlas: Directory) -> Map:
     return atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
 
 
@@ -46,14 +46,14 @@ def test_a_place_comes_with_its_history(lab: Map, hall: Map) -> None:
     assert hall.verify().ok
 
 
-def test_what_is_searched_is_what_is_stored(atlas: Atlas, directory: Path, hall: Map) -> None:
+def test_what_is_searched_is_what_is_stored(atlas: Directory, directory: Path, hall: Map) -> None:
     items = [(frame(name, x=float(n), sequence="monday"), history(n * 10)) for n, name in enumerate("abcdefg")]
     hall.transfer.adopt(items)
     before = hall.snapshot().whereabouts
     assert before.ordinal.tolist() == [0, 10, 20, 30, 40, 50, 60]
     assert hall.verify().ok
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     after = again.get("hall").snapshot().whereabouts
     assert np.array_equal(after.ordinal, before.ordinal) and np.array_equal(after.position, before.position)
     again.close()

@@ -9,17 +9,17 @@ import pytest
 
 from core.disk import files as disk
 from core.errors import MapExists, StorageFailure, UnknownMap
-from core.storage import Atlas, Map
-from core.storage import atlas as storage_atlas
+from core.store import Directory, Map
+from core.store import atlas as storage_atlas
 from core.storage.opening import UNLISTED
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 
-def making(atlas: Atlas, map_id: str = "new") -> Map:
+def making(atlas: Directory, map_id: str = "new") -> Map:
     return atlas.create(map_id, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE, unlisted=True)
 
 
-def test_it_is_found_by_nobody_who_does_not_make_it(atlas: Atlas) -> None:
+def test_it_is_found_by_nobody_who_does_not_make_it(atlas: Directory) -> None:
     made = making(atlas)
     made.enrol([frame("a")])
     assert atlas.unlisted() == {"new": made}
@@ -29,7 +29,7 @@ def test_it_is_found_by_nobody_who_does_not_make_it(atlas: Atlas) -> None:
             action("new")
 
 
-def test_its_name_is_taken(atlas: Atlas, lab: Map) -> None:
+def test_its_name_is_taken(atlas: Directory, lab: Map) -> None:
     making(atlas)
     for unlisted in (True, False):
         for name in ("new", "lab"):
@@ -37,7 +37,7 @@ def test_its_name_is_taken(atlas: Atlas, lab: Map) -> None:
                 atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE, unlisted=unlisted)
 
 
-def test_publishing_lists_it_whole(atlas: Atlas, directory: Path) -> None:
+def test_publishing_lists_it_whole(atlas: Directory, directory: Path) -> None:
     made = making(atlas)
     made.enrol([frame(name) for name in "abcdef"])
     listed = atlas.publish("new")
@@ -53,10 +53,10 @@ def test_publishing_lists_it_whole(atlas: Atlas, directory: Path) -> None:
     assert os.listdir(directory / "maps") == ["new"]
 
 
-def test_a_restart_finds_it_as_it_was(atlas: Atlas, directory: Path) -> None:
+def test_a_restart_finds_it_as_it_was(atlas: Directory, directory: Path) -> None:
     making(atlas).enrol([frame("a")])
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     try:
         assert again.records(None, 10) == ([], None)
         (found,) = again.unlisted().values()
@@ -67,7 +67,7 @@ def test_a_restart_finds_it_as_it_was(atlas: Atlas, directory: Path) -> None:
         again.close()
 
 
-def test_abandoning_leaves_nothing(atlas: Atlas, directory: Path) -> None:
+def test_abandoning_leaves_nothing(atlas: Directory, directory: Path) -> None:
     made = making(atlas)
     made.enrol([frame("a")])
     atlas.abandon("new")
@@ -78,11 +78,11 @@ def test_abandoning_leaves_nothing(atlas: Atlas, directory: Path) -> None:
     atlas.create("new", ENCODER, DIMENSION)
 
 
-def test_one_that_a_crash_has_damaged_is_removed(atlas: Atlas, directory: Path) -> None:
+def test_one_that_a_crash_has_damaged_is_removed(atlas: Directory, directory: Path) -> None:
     making(atlas)
     atlas.close()
     (directory / "maps" / f"{UNLISTED}new" / "map.sqlite").write_bytes(b"torn" * 1000)
-    again = Atlas(directory)
+    again = Directory(directory)
     assert again.unlisted() == {} and again.quarantined() == {}
     assert os.listdir(directory / "maps") == []
     again.close()
@@ -93,7 +93,7 @@ def refuse(*_: object) -> None:
 
 
 def test_a_name_that_cannot_be_given_leaves_it_unlisted(
-    atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch
+    atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     making(atlas).enrol([frame("a")])
     for action in (atlas.publish, atlas.abandon):
@@ -106,7 +106,7 @@ def test_a_name_that_cannot_be_given_leaves_it_unlisted(
 
 
 def test_abandoning_is_for_good_before_anything_is_removed(
-    atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch
+    atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     making(atlas).enrol([frame("a")])
     seen: list[list[str]] = []

@@ -11,15 +11,15 @@ from core.errors import MapQuarantined
 from core.index.flat import vectors
 from core.ledger.maps import frames
 from core.maps import MapSettings
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.database.schema import driver_of
 from core.storage.files.segment_files import HEADER_BYTES
-from tests.core.storage.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
+from tests.core.store.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
 
 
 @pytest.fixture
-def hall(atlas: Atlas) -> Map:
+def hall(atlas: Directory) -> Map:
     """Ten places, one of them forgotten, in segments of four rows; images are kept."""
     hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     images = [f"image {i}".encode() for i in range(10)]
@@ -74,7 +74,7 @@ def test_a_flipped_bit_of_any_part_of_a_row_is_found(hall: Map, folder: Path) ->
     assert hall.verify().ok
 
 
-def test_many_damaged_rows_are_counted(atlas: Atlas, directory: Path) -> None:
+def test_many_damaged_rows_are_counted(atlas: Directory, directory: Path) -> None:
     atlas._rows_per_segment = 64
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}") for i in range(30)])
@@ -171,7 +171,7 @@ def test_rows_that_contradict_one_another(hall: Map, statement: str, problem: st
 
 def test_places_enrolled_meanwhile_are_not_in_the_report(hall: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     """The report is of the moment of the call, although writes go on."""
-    from core.storage import verification
+    from core.store import verification
 
     check_tables = verification._check_tables
 
@@ -212,7 +212,7 @@ def test_the_log_can_be_emptied_while_descriptors_are_read(hall: Map, folder: Pa
 
 def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None:
     """Verifying must not let SQLite take what is left of it: what was acknowledged would be gone at the next start."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     for name in ("a", "b", "c"):
         lab.enrol([frame(name)])
@@ -223,7 +223,7 @@ def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None
     flip(kept["map.sqlite-wal"], 32 + 24 + 5)
     before = {name: path.read_bytes() for name, path in kept.items()}
     for _ in range(2):
-        again = Atlas(crashed)
+        again = Directory(crashed)
         with pytest.raises(MapQuarantined):
             again.get("lab")
         report = again.verify("lab")
@@ -231,6 +231,6 @@ def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None
         again.close()
         assert {name: path.read_bytes() for name, path in kept.items()} == before
     flip(kept["map.sqlite-wal"], 32 + 24 + 5)  # as if put back from a backup
-    mended = Atlas(crashed)
+    mended = Directory(crashed)
     assert [place.id for place in mended.get("lab").places(None, 9)[0]] == ["a", "b", "c"]
     mended.close()

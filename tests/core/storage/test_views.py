@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from core.maps import History, MapSettings
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Map:
-    return Atlas(tmp_path, rows_per_segment=4).create("lab", ENCODER, DIMENSION, MapSettings(keep="none"), LOCAL_SHAPE)
+    return Directory(tmp_path, rows_per_segment=4).create("lab", ENCODER, DIMENSION, MapSettings(keep="none"), LOCAL_SHAPE)
 
 
 def ordinals(lab: Map) -> dict[str, int]:

@@ -17,8 +17,8 @@ from pathlib import Path
 from core.errors import PlacerecError
 from core.maps import MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from core.store import Directory, Map
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 LARGE = 4096
 """Dimension with which the descriptors are by far the most that is written."""
@@ -30,7 +30,7 @@ def acknowledge(text: str) -> None:
 
 def everything(directory: Path) -> None:
     """Every kind of write once or more."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     acknowledge("opened")
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     acknowledge("created map")
@@ -58,7 +58,7 @@ def everything(directory: Path) -> None:
     acknowledge("deleted")
     atlas.close()
     acknowledge("closed")
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     atlas.get("lab").enrol([frame("late")])
     acknowledge("enrolled after a restart")
     for i in range(300):  # as many pages as make SQLite move its log into the file
@@ -69,7 +69,7 @@ def everything(directory: Path) -> None:
 
 def fill(directory: Path) -> None:
     """Enrols until a limit on the size of files stops it; then shows that the map still works."""
-    atlas = Atlas(directory, rows_per_segment=1024)
+    atlas = Directory(directory, rows_per_segment=1024)
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
     refused = _until_refused(lab)
@@ -94,7 +94,7 @@ def _until_refused(lab: Map) -> str:
 
 def hold(directory: Path) -> None:
     """Keeps the data directory until standard input ends."""
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     acknowledge("holding")
     sys.stdin.read()
     atlas.close()
@@ -102,7 +102,7 @@ def hold(directory: Path) -> None:
 
 def keep_trying(directory: Path) -> None:
     """Enrols ten places one by one, telling of each whether it was taken."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     try:
         lab = atlas.get("lab")
     except PlacerecError:
@@ -127,7 +127,7 @@ def keep_trying(directory: Path) -> None:
 
 def die_at_refusal(directory: Path) -> None:
     """Enrols until the disk refuses, and is killed right then."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     lab = atlas.get("lab")
     for i in range(10):
         try:
@@ -139,7 +139,7 @@ def die_at_refusal(directory: Path) -> None:
 
 def die_at_refused_change(directory: Path) -> None:
     """Changes that append nothing, until the disk refuses one, and is killed right then."""
-    lab = Atlas(directory, rows_per_segment=4).get("lab")
+    lab = Directory(directory, rows_per_segment=4).get("lab")
     changes: list[Callable[[], object]] = [
         lambda: lab.edit({"description": "edited"}),
         lambda: lab.forget_sequence("monday"),  # a whole segment

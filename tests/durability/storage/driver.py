@@ -26,11 +26,11 @@ from core.errors import PlacerecError
 from core.frames.masks import Mask
 from core.maps import Correspondence, Enrolment, History, MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, opening
+from core.store import Directory, opening
 from core.storage.database import connections as database
-from core.storage.files.row_formats import inner_products, pack_descriptors
+from core.maps.forms import inner_products, pack_descriptors
 from core.storage.search import index_files, recall
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, keypoints_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, keypoints_of
 from tests.durability.contents import contents, map_contents
 from tests.durability.storage.operations import Operation, enrolment, look_enrolment, pictures
 
@@ -79,7 +79,7 @@ class Storage:
         self._open()
 
     def _open(self) -> None:
-        self._atlas = Atlas(self._directory, rows_per_segment=ROWS_PER_SEGMENT)
+        self._atlas = Directory(self._directory, rows_per_segment=ROWS_PER_SEGMENT)
 
     def do(self, operation: Operation) -> Answer:
         """The answer to an operation, or the name of the error that it met."""

@@ -14,8 +14,8 @@ import numpy as np
 from core.maps import Enrolment, MapSettings
 from core.maps.records import Precision
 from core.places import PlaceFields, look_address
-from core.storage.files.row_formats import pack_descriptors, pack_local, unpack_descriptors, unpack_local
-from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, keypoints_of, local_of
+from core.maps.forms import pack_descriptors, pack_local, unpack_descriptors, unpack_local
+from tests.core.store.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, keypoints_of, local_of
 from tests.durability.contents import sha
 from tests.durability.model import MapModel, Refused, Shown, World
 

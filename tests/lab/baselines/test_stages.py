@@ -16,7 +16,7 @@ from core.places import PlaceFields
 from core.recognition.question import Question, Verify
 from core.recognition.recognition import enrol, recognize
 from core.recognition.verification import CANDIDATES
-from core.storage import Atlas
+from core.store import Directory
 from lab.baselines.encoders import EncoderSystem
 from lab.baselines.registry import build, systems
 from lab.baselines.stages import VerifiedSystem, keypoints_in
@@ -102,7 +102,7 @@ def test_a_default_encoder_is_judged_by_what_the_service_answers(
     assert isinstance(system, EncoderSystem) and system.identity == encoder.identity
     places = [jpeg(seed) for seed in (0, 1, 2, 3, 4, 5, 0)]
     queries = [encoded(seen_again(scene(seed))) for seed in (0, 3)] + [jpeg(40)]
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     for number, picture in enumerate(places):
         enrol(lab, f"p{number}", picture, encoder, PlaceFields(sequence="walk"))

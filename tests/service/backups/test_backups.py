@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from core.maps import Map
+from core.store import Map
 from core.maps.archives.reading import Archive, check
 from service.app.runtime import Runtime
 from service.backups.backups import AGAIN, PATIENCE, SETTLED, Backups

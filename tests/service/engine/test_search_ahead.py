@@ -18,7 +18,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
-from core.storage import Map
+from core.store import Map
 from core.threads import allowed_threads
 from service.engine import searches
 from service.engine.encoder_threads import EncoderThreads

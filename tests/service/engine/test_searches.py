@@ -17,7 +17,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from service.engine import searches
 from service.engine.searches import MOST_TOGETHER, Searches
 from tests.service.scenes import scene, seen_again
@@ -45,7 +45,7 @@ def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 @contextmanager
 def map_of_scenes(encoder: Encoder, folder: Path, count: int) -> Iterator[Map]:
     """So many scenes as the places p0, p1, …"""
-    atlas = Atlas(folder / "data")
+    atlas = Directory(folder / "data")
     made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     encodings = encoder.encode_batch([scene(seed) for seed in range(count)])
     made.enrol([enrolment(seed, encoding) for seed, encoding in enumerate(encodings)])

@@ -396,10 +396,10 @@ def test_the_files_of_a_job_are_discarded_however_it_ends(running: Running, tmp_
 
 
 def test_a_job_fails_if_its_map_was_replaced(running: Running, tmp_path: Path) -> None:
-    from core.storage import Atlas
+    from core.store import Directory
     from service.jobs.context import creation_time
 
-    atlas, gate = Atlas(tmp_path / "data"), threading.Event()
+    atlas, gate = Directory(tmp_path / "data"), threading.Event()
     lab = atlas.create("lab", "some@" + "0" * 64, 8)
 
     def look(context: JobContext) -> dict[str, Any]:

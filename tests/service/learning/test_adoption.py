@@ -12,12 +12,13 @@ import pytest
 
 from core.errors import TooManyLooks
 from core.frames.images import decode
-from core.maps import Enrolment, LearningSetting, Map, MapSettings, ReviewSetting
+from core.maps import Enrolment, LearningSetting, MapSettings, ReviewSetting
+from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, look_address
 from core.recognition.recognition import describe
-from core.storage import Atlas
+from core.store import Directory
 from service.engine.encoders import Encoded
 from service.learning.adoption import NOTHING, Adoption, Took, WaitingFrame, graph_of, waiting_frames
 from tests.service.scenes import jpeg
@@ -40,7 +41,7 @@ class Hall:
     """A map of four places, a proposal for ``p1`` that waits, and what takes it."""
 
     def __init__(self, folder: Path, encoder: Encoder) -> None:
-        self.atlas, self.encoder = Atlas(folder), encoder
+        self.atlas, self.encoder = Directory(folder), encoder
         settings = MapSettings(keep="none", verification=False)
         local, width = encoder.local_shape, encoder.dimension
         self.map: Map = self.atlas.create("hall", encoder.identity, width, settings, local_shape=local)

@@ -10,7 +10,8 @@ from threading import Thread
 import pytest
 
 from core.errors import UnknownStretch
-from core.maps import Map, ReviewSetting
+from core.store import Map
+from core.maps import ReviewSetting
 from core.maps.records import MOST_POSES, MOST_REJECTED
 from core.places import Pose
 from service.app.runtime import Runtime

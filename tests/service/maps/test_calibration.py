@@ -12,7 +12,7 @@ import pytest
 from core.errors import RevisionMismatch
 from core.judgement.trials import Trials, gathered
 from core.judgement.verdict import Calibration
-from core.storage import Map
+from core.store import Map
 from service.maps import calibration
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from tests.service.engines import ENCODER, end_of, runtime_at

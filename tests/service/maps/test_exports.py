@@ -17,7 +17,7 @@ from starlette.types import Message
 from core.errors import StorageFull
 from core.maps import MapSettings
 from core.maps.archives.writing import Advance, Expect, Exported
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from service.errors.faults import RangeNotSatisfiable, TooManyExports
 from service.maps.exports import FOLDER, Export, ExportResponse, Exports
 from service.places.staging import RESERVE
@@ -76,7 +76,7 @@ Run = Callable[[Work], None]
 def run(tmp_path: Path) -> Iterator[Run]:
     """Runs a test on an event loop."""
     settings = Settings(data_dir=tmp_path / "data", max_exports=2)
-    atlas, maps = Atlas(settings.data_dir), {}
+    atlas, maps = Directory(settings.data_dir), {}
     for name in ("a", "b", "c"):
         maps[name] = atlas.create(name, ENCODER, 8, MapSettings(keep="none"))
         maps[name].enrol(enrolments(1, 3, "p", "monday"))

@@ -13,7 +13,8 @@ from fastapi.testclient import TestClient
 
 from core.judgement.trials import StagedTrials, Trials
 from core.learning import Witness
-from core.maps import Enrolment, Map, ReviewSetting
+from core.maps import Enrolment, ReviewSetting
+from core.store import Map
 from core.places import PlaceFields
 from service.access.audit import ASKER
 from service.app.application import create_app

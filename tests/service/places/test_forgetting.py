@@ -11,8 +11,8 @@ import pytest
 from core.errors import InvalidCursor, TooManyToDelete
 from core.maps import MapSettings
 from core.maps.place_filter import PlaceFilter
-from core.storage import Atlas
-from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, frame
+from core.store import Directory
+from tests.core.store.frames import DIMENSION, LOCAL_SHAPE, frame
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 
@@ -121,7 +121,7 @@ def test_what_does_not_say_which_is_refused(server: Server, filled: str) -> None
 
 
 def test_more_than_may_be_forgotten_at_once_are_all_kept(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame(f"p{number}", sequence="s") for number in range(5)])
     wanted = PlaceFilter(sequence="s")

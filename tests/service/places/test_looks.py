@@ -15,7 +15,8 @@ from core.frames.images import decode
 from core.judgement.trials import StagedTrials, Trial, gathered
 from core.judgement.verdict import Judgement
 from core.learning import Witness
-from core.maps import Enrolment, Map
+from core.maps import Enrolment
+from core.store import Map
 from core.maps.records import MOST_LOOKS
 from core.places import PlaceFields, look_address
 from service.app.application import create_app

@@ -12,12 +12,12 @@ import pytest
 
 from core.ledger.maps import places
 from core.maps import MapSettings
-from core.maps.store import HANDED_OVER, HAS_PICTURE
-from core.storage import Atlas
+from core.ledger.maps.plan import HANDED_OVER, HAS_PICTURE
+from core.store import Directory
 from service.errors.faults import PlanTooLarge
 from service.http.headers import accepts_gzip
 from service.places import plans
-from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, frame
+from tests.core.store.frames import DIMENSION, LOCAL_SHAPE, frame
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 
@@ -102,7 +102,7 @@ def test_what_a_header_allows() -> None:
 def test_a_plan_that_is_too_long_names_a_step(
     server: Server, map_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame(f"p{number}") for number in range(7)])
     monkeypatch.setattr(plans, "MOST_PLACES", 3)
@@ -121,7 +121,7 @@ def test_a_plan_that_is_too_long_names_a_step(
 
 
 def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame("p0"), frame("p1")])
     with lab._writing() as write:
@@ -132,7 +132,7 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
 
 
 def test_only_the_plans_that_were_requested_last_are_cached(tmp_path: Path) -> None:
-    atlas = Atlas(tmp_path)
+    atlas = Directory(tmp_path)
     lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
     made, steps = plans.Plans(), range(1, plans.MOST_CACHED + 3)
     for step in steps:

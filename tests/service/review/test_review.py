@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from core.maps import MapSettings, ReviewSetting
-from core.storage import Atlas
+from core.store import Directory
 from service.access.keys import Keys
 from service.engine.review_keeper import MOST_WAITING, ReviewKeeper
 from tests.service.encoders import COARSE, install_coarse_encoder
@@ -293,7 +293,7 @@ def test_review_needs_the_role_enrol(tmp_path: Path) -> None:
 
 
 def test_more_frames_than_can_be_written_are_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=ReviewSetting()))
     gate, keep = threading.Event(), map_.review.keep
     monkeypatch.setattr(map_.review, "keep", lambda *given: gate.wait(60) and keep(*given))

@@ -16,7 +16,8 @@ from sqlalchemy import update
 from core.errors import StorageFailure
 from core.learning import Witness
 from core.ledger import Statement
-from core.maps import Map, MapSettings
+from core.store import Map
+from core.maps import MapSettings
 from core.places import PlaceFields, Pose
 from service.access.audit import ASKER
 from service.app.runtime import Runtime

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from core.ledger.postgres import PostgresLedger
-from core.maps import AlarmSetting, Map
+from core.maps import AlarmSetting
+from core.store import Map
 from core.upkeep.histories import PlacePeriod
 from service.app.runtime import Runtime
 from service.events.schemas import AlarmEvent, Event

@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.ledger.maps.counterparts import Counterparts
-from core.maps import Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.store import Map
 from core.maps.records import LearningSetting
 from core.places import PlaceFields, Pose
 from service.app.runtime import Runtime

@@ -14,7 +14,8 @@ from core.belief.evidence import NOTHING
 from core.judgement.trials import StagedTrials, Trial, gathered
 from core.judgement.verdict import Judgement
 from core.learning import RunFrame, Witness
-from core.maps import Map, ReviewSetting
+from core.store import Map
+from core.maps import ReviewSetting
 from core.maps.records import Enrolment
 from core.places import PlaceFields, look_address
 from service.access.audit import ASKER

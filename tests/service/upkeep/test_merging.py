@@ -21,7 +21,7 @@ from core.ledger.maps.transfer import Transfer
 from core.maps import Enrolment, MapSettings
 from core.maps.records import MOST_LOOKS
 from core.places import PlaceFields, look_address
-from core.storage import Atlas
+from core.store import Directory
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.context import creation_time
@@ -462,7 +462,7 @@ def test_it_does_not_go_on_into_another_map_of_the_same_id(
         after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
         wait_until(lambda: runtime.jobs.stopping)
-    atlas = Atlas(folder / "data")
+    atlas = Directory(folder / "data")
     atlas.delete(which)
     atlas.create(which, ENCODER, 8).enrol(enrolments(8000, 3, "n", "monday"))
     atlas.close()

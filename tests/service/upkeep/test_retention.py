@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from core.errors import NoThumbnail, StorageFailure
-from core.maps import Map, ReviewSetting
+from core.store import Map
+from core.maps import ReviewSetting
 from core.places import look_address
 from service.access.audit import LOGGER
 from service.administration.audit_trail import AuditTrail, audit_trail

@@ -9,7 +9,7 @@ from core.ledger.maps import schema
 from core.ledger.maps.connection import MapConnection
 from tests.core.ledger.conftest import OpenLedger
 from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 TABLES = Tables("map", 1, schema.METADATA, application_id=0x504C5243)
 

@@ -20,7 +20,7 @@ from core.ledger.maps.record import MapState
 from core.ledger.maps.schema import MAPS, METADATA
 from core.ledger.maps.writing import Descriptors, Write
 from core.maps.records import Enrolment, MapRecord
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 
 _CONTENT = {
     name: Statement(select(table).where((table.c.number if table is MAPS else table.c.map) == bindparam("map")))

@@ -21,7 +21,7 @@ from core.maps.counterparts import Correspondence
 from core.places import PlaceFields, Pose
 from tests.core.ledger.maps.memory import MOMENT, MemoryMap
 from tests.core.maps.mixed import both_kinds
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 MASK = Mask(polygons=(((0, 0), (0.25, 0), (0, 0.25)),))
 LENS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)

@@ -15,7 +15,7 @@ from core.ledger.maps.schema import PLACES
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, PlaceFields, Pose, microseconds
 from tests.core.ledger.maps.memory import MemoryMap
 from tests.core.maps.mixed import both_kinds
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 FIELDS = [
     PlaceFields(),

@@ -9,7 +9,7 @@ from core.maps import SameFrame
 from core.places import PlaceFields, Pose
 from tests.core.ledger.maps.memory import MemoryMap
 from tests.core.maps.mixed import POSES, both_kinds, posed
-from tests.core.storage.frames import digest_of, frame
+from tests.core.store.frames import digest_of, frame
 
 METRES, DEGREES = POSES
 

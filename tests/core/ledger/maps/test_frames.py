@@ -14,7 +14,7 @@ from core.ledger import Statement
 from core.ledger.maps import frames
 from core.ledger.maps.schema import KEYPOINTS, PICTURES, PLACES
 from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.storage.frames import frame, keypoints_of
+from tests.core.store.frames import frame, keypoints_of
 
 _K, _P = KEYPOINTS.c, PICTURES.c
 PUT = Statement(

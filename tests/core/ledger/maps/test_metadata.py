@@ -21,7 +21,7 @@ from core.ledger.sqlite import SqliteConnection
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import PlaceFields
 from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 scalars = st.one_of(
     st.none(),

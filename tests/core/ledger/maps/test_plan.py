@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 from typing import Any
 
 from core.maps.counterparts import Correspondence
-from core.maps.store import HANDED_OVER, HAS_PICTURE
+from core.ledger.maps.plan import HANDED_OVER, HAS_PICTURE
 from core.places import PlaceFields, Pose
 from tests.core.ledger.maps.memory import MemoryMap
 from tests.core.maps.mixed import both_kinds
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 
 def plan_of(lab: MemoryMap, step: int = 1) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from core.ledger.maps import record, sequences
 from core.ledger.maps.connection import MapConnection
 from core.ledger.postgres import PostgresConnection
 from tests.core.ledger.maps.memory import MemoryMap, record_of
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from core.ledger.maps.schema import MAPS, PLACES, SEQUENCES
 from core.maps.counterparts import Correspondence
 from core.places import NO_SEQUENCE, PlaceFields
 from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 
 def code_of(lab: MemoryMap, name: str) -> int:

@@ -11,7 +11,7 @@ from core.ledger.maps import sequences
 from core.ledger.maps.schema import SEQUENCES
 from core.maps.place_filter import PlaceFilter
 from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 CAFE = "Café"
 OLD = Statement(

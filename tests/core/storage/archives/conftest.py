@@ -8,10 +8,10 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.maps import Correspondence, Enrolment, MapSettings
 from core.places import PlaceFields, Pose, PoseAccuracy
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from tests.core.maps.mixed import both_kinds
 from tests.core.storage.archives.files import exported
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 ACCURACY = PoseAccuracy(metres=0.5, degrees=2.0)
 
@@ -56,7 +56,7 @@ def full(lab: Map) -> Map:
 def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The file of such a map."""
     folder = tmp_path_factory.mktemp("content")
-    atlas = Atlas(folder / "data", rows_per_segment=4)
+    atlas = Directory(folder / "data", rows_per_segment=4)
     lab = filled(atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE))
     try:
         return exported(lab, folder / "kept")

@@ -15,9 +15,9 @@ from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.manifest import seal_of
 from core.maps.archives.reading import Archive
 from core.maps.archives.tar_layout import header, padded
-from core.storage import Map
+from core.store import Map
 from core.storage.archives.building import build
-from core.storage.atlas import Atlas
+from core.store.directory import Directory
 
 Parts = dict[str, bytes]
 
@@ -95,7 +95,7 @@ def _peak() -> int:
 
 
 def imported(
-    atlas: Atlas, path: Path, map_id: str, rows_per_segment: int = 4, most_picture_bytes: int = MOST_PICTURE_BYTES
+    atlas: Directory, path: Path, map_id: str, rows_per_segment: int = 4, most_picture_bytes: int = MOST_PICTURE_BYTES
 ) -> Map:
     """The map of a file, listed."""
     with Archive(path) as archive, atlas.building(map_id) as folder:

@@ -15,13 +15,13 @@ from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExis
 from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive
 from core.places import look_address
-from core.storage import Atlas
+from core.store import Directory
 from core.storage.archives import unpacking
 from core.storage.archives.building import build
-from core.storage.archives.unpacking import layout_of
+from core.maps.archives.unpacking import layout_of
 from core.storage.files import segment_files as descriptors
 from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
-from tests.core.storage.frames import DIMENSION, ENCODER, digest_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, digest_of, frame
 
 Made = Callable[[bytes], bytes]
 PLACES, FRAMES, PICTURES = "places-000001.jsonl", "descriptors-000001.bin", "pictures-000001.bin"
@@ -182,13 +182,13 @@ def left_behind(directory: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Atlas:
-    return Atlas(tmp_path_factory.mktemp("library") / "data", rows_per_segment=4)
+def library(tmp_path_factory: pytest.TempPathFactory) -> Directory:
+    return Directory(tmp_path_factory.mktemp("library") / "data", rows_per_segment=4)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("case", HOSTILE)
-def test_hostile_contents_are_refused(content: bytes, library: Atlas, tmp_path: Path, case: str) -> None:
+def test_hostile_contents_are_refused(content: bytes, library: Directory, tmp_path: Path, case: str) -> None:
     make, complaint = HOSTILE[case]
     path = tmp_path / "sent.tar"
     path.write_bytes(make(content))
@@ -197,7 +197,7 @@ def test_hostile_contents_are_refused(content: bytes, library: Atlas, tmp_path: 
     assert left_behind(library._directory) == [] and library.records(None, 10) == ([], None)
 
 
-def test_the_cases_are_refused_for_nothing_else(content: bytes, library: Atlas, tmp_path: Path) -> None:
+def test_the_cases_are_refused_for_nothing_else(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(place(metadata={"changed": True})(content))
     made = imported(library, path, "another")
@@ -206,7 +206,7 @@ def test_the_cases_are_refused_for_nothing_else(content: bytes, library: Atlas, 
     library.delete("another")
 
 
-def test_pictures_can_be_looked_at(content: bytes, library: Atlas, tmp_path: Path) -> None:
+def test_pictures_can_be_looked_at(content: bytes, library: Directory, tmp_path: Path) -> None:
     def refuse(data: bytes) -> None:
         raise InvalidImage("no picture at all")
 
@@ -221,7 +221,7 @@ def test_pictures_can_be_looked_at(content: bytes, library: Atlas, tmp_path: Pat
     assert left_behind(library._directory) == []
 
 
-def test_large_pictures_are_not_even_read(content: bytes, library: Atlas, tmp_path: Path) -> None:
+def test_large_pictures_are_not_even_read(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
     with (
@@ -251,7 +251,7 @@ def test_places_that_nothing_could_hold(content: bytes, values: dict[str, Any], 
 
 
 def test_it_can_be_broken_off_among_the_sequences(
-    content: bytes, library: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    content: bytes, library: Directory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def advance(done: int, total: int) -> None:
         raise KeyboardInterrupt(f"{done} of {total}")
@@ -265,7 +265,7 @@ def test_it_can_be_broken_off_among_the_sequences(
 
 
 def test_few_long_lines_are_held_at_a_time(
-    content: bytes, library: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    content: bytes, library: Directory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(unpacking, "TEXT_BYTES", 4500)
     path, seen = tmp_path / "sent.tar", []
@@ -278,7 +278,7 @@ def test_few_long_lines_are_held_at_a_time(
     library.delete("long")
 
 
-def test_the_id_is_taken_while_it_is_built(content: bytes, library: Atlas, tmp_path: Path) -> None:
+def test_the_id_is_taken_while_it_is_built(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
     gives_up = RuntimeError("no more of this")
@@ -303,7 +303,7 @@ def test_nothing_of_it_is_seen_before_it_is_whole(
     monkeypatch.setattr(unpacking, "CHUNK_BYTES", 1)
     path, directory = tmp_path / "sent.tar", tmp_path / "data"
     path.write_bytes(content)
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     seen = []
 
     def advance(done: int, total: int) -> None:
@@ -313,7 +313,7 @@ def test_nothing_of_it_is_seen_before_it_is_whole(
             atlas.close()  # as if the process ended: nothing of the building can be undone
             left = left_behind(directory)
             assert len(left) == 1 and left[0].startswith(".making-lab-")
-            again = Atlas(directory)
+            again = Directory(directory)
             assert left_behind(directory) == [] and again.quarantined() == {}
             again.close()
             raise KeyboardInterrupt
@@ -326,7 +326,7 @@ def test_nothing_of_it_is_seen_before_it_is_whole(
 def test_a_full_disk_leaves_nothing(content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
 
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -365,7 +365,7 @@ def test_a_file_of_old_gives_its_texts_their_one_form(
         parts[PLACES] = changed.replace('"ä"'.encode(), b"%b: 1, %b" % ('"ä"'.encode(), letter), 1)
 
     path.write_bytes(changed(content, edit))
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     made = imported(atlas, path, "old")
     assert made.verify().ok
     names = {one.name: one.places for one in made.sequences(None, 9)[0]}
@@ -387,7 +387,7 @@ def test_a_file_of_old_has_no_levels_but_those_of_its_metadata(content: bytes, t
 
     path = tmp_path / "old.tar"
     path.write_bytes(changed(content, edit))
-    atlas = Atlas(tmp_path / "data")
+    atlas = Directory(tmp_path / "data")
     made = imported(atlas, path, "old")
     assert made.verify().ok
     places = made.places(None, 99)[0]
@@ -396,7 +396,7 @@ def test_a_file_of_old_has_no_levels_but_those_of_its_metadata(content: bytes, t
     assert all(place.pose_accuracy is None for place in places)
 
 
-def test_a_flipped_bit_anywhere_makes_no_map(content: bytes, library: Atlas, tmp_path: Path) -> None:
+def test_a_flipped_bit_anywhere_makes_no_map(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     for at in range(7, len(content), len(content) // 37):
         path.write_bytes(content[:at] + bytes([content[at] ^ (1 << at % 8)]) + content[at + 1 :])

@@ -17,13 +17,13 @@ from core.ledger.maps.connection import MapConnection
 from core.maps import MapSettings, ReviewSetting
 from core.maps.archives import writing
 from core.places import Neighborhood
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
 from core.storage.database.schema import driver_of
-from core.storage.files.row_formats import COMPRESSED, HALF
+from core.maps.forms import COMPRESSED, HALF
 from tests.core.storage.archives.files import exported, imported, parts_of
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 from tests.core.storage.test_opening import flip
 
 
@@ -45,7 +45,7 @@ def same_place(map_: Map, place_id: str) -> list[str]:
 
 @pytest.mark.parametrize("kind", ["of everything", "compressed", "without local descriptors"])
 def test_what_comes_back_is_what_was_there(
-    atlas: Atlas, tmp_path: Path, kind: str, request: pytest.FixtureRequest
+    atlas: Directory, tmp_path: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:
     if kind == "of everything":
         source = request.getfixturevalue("full")
@@ -56,7 +56,7 @@ def test_what_comes_back_is_what_was_there(
         source.forget("p2")
     path = tmp_path / "lab.tar"
     path.write_bytes(exported(source, tmp_path / "kept"))
-    other = Atlas(tmp_path / "other")
+    other = Directory(tmp_path / "other")
     copy = imported(other, path, "lab", rows_per_segment=3)
     assert copy.record == source.record and listed(copy) == listed(source)
     for place in source.places(None, 100)[0]:
@@ -123,7 +123,7 @@ def test_segments_of_which_nothing_lives_any_more(
     assert not (directory / "maps" / "lab" / "descriptors-000001.seg").exists()
     path = tmp_path / "after.tar"
     path.write_bytes(exported(full, tmp_path / "after"))
-    other = Atlas(tmp_path / "other")
+    other = Directory(tmp_path / "other")
     copy = imported(other, path, "lab")
     assert listed(copy) == listed(full) and copy.verify().ok
     other.close()
@@ -139,7 +139,7 @@ def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert joined == parts_of(whole)[1]["descriptors-000001.bin"]
     path = tmp_path / "grouped.tar"
     path.write_bytes(grouped)
-    other = Atlas(tmp_path / "other")
+    other = Directory(tmp_path / "other")
     assert exported(imported(other, path, "lab"), tmp_path / "again") == grouped
     other.close()
 
@@ -168,7 +168,7 @@ def test_enrolment_goes_on_while_it_is_read(full: Map, tmp_path: Path) -> None:
 
 
 def test_a_map_that_is_deleted_does_not_wait_for_its_export(
-    full: Map, atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    full: Map, atlas: Directory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writing, "PLACES_PER_GROUP", 2)
     going = threading.Event()
@@ -245,9 +245,9 @@ def test_damage_is_found_and_not_exported(full: Map, directory: Path, tmp_path: 
     assert list(tmp_path.glob("*.tar")) == []
 
 
-def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, atlas: Atlas, tmp_path: Path) -> None:
+def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, atlas: Directory, tmp_path: Path) -> None:
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     found = again.find("lab")
     assert found.exporter.state() is None
     assert exported(found, tmp_path / "kept") and isinstance(found.exporter, Exporter)

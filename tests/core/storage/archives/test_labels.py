@@ -13,10 +13,10 @@ from core.errors import InvalidArchive
 from core.judgement.verdict import Verdict
 from core.maps import ReviewSetting
 from core.maps.archives.manifest import LABELLED, LABELS, VERSION, WITHOUT_LABELS
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.database.schema import driver_of
 from tests.core.storage.archives.files import Parts, changed, exported, imported, line_changed, parts_of
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 SETTING = ReviewSetting(verdicts=("unknown",), most_frames=20)
 SAID = {"at": "2026-11-28T10:00:00.250000+00:00", "by": "ann"}
@@ -55,7 +55,7 @@ def copied(content: bytes, folder: Path) -> Map:
     folder.mkdir()
     path = folder / "sent.tar"
     path.write_bytes(content)
-    return imported(Atlas(folder / "data"), path, "copy", rows_per_segment=4)
+    return imported(Directory(folder / "data"), path, "copy", rows_per_segment=4)
 
 
 def test_labels_and_the_setting_come_back(reviewed: Map, tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_what_is_no_label_is_refused(reviewed: Map, tmp_path: Path, change: Call
     path = tmp_path / "other/sent.tar"
     path.write_bytes(change(content))
     with pytest.raises(InvalidArchive, match=why):
-        imported(Atlas(tmp_path / "other/data"), path, "copy", most_picture_bytes=1000)
+        imported(Directory(tmp_path / "other/data"), path, "copy", most_picture_bytes=1000)
 
 
 def test_the_lines_are_plain_json(reviewed: Map, tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from core.maps import SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.maps.selection import Conditions, RecentFrames, Selection
 from core.places import PlaceFields
-from core.storage import Map
+from core.store import Map
 from core.storage.database.schema import driver_of
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
 LAST = RecentFrames("s", 3)

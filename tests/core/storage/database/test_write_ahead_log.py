@@ -11,7 +11,7 @@ import pytest
 
 from core.disk.files import Damage
 from core.storage.database.connections import FILE
-from core.storage.database.write_ahead_log import check_log
+from core.disk.write_ahead_log import check_log
 
 FRAME = 24 + 4096
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from core.index.flat import vectors
-from core.storage import Atlas
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, local_of, stored_of
+from core.store import Directory
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, local_of, stored_of
 from tests.syscalls import strace
 
 REPOSITORY = Path(__file__).parents[4]
@@ -45,7 +45,7 @@ def run(action: str, directory: Path, call: str, error: str, when: str) -> subpr
     ],
 )
 def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call: str, error: str, when: str) -> None:
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(2)])
     atlas.close()
 
@@ -60,7 +60,7 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
     assert answer["searched"] == 2 + len(taken)
     assert answer["problems"] == []
 
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     assert [place.id for place in lab.places(None, 100)[0]] == ["p0", "p1", *taken]
     for row, name in enumerate(["p0", "p1", *taken]):
@@ -75,13 +75,13 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
 @pytest.mark.parametrize("when", ["3", "4", "5"])
 def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Path, when: str) -> None:
     """Its frames are in SQLite's log, whole: only their sync failed."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     finished = run("die-at-refusal", directory, "fdatasync", "EIO", when)
     assert finished.returncode in (-9, 137), finished.stderr.decode()
     taken = [line.removeprefix("ack ") for line in finished.stdout.decode().splitlines()]
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     assert [place.id for place in lab.places(None, 100)[0]] == taken
     assert lab.verify().ok
@@ -94,7 +94,7 @@ def test_a_change_that_was_refused_does_not_come_true_with_a_crash(
     directory: Path, call: str, before: list[str]
 ) -> None:
     """A deletion that gives a segment back, a patch: nothing is appended, but SQLite's log has their frames."""
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}", sequence="monday" if i < 4 else "tuesday") for i in range(6)])
     atlas.close()
@@ -102,7 +102,7 @@ def test_a_change_that_was_refused_does_not_come_true_with_a_crash(
     assert finished.returncode in (-9, 137), finished.stderr.decode()
     taken = [line.removeprefix("ack ") for line in finished.stdout.decode().splitlines()]
     assert taken == before
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     assert lab.record.description == "edited"
     assert [place.id for place in lab.places(None, 9)[0]] == [f"p{i}" for i in range(4 if "1" in taken else 0, 6)]

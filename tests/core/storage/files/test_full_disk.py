@@ -16,9 +16,9 @@ import pytest
 
 from core.errors import StorageFailure, StorageFull
 from core.maps import Enrolment, MapSettings
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.files.segment_files import HEADER_BYTES
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.storage.worker import LARGE
 
 REPOSITORY = Path(__file__).parents[4]
@@ -77,7 +77,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     small_disk: Path, dimension: int, image_bytes: int, batch: int, left: int
 ) -> None:
     directory = small_disk / "data"
-    atlas = Atlas(directory, rows_per_segment=8)
+    atlas = Directory(directory, rows_per_segment=8)
     lab = atlas.create("lab", ENCODER, dimension, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     lab.enrol([large_frame("first", dimension, image_bytes)])
     ballast = fill_up(small_disk, left)
@@ -104,7 +104,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     lab.enrol([large_frame("after", dimension, image_bytes)])
     assert lab.verify().ok
     atlas.close()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     assert [place.id for place in lab.places(None, 1000)[0]] == [*ids, "after"]
     report = lab.verify()
@@ -113,7 +113,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
 
 
 def test_deleting_a_sequence_makes_room(small_disk: Path) -> None:
-    atlas = Atlas(small_disk / "data", rows_per_segment=8)
+    atlas = Directory(small_disk / "data", rows_per_segment=8)
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     for name in ("monday", "tuesday"):
         lab.enrol([frame(f"{name}{i}", dimension=LARGE, sequence=name) for i in range(48)])
@@ -133,7 +133,7 @@ def test_deleting_a_sequence_makes_room(small_disk: Path) -> None:
 
 
 def test_a_map_that_finds_no_room_is_not_made(small_disk: Path) -> None:
-    atlas = Atlas(small_disk / "data")
+    atlas = Directory(small_disk / "data")
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     ballast = fill_up(small_disk, 0)
     with pytest.raises(StorageFull):
@@ -151,11 +151,11 @@ def test_a_map_that_finds_no_room_is_not_made(small_disk: Path) -> None:
 
 
 def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Path) -> None:
-    atlas = Atlas(small_disk / "data")
+    atlas = Directory(small_disk / "data")
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     atlas.close()
     ballast = fill_up(small_disk, 0)
-    atlas = Atlas(small_disk / "data")
+    atlas = Directory(small_disk / "data")
     assert list(atlas.quarantined()) == ["lab"]
     with pytest.raises(StorageFailure):
         atlas.get("lab")

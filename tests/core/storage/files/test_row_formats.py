@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.maps.records import Precision
-from core.storage.files.row_formats import (
+from core.maps.forms import (
     BLOCK,
     inner_products,
     pack_descriptors,
@@ -14,7 +14,7 @@ from core.storage.files.row_formats import (
     unpack_descriptors,
     unpack_local,
 )
-from tests.core.storage.frames import descriptor_of, local_of
+from tests.core.store.frames import descriptor_of, local_of
 
 PRECISIONS: tuple[Precision, ...] = ("half", "compressed")
 

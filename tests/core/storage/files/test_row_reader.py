@@ -13,7 +13,7 @@ from core.disk.files import Damage
 from core.maps.records import Precision
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
-from tests.core.storage.frames import descriptor_of, local_of, packed
+from tests.core.store.frames import descriptor_of, local_of, packed
 
 SHAPE, ROWS = (3, 5), 10
 

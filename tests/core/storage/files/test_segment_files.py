@@ -21,7 +21,7 @@ from core.storage.files.segment_files import (
     segment_checksum,
     segment_name,
 )
-from tests.core.storage.frames import descriptor_of, local_of, packed, stored_of
+from tests.core.store.frames import descriptor_of, local_of, packed, stored_of
 
 LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4, local_shape=(3, 5))
 WITHOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)

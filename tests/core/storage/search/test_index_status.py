@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from core.index import Coder, Codes
 from core.maps import MapSettings
-from core.storage import Atlas
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from core.store import Directory
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 
 def wait_for(is_so: Callable[[], bool]) -> None:
@@ -23,7 +23,7 @@ def wait_for(is_so: Callable[[], bool]) -> None:
 
 
 def test_a_map_emptied_while_its_first_codes_are_made_is_searched_exactly(
-    atlas: Atlas, monkeypatch: pytest.MonkeyPatch
+    atlas: Directory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The write finds nothing built that would have to go; what builds has to look again at the end."""
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE)

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, Codes, table
 from core.maps import IndexStatus, MapSettings
-from core.storage import Atlas, Map
+from core.store import Directory, Map
 from core.storage.files import array_files
 from core.storage.files.segment_files import HEADER_BYTES
 from core.storage.search import indexing, recall, snapshot, tiers
-from core.storage.search.snapshot import Snapshot
-from tests.core.storage.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
+from core.store.snapshot import Snapshot
+from tests.core.store.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 from tests.core.storage.test_opening import cut, flip, flip_middle, garbage, remove
 
 DIMENSION, ROWS, PLACES, SHORTLIST = 256, 16, 150, 20
@@ -39,8 +39,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def atlas(directory: Path) -> Iterator[Atlas]:
-    atlas = Atlas(directory, rows_per_segment=ROWS)
+def atlas(directory: Path) -> Iterator[Directory]:
+    atlas = Directory(directory, rows_per_segment=ROWS)
     yield atlas
     atlas.close()
 
@@ -50,7 +50,7 @@ def folder(directory: Path) -> Path:
     return directory / "maps" / "lab"
 
 
-def make(atlas: Atlas, places: int = PLACES, **settings: object) -> Map:
+def make(atlas: Directory, places: int = PLACES, **settings: object) -> Map:
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(**settings), LOCAL_SHAPE)  # type: ignore[arg-type]
     lab.enrol([frame(f"p{i}", dimension=DIMENSION) for i in range(places)])
     return lab
@@ -85,7 +85,7 @@ def everything_held(found: Snapshot) -> bool:
     return all(segment.held is not None or segment.removed for segment in found.segments)
 
 
-def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> None:
+def test_a_map_becomes_compact_and_exact_again(atlas: Directory, folder: Path) -> None:
     lab = make(atlas)
     queries = np.array([descriptor_of(f"query {i}", DIMENSION) for i in range(10)])
     exact = lab.snapshot().search_batch(queries)
@@ -117,7 +117,7 @@ def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> No
     assert lab.verify().ok
 
 
-def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_grows_into_its_tier(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
     monkeypatch.setattr(tiers, "ON_DISK_FROM", 120)
     lab = make(atlas, 59)
@@ -141,7 +141,7 @@ def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch
     assert lab.verify().ok
 
 
-def test_codes_are_joined_while_the_map_grows(atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_codes_are_joined_while_the_map_grows(atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"ROWS_PER_BLOCK": 16, "LOOSE_ROWS": 32, "LARGEST_BLOCK": 96, "SCANNED_VALUES": 128}.items():
         monkeypatch.setattr(table, name, value)
 
@@ -161,13 +161,13 @@ def test_codes_are_joined_while_the_map_grows(atlas: Atlas, directory: Path, mon
     names = [*(f"p{i}" for i in range(70) if i != 3), *(f"q{i}" for i in range(80))]
     assert np.mean([finds(lab, name) for name in names]) > 0.95
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     assert scanned(again.get("lab")) >= 100
     assert finds(again.get("lab"), "q79")
     again.close()
 
 
-def test_places_in_memory_are_ranked_by_their_codes_too(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_in_memory_are_ranked_by_their_codes_too(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
     lab = make(atlas)
     queries = np.array([descriptor_of(f"query {i}", DIMENSION) for i in range(10)])
@@ -182,7 +182,7 @@ def test_places_in_memory_are_ranked_by_their_codes_too(atlas: Atlas, monkeypatc
         np.testing.assert_allclose(products, alike, atol=1e-6)
 
 
-def test_writes_are_seen_at_once(atlas: Atlas) -> None:
+def test_writes_are_seen_at_once(atlas: Directory) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     for i in range(20):
@@ -200,7 +200,7 @@ def test_writes_are_seen_at_once(atlas: Atlas) -> None:
     assert (report.ok, report.stale_caches, report.problems) == (True, [], [])
 
 
-def test_an_older_snapshot_stays_what_it_was(atlas: Atlas) -> None:
+def test_an_older_snapshot_stays_what_it_was(atlas: Directory) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     before, query = lab.snapshot(), descriptor_of("p5", DIMENSION)
@@ -212,7 +212,7 @@ def test_an_older_snapshot_stays_what_it_was(atlas: Atlas) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
-def test_only_allowed_places_are_found(atlas: Atlas, share: float) -> None:
+def test_only_allowed_places_are_found(atlas: Directory, share: float) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     found = lab.snapshot()
@@ -225,7 +225,7 @@ def test_only_allowed_places_are_found(atlas: Atlas, share: float) -> None:
             assert rows[0] == i
 
 
-def test_searches_and_writes_go_on_while_codes_are_made(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_and_writes_go_on_while_codes_are_made(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every step of the making waits to be told, and between any two of them the map is asked and written to."""
     lab = make(atlas, 60)
     waiting, step, encode = threading.Semaphore(0), threading.Semaphore(0), Coder.encode
@@ -258,7 +258,7 @@ def test_searches_and_writes_go_on_while_codes_are_made(atlas: Atlas, monkeypatc
 
 
 def test_a_start_reads_codes_and_makes_none(
-    atlas: Atlas, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+    atlas: Directory, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make(atlas, index="compact")
     settled(atlas.get("lab"))
@@ -271,7 +271,7 @@ def test_a_start_reads_codes_and_makes_none(
         raise AssertionError
 
     monkeypatch.setattr(Coder, "encode", refuse)
-    again = Atlas(directory)
+    again = Directory(directory)
     lab = again.get("lab")
     assert lab.snapshot().coded == PLACES  # from the first query on
     assert all(finds(lab, f"p{i}") for i in (0, 31, 32, PLACES - 1))
@@ -297,14 +297,14 @@ def of_another_group(path: Path) -> None:
     ],
 )
 def test_a_bad_file_is_logged_and_made_again(
-    atlas: Atlas, directory: Path, folder: Path, name: str, spoil: Callable[[Path], None]
+    atlas: Directory, directory: Path, folder: Path, name: str, spoil: Callable[[Path], None]
 ) -> None:
     make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
     good = (folder / name).read_bytes()
     spoil(folder / name)
-    again = Atlas(directory)
+    again = Directory(directory)
     lab = again.get("lab")
     assert all(finds(lab, f"p{i}") for i in (0, 40, PLACES - 1))
     settled(lab)
@@ -318,13 +318,13 @@ def test_a_bad_file_is_logged_and_made_again(
     again.close()
 
 
-def test_codes_of_another_make_are_made_again(atlas: Atlas, directory: Path, folder: Path) -> None:
+def test_codes_of_another_make_are_made_again(atlas: Directory, directory: Path, folder: Path) -> None:
     make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
     bits = {"sketches": np.zeros((32, 8), np.uint64), "bits": np.zeros((32, 4), np.uint64)}
     array_files.write_arrays(folder / "codes-000001.index", "codes", "others", bits)
-    again = Atlas(directory)
+    again = Directory(directory)
     lab = again.get("lab")
     assert settled(lab).rows_indexed == PLACES
     assert all(finds(lab, f"p{i}") for i in (0, 40, PLACES - 1))
@@ -333,7 +333,7 @@ def test_codes_of_another_make_are_made_again(atlas: Atlas, directory: Path, fol
 
 
 def test_a_disk_that_is_full_for_codes_leaves_the_map_serving(
-    atlas: Atlas, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    atlas: Directory, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -346,19 +346,19 @@ def test_a_disk_that_is_full_for_codes_leaves_the_map_serving(
         atlas.close()
     assert "could not be written and will be made again" in caplog.text
     assert not [*folder.glob("*.index"), *folder.glob("*.tmp")]
-    again = Atlas(directory)
+    again = Directory(directory)
     assert finds(again.get("lab"), "p7")
     assert settled(again.get("lab")).tier == "compact"
     again.close()
 
 
-def test_damage_on_disk_takes_the_map_out_of_service(atlas: Atlas, directory: Path, folder: Path) -> None:
+def test_damage_on_disk_takes_the_map_out_of_service(atlas: Directory, directory: Path, folder: Path) -> None:
     make(atlas, index="compact")
     atlas.create("hall", ENCODER, 16, local_shape=(0, 0)).enrol([frame("h", local_shape=(0, 0))])
     settled(atlas.get("lab"))
     atlas.close()
     flip(folder / "descriptors-000002.seg", HEADER_BYTES + 5)
-    again = Atlas(directory)
+    again = Directory(directory)
     lab = again.get("lab")
     assert finds(lab, "p0")
     with pytest.raises(MapQuarantined, match=r"descriptors-000002\.seg: row 16 does not match"):
@@ -373,19 +373,19 @@ def test_damage_on_disk_takes_the_map_out_of_service(atlas: Atlas, directory: Pa
 
 @pytest.mark.parametrize("spoil", [remove, cut])
 def test_a_lost_or_cut_segment_is_found_at_the_start(
-    atlas: Atlas, directory: Path, folder: Path, spoil: Callable[[Path], None]
+    atlas: Directory, directory: Path, folder: Path, spoil: Callable[[Path], None]
 ) -> None:
     make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
     spoil(folder / "descriptors-000002.seg")
-    again = Atlas(directory)
+    again = Directory(directory)
     with pytest.raises(MapQuarantined, match=r"descriptors-000002\.seg: the file"):
         again.get("lab")
     again.close()
 
 
-def test_a_deleted_map_says_so_to_those_that_still_search_it(atlas: Atlas) -> None:
+def test_a_deleted_map_says_so_to_those_that_still_search_it(atlas: Directory) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     before = lab.snapshot()
@@ -394,18 +394,18 @@ def test_a_deleted_map_says_so_to_those_that_still_search_it(atlas: Atlas) -> No
         before.search(descriptor_of("p8", DIMENSION))
 
 
-def test_a_map_is_closed_while_it_is_built(atlas: Atlas, directory: Path) -> None:
+def test_a_map_is_closed_while_it_is_built(atlas: Directory, directory: Path) -> None:
     make(atlas, 60)
     atlas.get("lab").edit({"index": "compact"})
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     assert finds(again.get("lab"), "p59")
     assert settled(again.get("lab")).tier == "compact"
     assert again.get("lab").verify().ok
     again.close()
 
 
-def test_who_writes_faster_than_codes_are_made_makes_them(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_writes_faster_than_codes_are_made_makes_them(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the descriptors that wait for their codes would fill the memory."""
     monkeypatch.setattr(indexing, "MOST_BEHIND", 3 * ROWS)
     monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
@@ -424,7 +424,7 @@ def test_who_writes_faster_than_codes_are_made_makes_them(atlas: Atlas, monkeypa
     assert lab.snapshot().coded == lab.snapshot().rows == PLACES + 200
 
 
-def test_codes_that_a_snapshot_lacks_are_not_written_as_whole(atlas: Atlas, folder: Path) -> None:
+def test_codes_that_a_snapshot_lacks_are_not_written_as_whole(atlas: Directory, folder: Path) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     assert lab.indexer is not None
@@ -436,7 +436,7 @@ def test_codes_that_a_snapshot_lacks_are_not_written_as_whole(atlas: Atlas, fold
     assert not lab.indexer._written
 
 
-def test_an_empty_map_waits_for_its_first_place(atlas: Atlas) -> None:
+def test_an_empty_map_waits_for_its_first_place(atlas: Directory) -> None:
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE)
     assert settled(lab).tier == "exact"
     lab.enrol([frame("first", dimension=DIMENSION)])
@@ -447,7 +447,7 @@ def test_an_empty_map_waits_for_its_first_place(atlas: Atlas) -> None:
     assert lab.snapshot().search(descriptor_of("first", DIMENSION))[0].tolist() == []
 
 
-def test_whereabouts_of_a_few_rows_are_those_of_all(atlas: Atlas) -> None:
+def test_whereabouts_of_a_few_rows_are_those_of_all(atlas: Directory) -> None:
     lab = make(atlas, index="compact")
     lab.enrol([frame(f"at {i}".replace(" ", ""), dimension=DIMENSION, x=i) for i in range(5)])
     found, rows = lab.snapshot(), np.array([PLACES + 3, 0, PLACES + 1])
@@ -459,7 +459,7 @@ def test_whereabouts_of_a_few_rows_are_those_of_all(atlas: Atlas) -> None:
 
 
 def test_compressed_maps_answer_too(directory: Path) -> None:
-    atlas = Atlas(directory, rows_per_segment=ROWS)
+    atlas = Directory(directory, rows_per_segment=ROWS)
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE, precision="compressed")
     lab.enrol([frame(f"p{i}", dimension=DIMENSION) for i in range(PLACES)])
     assert settled(lab).tier == "compact"

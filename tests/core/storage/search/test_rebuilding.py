@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownMap
 from core.index import Coder, Codes
-from core.storage import Atlas
+from core.store import Directory
 from core.storage.search import indexing, rebuilding, recall, snapshot
-from tests.core.storage.frames import frame
+from tests.core.store.frames import frame
 from tests.core.storage.search.test_indexing import DIMENSION, PLACES, ROWS, finds, make, settled
 
 
@@ -28,8 +28,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def atlas(directory: Path) -> Iterator[Atlas]:
-    atlas = Atlas(directory, rows_per_segment=ROWS)
+def atlas(directory: Path) -> Iterator[Directory]:
+    atlas = Directory(directory, rows_per_segment=ROWS)
     yield atlas
     atlas.close()
 
@@ -42,7 +42,7 @@ def silent(_done: int, _total: int) -> None:
     """Nobody is told."""
 
 
-def test_all_is_made_anew_beside_what_serves(atlas: Atlas, directory: Path) -> None:
+def test_all_is_made_anew_beside_what_serves(atlas: Directory, directory: Path) -> None:
     folder = directory / "maps" / "lab"
     lab = make(atlas, index="compact")
     settled(lab)
@@ -70,13 +70,13 @@ def test_all_is_made_anew_beside_what_serves(atlas: Atlas, directory: Path) -> N
     atlas.close()
     after = caches(folder)
     assert set(before) == set(after) and after["codes-000001.index"] == before["codes-000001.index"]
-    again = Atlas(directory)
+    again = Directory(directory)
     assert again.get("lab").snapshot().coded == PLACES + 1, "what was made is kept"
     assert all(finds(again.get("lab"), name) for name in ("p0", "p149", "late"))
     again.close()
 
 
-def test_one_that_is_broken_off_leaves_all_as_it_was(atlas: Atlas, directory: Path) -> None:
+def test_one_that_is_broken_off_leaves_all_as_it_was(atlas: Directory, directory: Path) -> None:
     lab = make(atlas, index="compact")
     settled(lab)
     before, served = caches(directory / "maps" / "lab"), lab.snapshot()
@@ -98,7 +98,7 @@ def test_one_that_is_broken_off_leaves_all_as_it_was(atlas: Atlas, directory: Pa
     assert finds(lab, "new") and finds(lab, "p0")
 
 
-def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_that_is_deleted_or_searched_exactly(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = make(atlas)
     assert lab.rebuild_index(silent).tier == "exact"
     lab.edit({"index": "compact"})
@@ -131,7 +131,7 @@ def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: py
     assert [type(error) for error in failed] == [UnknownMap]
 
 
-def test_a_failure_to_build_is_logged_and_tried_again(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_to_build_is_logged_and_tried_again(atlas: Directory, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = make(atlas)
 
     def fail(*_: object) -> None:

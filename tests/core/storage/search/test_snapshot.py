@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.index.flat import flat_index, vectors
-from core.storage import Snapshot
+from core.store import Snapshot
 from core.storage.search import snapshot as module
-from core.storage.search.segment import Location
-from tests.core.storage.frames import descriptor_of, local_of
+from core.store.segment import Location
+from tests.core.store.frames import descriptor_of, local_of
 
 DIMENSION, ROWS, SHAPE = 8, 4, (2, 3)
 

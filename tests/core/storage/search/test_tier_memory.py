@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from core.maps import MapSettings
-from core.storage import Atlas, Map
-from core.storage.search.snapshot import threads
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from core.store import Directory, Map
+from core.store.snapshot import threads
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 REPOSITORY = Path(__file__).parents[4]
 
@@ -31,11 +31,11 @@ def become(lab: Map, tier: str) -> None:
 
 @pytest.mark.parametrize("local_shape", [LOCAL_SHAPE, (0, 0)])
 def test_descriptors_read_at_the_start_are_given_up(directory: Path, local_shape: tuple[int, int]) -> None:
-    atlas = Atlas(directory, rows_per_segment=4)
+    atlas = Directory(directory, rows_per_segment=4)
     made = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape)
     made.enrol([frame(f"p{i}", local_shape=local_shape) for i in range(10)])
     atlas.close()
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.get("lab")
     held = [weakref.ref(segment.held) for segment in lab.snapshot().segments]
     assert all(ref() is not None for ref in held)
@@ -50,7 +50,7 @@ def test_descriptors_read_at_the_start_are_given_up(directory: Path, local_shape
 
 def priorities(directory: Path) -> None:
     """Print those of the threads that search, which a map that was built is the first to need, and the process's."""
-    atlas = Atlas(directory)
+    atlas = Directory(directory)
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}") for i in range(200)])
     become(lab, "compact")

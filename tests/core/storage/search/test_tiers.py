@@ -6,9 +6,9 @@ import pytest
 
 from core.maps.records import COMPACT_FROM, TierSetting
 from core.maps.status import Tier
-from core.storage import Atlas, Map
-from core.storage.search.tiers import ON_DISK_FROM, holds_for, tier_for
-from tests.core.storage.frames import ENCODER, frame
+from core.store import Directory, Map
+from core.store.tiers import ON_DISK_FROM, holds_for, tier_for
+from tests.core.store.frames import ENCODER, frame
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ def test_what_a_map_takes_on_disk(lab: Map, directory: Path) -> None:
     assert status.bytes_per_place == round(sum(files.values()) / 5)
 
 
-def test_a_map_that_was_not_used_yet_says_so(atlas: Atlas, directory: Path) -> None:
+def test_a_map_that_was_not_used_yet_says_so(atlas: Directory, directory: Path) -> None:
     atlas.create("big", ENCODER, 16, local_shape=(0, 0)).enrol([frame("p", local_shape=(0, 0))])
     atlas.close()
-    again = Atlas(directory)
+    again = Directory(directory)
     status = again.find("big").index_status()
     assert (status.state, status.tier, status.wanted, status.setting) == ("unopened", "exact", "exact", "auto")
     assert again.get("big").index_status().state == "ready"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from core.storage import Atlas
+from core.store import Directory
 from tests.core.recordings.bags import (
     CAMERA,
     ODOMETRY,
@@ -41,7 +41,7 @@ from tests.service.server import ROOT, Server
 
 def stored(data: Path, name: str) -> tuple[list[dict[str, Any]], Any]:
     """The places of a map as the disk has them, in their order, without the times of storing; and their descriptors."""
-    atlas = Atlas(data)
+    atlas = Directory(data)
     try:
         map_ = atlas.get(name)
         map_.open()

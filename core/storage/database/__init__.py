@@ -1,1 +1,0 @@
-"""A map's SQLite database: its connections, tables, statements and log."""
