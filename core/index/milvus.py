@@ -1,8 +1,9 @@
 """The first stage of a search in a Milvus, for maps whose codes do not fit in the memory of a service.
 
 A map has a collection of its rows: their numbers and descriptors.  All of it is derived and may be lost; the store
-gives it again.  A row is of one frame for ever, so services that fill a collection at the same time give it the same;
-rows that no place has any more are left out of searches by their caller, and deleted when there is time.
+gives it again.  A row is of one frame for ever, so services that fill a collection at the same time give it the same:
+each gives it all rows that were made since it opened the map, and when it opens one, those that Milvus lacks.  Rows
+that no place has any more are left out of searches by their caller, and deleted when there is time.
 
 A collection has a random name and is found by an alias, whose making succeeds once.  Searches name the collection, so
 that nobody takes one that was lost and is being filled anew for the one that was there before.
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 
 from core.errors import MissingExtra, StoreUnavailable
 from core.index.codes import Coder, Codes
-from core.index.flat import Array, Flags, Positions, ranked
+from core.index.flat import Array, Flags, ranked
 from core.index.table import Shortlist
 from core.outage import Outage, Unreachable
 
@@ -166,12 +167,14 @@ class Milvus:
         with self.using("list collections") as client:
             client.list_collections(timeout=3)
 
-    def codes(self, uid: str, dimension: int, rows: int) -> MilvusCodes:
+    def codes(self, uid: str, dimension: int, rows: int, last: tuple[int, Array] | None = None) -> MilvusCodes:
         """The first stage of as many of the first ``rows`` rows of a map as Milvus has; it is asked for them.
 
         Args:
-            uid: names the map and its generation, in which a row has always been of the same frame: at most 200 ASCII
-                letters, digits and underscores.  ``dimension`` is D, the values of a descriptor.
+            uid: names the map, and no map that was lost: at most 200 ASCII letters, digits and underscores.
+            dimension: D, the values of a descriptor.
+            last: the last of the rows that a place has, and its descriptor, float32 [D].  If Milvus has another one, as
+                behind a store that was restored and went on, the collection is dropped.
         """
         with self.using("read rows", searching=True) as client:
             made, low, high, step = self._loaded(client, uid), 0, rows, 1
@@ -180,7 +183,11 @@ class Milvus:
                 expression = f"row >= {at} and row < {high}"
                 found = client.query(made.name, expression, ["row"], limit=1, consistency_level="Strong", **_PATIENCE)
                 low, high, step = (int(found[0]["row"]) + 1, high, step) if found else (low, at, 2 * step)
-        return MilvusCodes(self, uid, dimension, made, low, time.monotonic())
+        there = MilvusCodes(self, uid, Coder.of(dimension), made, low, time.monotonic())
+        if last is not None and last[0] < low and not there.has(*last):
+            self.drop(lambda other: other == uid)
+            return replace(there, made=None, rows=0)
+        return there
 
     def _loaded(self, client: MilvusClient, uid: str) -> Made | None:
         """The collection of a map, None if it has none."""
@@ -252,13 +259,14 @@ class Made(NamedTuple):
 class MilvusCodes:
     """Rows 0 … ``rows`` of a map in Milvus (:class:`core.index.table.FirstStage`), an immutable value.
 
+    coder: makes the codes that the store keeps beside descriptors.
     made: the collection that has them; None if there is none.
     since: when it was known to have them, by this machine's monotonic clock, in seconds.
     """
 
     milvus: Milvus
     uid: str
-    dimension: int
+    coder: Coder
     made: Made | None
     rows: int
     since: float
@@ -266,11 +274,6 @@ class MilvusCodes:
 
     def __len__(self) -> int:
         return self.rows
-
-    @property
-    def coder(self) -> Coder:
-        """Makes the codes that the store keeps beside descriptors."""
-        return Coder.of(self.dimension)
 
     @property
     def is_lost(self) -> bool:
@@ -288,7 +291,7 @@ class MilvusCodes:
             rows: those from ``len(self)`` on and below ``total`` that places have, ascending, and their descriptors,
                 float32 [D]; an error leaves in Milvus those that it was given.
         """
-        made = self.made or self.milvus.make(self.uid, self.dimension)
+        made = self.made or self.milvus.make(self.uid, self.coder.dimension)
         for some in _batched(rows, _AT_ONCE):
             vectors = made.vectors(np.stack([descriptor for _, descriptor in some]))
             entities = [{"row": row, "descriptor": one} for (row, _), one in zip(some, vectors, strict=True)]
@@ -305,13 +308,14 @@ class MilvusCodes:
         some thousands have too few of them, all are named, some at a time.
         """
         allowed = np.ones(len(self), np.bool_) if allowed is None else allowed
-        if allowed.shape != (len(self),) or queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise ValueError(f"allowed is said of all {len(self)} rows, and a query has {self.dimension} values")
+        if allowed.shape != (len(self),) or queries.ndim != 2 or queries.shape[1] != self.coder.dimension:
+            raise ValueError(f"allowed is said of all {len(self)} rows, and a query has {self.coder.dimension} values")
         rows = np.flatnonzero(allowed)
         limit = -(-count * len(allowed) // max(1, len(rows)))
         while len(rows) > MOST_LISTED and limit <= MOST_FOUND:
             every = self._found(queries, f"row < {len(self)}", limit)
-            found = [_first(count, hits.rows[fit := allowed[hits.rows]], hits.estimates[fit]) for hits in every]
+            kept = [(hits.rows[fit := allowed[hits.rows]], hits.estimates[fit]) for hits in every]
+            found = [Shortlist(chosen[:count], estimates[:count]) for chosen, estimates in kept]
             if all(len(one.rows) == count or len(hits.rows) < limit for one, hits in zip(found, every, strict=True)):
                 return found
             limit *= 4
@@ -319,8 +323,13 @@ class MilvusCodes:
         for some in _batched(rows.tolist(), MOST_LISTED):
             for at, hits in enumerate(self._found(queries, f"row in {some}", count)):
                 joined = ranked(np.append(best[at].rows, hits.rows), np.append(best[at].estimates, hits.estimates))
-                best[at] = _first(count, *joined)
+                best[at] = Shortlist(joined[0][:count], joined[1][:count])
         return best
+
+    def has(self, row: int, descriptor: Array) -> bool:
+        """Whether Milvus has this descriptor, float32 [D], in a row."""
+        products = self._found(descriptor[np.newaxis], f"row == {row}", 1)[0].estimates
+        return len(products) == 1 and bool(np.isclose(products[0], descriptor @ descriptor, rtol=0.01))
 
     def _found(self, queries: Array, expression: str, limit: int) -> list[Shortlist]:
         """The best rows for each query of those for which an expression holds."""
@@ -334,7 +343,3 @@ class MilvusCodes:
             hits = [(np.array(one.ids, np.int64), np.array(one.distances, np.float32)) for one in every]
             found += [Shortlist(*ranked(*one)) for one in hits]
         return found
-
-
-def _first(count: int, rows: Positions, estimates: Array) -> Shortlist:
-    return Shortlist(rows[:count], estimates[:count])

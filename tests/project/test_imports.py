@@ -54,7 +54,6 @@ EXTRAS = {
     "core/ledger/postgres": {"cluster"},
     "core/maps/formats/mcap": {"bags"},
     "core/index/milvus": {"milvus"},
-    "core/milvus": {"milvus"},
     "core/postgres": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},

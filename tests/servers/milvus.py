@@ -56,18 +56,21 @@ class MilvusServer:
     """A Milvus in a folder of its own.
 
     address, process: its own.
+    token, certificate: by which its administrator comes in.
     """
+
+    certificate: str | None
 
     def __init__(self, folder: Path, settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
         if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
         (port,) = fixed_ports(1)
-        self.address = f"http://127.0.0.1:{port}"
+        self.address, self.token, self.certificate = f"http://127.0.0.1:{port}", "", None
         self.process = _server(folder, port, settings, self.ask)
 
     def ask(self) -> None:
         """Raise unless it answers."""
-        asking = Milvus(self.address)
+        asking = Milvus(self.address, self.token, certificate=self.certificate)
         try:
             asking.check()
         finally:

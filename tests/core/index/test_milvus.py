@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from threading import Barrier
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,8 +19,9 @@ from core.index.milvus import MOST_FOUND, MOST_LISTED, Milvus, MilvusCodes, inde
 from core.places import NO_POSE, NO_SEQUENCE
 from core.store.segment import Location
 from core.store.snapshot import SHORTLIST, Snapshot
+from tests.certificates import certify
 from tests.core.index.made_up import Array
-from tests.servers.milvus import MilvusServer, running_milvus
+from tests.servers.milvus import MILVUS_SETTINGS, MilvusServer, running_milvus
 from tests.service.stores.door import Door
 from tests.service.wire import eventually
 
@@ -179,7 +183,7 @@ def test_a_snapshot_is_searched_as_one_with_codes_in_memory(whole: MilvusCodes) 
     base = Snapshot(D, 4096)
     for part in np.split(ROWS, 40):
         base = base.appended(part, where)
-    ours = Snapshot(D, 4096, base.segments, table=whole)  # type: ignore[arg-type]
+    ours = Snapshot(D, 4096, base.segments, table=cast(Any, whole))
     ours = ours.appended(extra, where).without([7, 12_007])
     assert ours.coded == len(ROWS) and ours.rows == 12_300
     every, alive = np.concatenate([ROWS, extra]), np.ones(12_300, np.bool_)
@@ -288,6 +292,23 @@ def test_what_was_lost_is_noticed_and_given_again(
 
 
 @pytest.mark.cluster
+def test_rows_of_a_history_that_was_lost_are_found_by_nobody(connected: Milvus) -> None:
+    """A store was restored with 200 of 300 rows, and others came after them, the last of which Milvus was not given."""
+    lost = filled(connected, ROWS[:300])
+    now = np.concatenate([ROWS[:200], ROWS[1000:1050]])
+    codes = connected.codes("lab_1", D, 200, (199, now[199]))
+    assert len(codes) == 200 and not lost.is_lost
+    after = codes.brought_up(enumerate(now[200:240], 200), 240)
+    assert found(after, 240) == [best(now[:240], query, 240) for query in QUERIES]
+    assert len(connected.codes("lab_1", D, 240, (239, now[239]))) == 240
+    opened = connected.codes("lab_1", D, 250, (249, now[249]))
+    assert len(opened) == 0
+    assert found(opened.brought_up(enumerate(now), 250), 250) == [best(now, query, 250) for query in QUERIES]
+    with pytest.raises(StoreUnavailable, match="has lost a map's descriptors"):
+        found(lost)
+
+
+@pytest.mark.cluster
 def test_collections_of_maps_that_are_gone_are_dropped(connected: Milvus) -> None:
     for uid in ("store_1", "store_2", "other_1"):
         filled(connected, ROWS[:10], uid)
@@ -355,3 +376,55 @@ def test_a_milvus_that_is_killed_has_what_it_was_given(connected: Milvus, server
 
     assert eventually(has_all, 300)
     assert len(filled(connected, ROWS[:600])) == 600
+
+
+@pytest.mark.cluster
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_each_refusal_is_said_and_ends_when_it_is_put_right(tmp_path: Path) -> None:
+    for name in ("own", "other"):
+        (tmp_path / name).mkdir()
+        certify(tmp_path / name)
+    (folder := tmp_path / "milvus").mkdir()
+    settings = {
+        "common.security.authorizationEnabled": "true",
+        "common.security.tlsMode": "1",
+        "tls.serverPemPath": str(tmp_path / "own/server.pem"),
+        "tls.serverKeyPath": str(tmp_path / "own/server.key"),
+    }
+    server = MilvusServer(folder, {**MILVUS_SETTINGS, **settings})
+    authority, plain = tmp_path / "own/authority.pem", server.address
+    server.address = plain.replace("http://127.0.0.1", "https://localhost")
+    server.token, server.certificate = "root:Milvus", str(authority)  # Milvus's own at its first start
+    trusted = Path(shutil.copy(tmp_path / "other/authority.pem", tmp_path / "trusted.pem"))
+    robot = Milvus(server.address, "robot:its-own-token", certificate=str(trusted))
+
+    def says(text: str) -> None:
+        assert eventually(lambda: text in _refusal(robot), 60), _refusal(robot)
+
+    server.process.start()
+    try:
+        says("Milvus has a certificate that cannot be trusted")
+        trusted.unlink()
+        says("Milvus cannot be reached")
+        shutil.copy(authority, trusted)
+        says("Milvus refuses the token")
+        with Milvus(server.address, server.token, certificate=server.certificate).using("administer") as administrator:
+            administrator.create_user("robot", "its-own-token")
+            says("the token's user has no right to")
+            administrator.grant_role("robot", "admin")
+        says("nothing")
+        assert len(filled(robot, ROWS[:10])) == 10
+        without = Milvus(plain, "robot:its-own-token")
+        assert "closes the connection, as one does that wants TLS" in _refusal(without)
+    finally:
+        server.process.end()
+
+
+def _refusal(of: Milvus) -> str:
+    """What a Milvus says that is to make a map's collection, without what is secret."""
+    try:
+        of.make("tried", D)
+    except StoreUnavailable as error:
+        assert "its-own-token" not in str(error)
+        return str(error)
+    return "nothing"
