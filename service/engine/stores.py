@@ -29,13 +29,12 @@ class OpenStore:
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
         self.most_open = most_open_maps(settings)
-        if settings.engine == "files":
+        if settings.database is None:
             self.maps = Directory(settings.data_dir, self.most_open)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            assert settings.database is not None  # the settings were checked
             cluster = open_cluster(settings.database.get_secret_value(), settings.row_cache_bytes)
         except BaseException:
             self._lock.release()
