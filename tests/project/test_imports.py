@@ -61,7 +61,6 @@ EXTRAS = {
     "scripts/manifests": {"dev"},
     "service/peers/differences": {"cluster"},
     "service/peers/replica": {"cluster"},
-    "service/ray_serve": {"ray"},
     "service/shared": {"cluster"},
 }
 """Folders and modules that may import what an extra brings; tests and benchmarks may import all."""
