@@ -121,9 +121,6 @@ PARTS = {
     "sizing": Part("benchmarks.cluster.sizing", needs="PostgreSQL"),
     "kills": Part("tests.core.cluster.kills", "--kills 100", "PostgreSQL"),
     "milvus-kills": Part("tests.core.cluster.kills", "--vectors milvus --kills 30", "PostgreSQL, .venv-cluster"),
-    "ray": Part("benchmarks.ray_serve.overhead", "--places 400 --robots 1 --robots 16", "placerec[ray]"),
-    "scaling": Part("benchmarks.ray_serve.scaling", "", "placerec[ray]"),
-    "ray-kills": Part("tests.service.ray_serve.kills", "--kills 12", "placerec[ray]"),
 }
 """The parts by name, accuracy first, then speed, then robustness and clusters."""
 

@@ -44,7 +44,7 @@ DRAWN = 60
 
 def scaled_for_drawing(encoded: Encoded) -> Encoded:
     """A copy whose pixels are scaled to the size of the drawing: a frame of 40 megapixels would fill the memory."""
-    return replace(encoded, source=scaled(encoded.pixels))
+    return replace(encoded, pixels=scaled(encoded.pixels))
 
 
 async def explain_match(
