@@ -16,13 +16,9 @@ LEVELS: dict[DialectName, list[str]] = {
     "sqlite": [
         f"ALTER TABLE places ADD COLUMN {one}"
         for one in ("level TEXT", "accuracy_metres REAL", "accuracy_degrees REAL")
-    ],
-    "postgresql": [
-        'ALTER TABLE places ADD COLUMN level TEXT COLLATE "C", ADD COLUMN accuracy_metres FLOAT(53),'
-        " ADD COLUMN accuracy_degrees FLOAT(53)"
-    ],
+    ]
 }
-"""The statements that bring tables of 1.0 up to date."""
+"""The statements that bring the file of a map of 1.0 up to date."""
 
 
 def _column(name: str, kind: Any, optional: bool = False, **more: Any) -> Column[Any]:
