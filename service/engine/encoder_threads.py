@@ -130,7 +130,7 @@ class EncoderThreads:
             spent: dict[str, float] = {}  # by another thread, which may end after a frame without regions is done
             find = begun(lambda: _keypoints(pixels, frame.mask, spent)) if frame.keypoints else None
             encoding = frame.encoder.encode(pixels, frame.mask)
-            if not frame.features:
+            if frame.bulk:
                 encoding = replace(encoding, regions=encoding.regions.without_features())
             if not len(encoding.regions):
                 find = None

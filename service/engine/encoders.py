@@ -38,7 +38,7 @@ class Encoded:
     """A frame, decoded and encoded.
 
     pixels: uint8 [H, W, 3], BGR.
-    encoding: its regions have features only if these were requested.
+    encoding: the regions of a bulk frame, which nobody explains, have no features.
     encoder: the encoder that has encoded it.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
     mask: the part of the frame that was ignored.
@@ -97,7 +97,6 @@ class QueuedFrame:
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
     keypoints: whether the frame's keypoints are wanted, too.
-    features: whether the features of its regions are, which only explanations need.
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
     result: the encoded frame, or the error that prevented its encoding.
@@ -112,7 +111,6 @@ class QueuedFrame:
     deadline: float
     bulk: bool = False
     keypoints: bool = False
-    features: bool = False
     after_encoding: AfterEncoding | None = None
     caller: str = field(default_factory=CALLER.get)
     result: Future[Encoded] = field(default_factory=Future)

@@ -238,8 +238,8 @@ class Engine:
         mask = await camera_mask(map_, question.camera)
         ahead = search_ahead(map_, question)
         with self.queue.place():
-            wanted = needs_keypoints(map_, question), question.explain
-            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, *wanted)
+            keypoints = needs_keypoints(map_, question)
+            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, keypoints)
         (answered,) = await self.searches.answer(map_, [frame], question)
         return answered
 

@@ -193,14 +193,13 @@ class EncoderQueue:
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
         keypoints: bool = False,
-        features: bool = False,
     ) -> Encoded:
         """Wait in the queue, then decode and encode one frame; call it within ``place``.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
             mask: the part of the frame that is ignored.
-            keypoints, features, after_encoding: see :class:`QueuedFrame`.
+            keypoints, after_encoding: see :class:`QueuedFrame`.
 
         Raises:
             DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
@@ -209,9 +208,7 @@ class EncoderQueue:
             EncoderNotInstalled, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
-        frame = QueuedFrame(
-            encoder, data, mask, deadline.at, keypoints=keypoints, features=features, after_encoding=after_encoding
-        )
+        frame = QueuedFrame(encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding)
         place = _place()
         place.frames = [frame]
         self.encoders.put([frame])

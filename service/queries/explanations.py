@@ -75,7 +75,7 @@ async def explain_match(
         with suppress(UnknownCamera):  # the camera was deleted after the place was enrolled
             mask = await camera_mask(map_, place.camera)
         with engine.queue.place():
-            encoded = await engine.queue.encode(map_.record.encoder, picture, deadline, mask, features=True)
+            encoded = await engine.queue.encode(map_.record.encoder, picture, deadline, mask)
     match = replace(stored, regions=None if encoded is None else encoded.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
     explained = await in_thread(lambda: explanation_view(encoder, explain(encoder, shown, match), shown, match))
