@@ -53,6 +53,7 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"
 EXTRAS = {
     "core/ledger/postgres": {"cluster"},
     "core/maps/formats/mcap": {"bags"},
+    "core/index/milvus": {"milvus"},
     "core/store/cluster": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},

@@ -146,7 +146,7 @@ def test_values_reach_what_they_name() -> None:
         {"replicas": 3},
         {"service": {"replicas": "three"}},
         {"settings": {"LOG_LEVEL": "debug"}},
-        {"settings": {"PLACEREC_VECTORS": "postgres"}},  # it has a value of its own
+        {"settings": {"PLACEREC_MILVUS": "http://other"}},  # it has a value of its own
         {"stores": {"postgres": {"storage": "much"}}},
     ],
 )
