@@ -9,6 +9,7 @@ import httpx
 import pytest
 
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from tests.service.damage import damage
 from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -283,10 +284,7 @@ def test_after_a_kill_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path
     assert server.client.put("/v1/maps/good/cameras/front", json={"mask": mask}).status_code == 201
     assert server.enrol("good", "masked", jpeg(2), camera="front").status_code == 201
     server.kill()
-    segment = next((tmp_path / "data" / "maps" / "bad").glob("*.seg"))
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
+    damage(tmp_path / "data", "bad")
 
     server = Server(tmp_path).wait()
     client = server.client
