@@ -65,7 +65,6 @@ MAP_EXAMPLE: dict[str, Any] = {
         "tier": "exact",
         "wanted": "exact",
         "state": "ready",
-        "progress": 1.0,
         "rows_indexed": 0,
         "recall": None,
         "bytes_in_memory": 10902753,

@@ -34,6 +34,7 @@ from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 
 FEW = settings(max_examples=60, deadline=10_000, derandomize=True)
 
+
 @st.composite
 def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
     """A sound file with bytes changed, taken out, put in, or its end cut off."""

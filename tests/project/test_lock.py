@@ -99,10 +99,7 @@ def test_opencv_still_reads_caffe() -> None:
     assert version(locked("service")["opencv-python-headless"]).startswith("4.")
 
 
-OWN = {
-    f"http://{host}"
-    for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "placerec")
-}
+OWN = {f"http://{host}" for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "placerec")}
 OWN |= {"https://the-host", "postgresql://placerec"}
 """Addresses of this machine and of parts of a cluster."""
 
