@@ -122,7 +122,7 @@ class MapView(BaseModel):
         "places or of strangers, or on too few of them. Null: nothing is known against it."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
-    storage: StorageStatus = Field(description="The size of the map on disk.")
+    storage: StorageStatus = Field(description="The size of what is stored of the map.")
     places: int
     last_day: VerdictCounts | None = Field(
         description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."
