@@ -287,7 +287,6 @@ class Map(LedgerMap):
             tier=tier,
             wanted=tier_for(setting, count, tier),
             state="unopened" if held is None else "ready",
-            progress=0 if held is None else 1,
             rows_indexed=0 if held is None else held.snapshot.coded,
             recall=recall,
             bytes_in_memory=0 if held is None else held.snapshot.memory,
@@ -356,7 +355,8 @@ class Map(LedgerMap):
             if self._room is None or self._room[0] != key:
                 count, keypoints, pictures = frames.room(connection)
                 descriptors = state.searched * Form.of(state.record).frame.itemsize
-                codes = state.searched * Coder.of(state.record.dimension).bytes_per_place
+                coded = tier_for(state.record.index, state.searched, "exact") == "compact"
+                codes = state.searched * Coder.of(state.record.dimension).bytes_per_place if coded else 0
                 known = descriptors + codes + keypoints + pictures
                 whole = self.database.room() or known
                 status = StorageStatus(

@@ -214,7 +214,7 @@ class Engine:
         return self.catalogue.resolve(name_or_identity or self.settings.encoder)
 
     async def map(self, map_id: str) -> Map:
-        """A map, which is opened from disk if it is not open yet.
+        """A map, which is read if it is not open yet.
 
         Raises:
             UnknownMap: there is no map of this id.
@@ -233,7 +233,7 @@ class Engine:
         Raises:
             UnknownCamera: the map has no camera of the question's name.
             QueueFull: too many requests are waiting.
-            StorageFailure: the map's files cannot be read.
+            StorageFailure: the map cannot be read.
             Others: see ``EncoderQueue.encode``.
         """
         mask = await camera_mask(map_, question.camera)

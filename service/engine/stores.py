@@ -16,7 +16,7 @@ class OpenStore:
     Servers are not waited for: without one that can be reached the service starts and is not ready.
 
     Raises:
-        DataDirectoryLocked, DataDirectoryTooNew, StorageFull, StorageFailure: the data directory cannot be opened.
+        DataDirectoryLocked, DataDirectoryTooNew, DataDirectoryTooOld, StorageFull, StorageFailure: the data directory cannot be opened.
         MissingExtra: the client of the servers is not installed.
     """
 

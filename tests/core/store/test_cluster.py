@@ -24,7 +24,7 @@ from tests.core.maps.mixed import check_one_kind_wins
 from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing, check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.maps.writers import check_writers_lose_nothing
-from tests.core.storage.archives.conftest import filled
+from tests.core.store.archives.conftest import filled
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.postgres import Postgres
 

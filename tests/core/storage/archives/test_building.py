@@ -20,7 +20,7 @@ from core.storage.archives import unpacking
 from core.storage.archives.building import build
 from core.maps.archives.unpacking import layout_of
 from core.storage.files import segment_files as descriptors
-from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
+from tests.core.store.archives.files import Parts, changed, imported, line_changed, parts_of
 from tests.core.store.frames import DIMENSION, ENCODER, digest_of, frame
 
 Made = Callable[[bytes], bytes]

@@ -22,7 +22,7 @@ from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
 from core.storage.database.schema import driver_of
 from core.maps.forms import COMPRESSED, HALF
-from tests.core.storage.archives.files import exported, imported, parts_of
+from tests.core.store.archives.files import exported, imported, parts_of
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 from tests.core.storage.test_opening import flip
 

@@ -10,19 +10,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from core import maps
 from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.manifest import seal_of
 from core.maps.archives.reading import Archive
 from core.maps.archives.tar_layout import header, padded
-from core.store import Map
-from core.storage.archives.building import build
-from core.store.directory import Directory
+from core.store import Map, Store
 
 Parts = dict[str, bytes]
 
 
-def exported(map_: maps.Map, path: Path) -> bytes:
+def exported(map_: Map, path: Path) -> bytes:
     """The whole file of a map, which is written to ``path`` and removed."""
     map_.exporter.write(path)
     try:
@@ -94,10 +91,8 @@ def _peak() -> int:
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
 
 
-def imported(
-    atlas: Directory, path: Path, map_id: str, rows_per_segment: int = 4, most_picture_bytes: int = MOST_PICTURE_BYTES
-) -> Map:
+def imported(store: Store, path: Path, map_id: str, most_picture_bytes: int = MOST_PICTURE_BYTES) -> Map:
     """The map of a file, listed."""
-    with Archive(path) as archive, atlas.building(map_id) as folder:
-        build(archive, folder, map_id, rows_per_segment, most_picture_bytes=most_picture_bytes)
-    return atlas.get(map_id)
+    with Archive(path) as archive:
+        store.import_map(archive, map_id, lambda *_: None, lambda _: None, most_picture_bytes, lambda _: None)
+    return store.get(map_id)
