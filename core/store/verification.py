@@ -27,7 +27,7 @@ AT_ONCE = 64
 """Places that are read together."""
 
 CHECKED_TABLES = ("maps", "places", "tokens", "sequences", "cameras", "dead_rows", "review_frames")
-"""The tables that SQLite checks when a map is opened; long values have checksums, and are checked when they are read."""
+"""The tables that SQLite checks when a map is opened; long values are checked when they are read."""
 
 _MOST_LISTED = 10  # damaged rows of one kind that are listed one by one; further ones are counted
 
