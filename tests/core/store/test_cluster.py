@@ -22,7 +22,7 @@ from core.store import Directory
 from tests.core.maps.mixed import check_one_kind_wins
 from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
 from tests.core.maps.writers import check_writers_lose_nothing
-from tests.core.storage.archives.conftest import filled
+from tests.core.store.archives.conftest import filled
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.postgres import Postgres
 
