@@ -146,7 +146,7 @@ def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
 
 
 def test_one_process_at_a_time(directory: Path) -> None:
-    command = [sys.executable, "-m", "tests.core.storage.worker", "hold", str(directory)]
+    command = [sys.executable, "-m", "tests.core.store.worker", "hold", str(directory)]
     with subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdin is not None
         assert other.stdout is not None

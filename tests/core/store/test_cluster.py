@@ -10,22 +10,20 @@ from pathlib import Path
 
 import psycopg
 import pytest
+
+from core.errors import MapExists, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
+from core.ledger.maps import frames
+from core.maps import MapSettings
+from core.maps.archives.reading import Archive
 from core.postgres import rows
 from core.postgres.map import PostgresMap
-
-from core.errors import MapExists, StorageFailure, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
-from core.ledger.maps import frames
-from core.maps import MapSettings, ReviewSetting
-from core.maps.archives.reading import Archive
-from core.maps.forms import COMPRESSED
-from core.store import Directory
 from core.store.cluster import Cluster
+from core.store import Directory
 from tests.core.maps.mixed import check_one_kind_wins
-from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing, check_moves
-from tests.core.maps.review import check_pages_are_of_one_moment
+from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
 from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.store.archives.conftest import filled
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(300)]
@@ -63,58 +61,6 @@ def test_of_two_writers_of_both_kinds_of_coordinates_one_wins(postgres: Postgres
     other = Cluster(postgres.address)
     check_one_kind_wins(store.get("lab"), other.get("lab"))
     other.close()
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("precision", ["half", COMPRESSED])
-def test_a_map_moves_from_and_to_a_data_directory(store: Cluster, tmp_path: Path, precision: str) -> None:
-    check_moves(store, tmp_path, precision)
-
-
-def test_a_page_for_review_is_of_one_moment(store: Cluster) -> None:
-    check_pages_are_of_one_moment(made(store).review, store.get("lab").review)
-
-
-def test_pictures_take_room(store: Cluster) -> None:
-    lab = store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
-    lab.enrol([frame("a"), frame("bee")])
-    room = lab.storage_status()
-    assert room.keypoints is not None
-    assert room.database == len(b"image of a") + len(b"image of bee") + room.keypoints.bytes
-
-
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        ("DELETE FROM pictures WHERE row = 1", "place 'b' is recorded to keep image, which is not true"),
-        ("UPDATE pictures SET bytes = 'image of B' WHERE row = 1", "the image of place 'b' does not match its digest"),
-        (
-            "UPDATE pictures SET bytes = 'image of B', digest = sha256('image of B') WHERE row = 1",
-            "the image of place 'b' does not match its digest",
-        ),
-    ],
-    ids=["lost", "damaged", "another"],
-)
-def test_a_wrong_picture_is_reported(postgres: Postgres, store: Cluster, damage: str, said: str) -> None:
-    lab = store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
-    lab.enrol([frame("a"), frame("b")])
-    assert store.verify("lab").ok
-    execute(postgres, damage)
-    report = store.verify("lab")
-    assert not report.ok and report.problems == [f"PostgreSQL: {said}"]
-    assert lab.picture("a") == b"image of a"
-
-
-@pytest.mark.parametrize("damage", ["DELETE FROM review_pictures", "UPDATE review_pictures SET bytes = 'another'"])
-def test_a_wrong_picture_for_review_is_not_shown(postgres: Postgres, store: Cluster, damage: str) -> None:
-    review, setting = made(store).review, ReviewSetting(most_frames=2)
-    assert [review.keep(one, {}, setting) for one in (b"one", b"one", b"two", b"three")] == [True, False, True, True]
-    shown = [review.picture(one.number) for one in review.page(None, 10).frames]
-    assert shown == [b"three", b"two"]
-    execute(postgres, damage)
-    for one in review.page(None, 10).frames:
-        with pytest.raises(StorageFailure, match="damaged"):
-            review.picture(one.number)
 
 
 def test_a_refused_import_leaves_nothing(store: Cluster, tmp_path: Path) -> None:
@@ -183,7 +129,7 @@ def test_rows_that_no_place_has_are_deleted_a_while_later(store: Cluster, monkey
     assert stored() == ({2, 3}, {2, 3})
 
 
-@pytest.mark.parametrize("by", [-1, 1])
+@pytest.mark.parametrize("by", [-2, 1])
 def test_tables_of_another_version(postgres: Postgres, store: Cluster, by: int) -> None:
     made(store)
     ((version,),) = execute(postgres, "SELECT version FROM placerec_tables WHERE part = 'maps'")

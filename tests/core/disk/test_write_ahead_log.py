@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from core.disk.files import Damage
-from core.storage.database.connections import FILE
 from core.disk.write_ahead_log import check_log
 
+FILE = "map.sqlite"
 FRAME = 24 + 4096
 
 
