@@ -16,7 +16,9 @@ from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, 
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Map:
-    return Directory(tmp_path, rows_per_segment=4).create("lab", ENCODER, DIMENSION, MapSettings(keep="none"), LOCAL_SHAPE)
+    return Directory(tmp_path, rows_per_segment=4).create(
+        "lab", ENCODER, DIMENSION, MapSettings(keep="none"), LOCAL_SHAPE
+    )
 
 
 def ordinals(lab: Map) -> dict[str, int]:

@@ -103,7 +103,9 @@ def test_a_geographic_pose_and_its_position(lab: Map) -> None:
     np.testing.assert_array_equal(there.position[0], pose.position())
 
 
-def test_a_height_on_the_earth_is_there_when_the_map_is_opened_again(atlas: Directory, lab: Map, directory: Path) -> None:
+def test_a_height_on_the_earth_is_there_when_the_map_is_opened_again(
+    atlas: Directory, lab: Map, directory: Path
+) -> None:
     poses = {"hill": Pose(latitude=48.9, longitude=2.35, z=130.5), "plain": Pose(latitude=48.8, longitude=2.35)}
     lab.enrol([replace(frame(name), fields=PlaceFields(pose=pose)) for name, pose in poses.items()])
     atlas.close()

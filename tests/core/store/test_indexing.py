@@ -141,7 +141,9 @@ def test_a_map_grows_into_its_tier(atlas: Directory, monkeypatch: pytest.MonkeyP
     assert lab.verify().ok
 
 
-def test_codes_are_joined_while_the_map_grows(atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_codes_are_joined_while_the_map_grows(
+    atlas: Directory, directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in {"ROWS_PER_BLOCK": 16, "LOOSE_ROWS": 32, "LARGEST_BLOCK": 96, "SCANNED_VALUES": 128}.items():
         monkeypatch.setattr(table, name, value)
 
