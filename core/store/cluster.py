@@ -301,6 +301,8 @@ class Cluster(Store):
     def close(self) -> None:
         """Close the connections, and refuse further reads and writes."""
         self._closed.set()
+        for found in list(self._maps.values()):
+            found.end()
         self.database.close()
 
     def _expect_open(self) -> None:

@@ -13,6 +13,7 @@ from core.ledger.maps import rows
 from core.maps import MapSettings
 from core.store import Directory, Map, Store
 from core.store.cluster import Cluster
+from core.store.file import MapFile
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 from tests.servers.postgres import Postgres
 
@@ -76,3 +77,16 @@ def lab(store: Store) -> Map:
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have what no place names any more deleted with the write by which it died, and not a while later."""
     monkeypatch.setattr(rows, "LEFT_SECONDS", -1)  # clocks of databases are coarse
+
+
+def execute(map_: Map, *statements: str) -> None:
+    """Change rows of a map, of the only one in its database, behind its back."""
+    with map_._transaction() as connection:
+        for statement in statements:
+            connection.whole.driver.execute(statement)  # type: ignore[attr-defined]
+
+
+def file_of(map_: Map) -> MapFile:
+    """The file of a map of a data directory."""
+    assert isinstance(map_.database, MapFile)
+    return map_.database

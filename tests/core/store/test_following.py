@@ -11,14 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 import psycopg
 import pytest
+from core.postgres.search import following
+from core.postgres.search.cache import RowCache
+from core.postgres.search.map import CodedMap
 
 from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
-from core.postgres.search import following
-from core.postgres.search.cache import RowCache
-from core.postgres.search.map import CodedMap
 from core.store.cluster import Cluster
 from tests.servers.postgres import Postgres
 

@@ -60,9 +60,9 @@ def test_what_a_map_takes_on_disk(lab: Map, directory: Path) -> None:
     assert status.bytes_per_place == round(sum(files.values()) / 5)
 
 
-def test_a_map_that_was_not_used_yet_says_so(atlas: Directory, directory: Path) -> None:
-    atlas.create("big", ENCODER, 16, local_shape=(0, 0)).enrol([frame("p", local_shape=(0, 0))])
-    atlas.close()
+def test_a_map_that_was_not_used_yet_says_so(store: Directory, directory: Path) -> None:
+    store.create("big", ENCODER, 16, local_shape=(0, 0)).enrol([frame("p", local_shape=(0, 0))])
+    store.close()
     again = Directory(directory)
     status = again.find("big").index_status()
     assert (status.state, status.tier, status.wanted, status.setting) == ("unopened", "exact", "exact", "auto")
