@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from core.milvus.indexes import indexing_for, search_settings
 
 

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from core.errors import StorageFailure, UnknownPlace
 from core.milvus import open_store
 from core.postgres import Bucket, open_database
 from core.postgres.map import PostgresMap
 from core.postgres.store import PostgresStore
+
+from core.errors import StorageFailure, UnknownPlace
 from tests.core.store.frames import descriptor_of, frame
 
 ROOT = Path(__file__).parents[3]

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
+from core.postgres.map import PostgresMap
 
 from core.errors import StorageFailure, UnknownPlace
-from core.postgres.map import PostgresMap
 from tests.core.cluster.clients import ProcessClient, StoreClient
 from tests.core.store.frames import descriptor_of, digest_of
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from core.postgres import open_database
 
 from core.errors import StorageFailure
-from core.postgres import open_database
 from core.store.cluster import Cluster
 from tests.core.cluster.clients import StoreClient
 from tests.core.cluster.load import May, PlaceLoad, check, running

@@ -6,12 +6,12 @@ from contextlib import closing
 from hashlib import sha256
 
 import numpy as np
+from core.milvus.collection import collection_name, milvus_errors
+from core.postgres.pictures.objects import Objects
 from pymilvus import MilvusClient
 
 from core.errors import StorageFailure
 from core.ledger.maps.frames import StoredObject
-from core.milvus.collection import collection_name, milvus_errors
-from core.postgres.pictures.objects import Objects
 from tests.core.cluster.clients import Addresses
 from tests.core.cluster.parts import KillableCluster, KilledClient, KilledPostgres, KilledServer, SilentPostgres
 from tests.core.store.frames import DIMENSION, ENCODER

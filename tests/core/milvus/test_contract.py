@@ -6,13 +6,13 @@ from contextlib import suppress
 from typing import ClassVar
 
 import pytest
+from core.milvus import Bucket, open_store
+from core.milvus.store import MilvusStore
 from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 
 from core.errors import UnknownMap
 from core.store import Map
-from core.milvus import Bucket, open_store
-from core.milvus.store import MilvusStore
 from tests.core.maps.contract import MAP, StoreContract
 from tests.servers.milvus import Servers
 

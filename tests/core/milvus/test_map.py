@@ -8,24 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core.milvus import open_store
+from core.milvus.map import MilvusMap
+from core.milvus.snapshot import SHORTLIST
+from core.milvus.store import MilvusStore
 
 from core.errors import StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
 from core.ledger.maps.record import RECENT_SECONDS
-from core.store import Map
 from core.maps import MapSettings, Selection
 from core.maps.records import COMPACT_FROM
 from core.maps.selection import Conditions
 from core.method.catalogue import EncoderCatalogue
-from core.milvus import open_store
-from core.milvus.map import MilvusMap
-from core.milvus.snapshot import SHORTLIST
-from core.milvus.store import MilvusStore
 from core.places import Neighborhood, Pose
 from core.recognition import enrol, recognize
 from core.recognition.question import Question
-from core.store import Directory
+from core.store import Directory, Map
 from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, stored_of
 from tests.servers.milvus import Servers

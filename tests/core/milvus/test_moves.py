@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
 from core.milvus import open_store
 from core.milvus.store import MilvusStore
+
 from core.maps.forms import COMPRESSED
 from tests.core.maps.moves import check_a_refused_import_leaves_nothing, check_moves
 from tests.servers.milvus import Servers

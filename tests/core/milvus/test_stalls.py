@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 import pytest
-
-from core.errors import StorageFailure
 from core.milvus import open_store
 from core.milvus.map import MilvusMap
+
+from core.errors import StorageFailure
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.servers.milvus import Servers
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymilvus import MilvusClient
-
-from core.errors import StorageFailure, StoreUnavailable
-from core.ledger.maps import places, record
 from core.milvus import open_store
 from core.milvus.map import MilvusMap
 from core.milvus.store import MilvusStore
 from core.postgres import rows
+from pymilvus import MilvusClient
+
+from core.errors import StorageFailure, StoreUnavailable
+from core.ledger.maps import places, record
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.servers.milvus import Servers
 

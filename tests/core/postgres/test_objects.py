@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import obstore
 import pytest
+from core.postgres import rows
+from core.postgres.map import PostgresMap
+from core.postgres.pictures.bucket import Bucket
+from core.postgres.pictures.objects import Objects
 
 from core.errors import StorageFailure, StorageFull, StoreUnavailable
 from core.ledger.maps import frames, places, record
 from core.ledger.maps.frames import StoredObject
 from core.maps import MapSettings, ReviewSetting
-from core.postgres import rows
-from core.postgres.map import PostgresMap
-from core.postgres.pictures.bucket import Bucket
-from core.postgres.pictures.objects import Objects
-from core.store.cluster import Cluster
 from core.maps.forms import COMPRESSED
+from core.store.cluster import Cluster
 from tests.core.maps.moves import check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame

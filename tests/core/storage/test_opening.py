@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import MapQuarantined
 from core.ledger.maps import places
 from core.ledger.maps.places import token_of
 from core.store import Directory
-from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.store.frames import (
     DESCRIPTOR_BYTES,
     DIMENSION,

@@ -25,6 +25,7 @@ from core.errors import (
 from core.ledger.maps.checksums import checksum_of
 from core.maps import MapSettings
 from core.store import Directory, Map
+from tests.core.store.conftest import OpenStore, file_of
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[3]
@@ -108,24 +109,20 @@ def test_a_deleted_map_is_gone_and_its_name_is_free(store: Directory, directory:
     assert (again.count_places(), again.verify().ok) == (1, True)
 
 
-def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path) -> None:
-    with_places = Directory(directory, rows_per_segment=4)
+def test_maps_are_found_at_the_next_start_and_read_on_first_use(open_store: OpenStore, store: Directory) -> None:
     for name in ("hall", "lab"):
-        with_places.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
-            [frame(f"{name}{i}") for i in range(6)]
-        )
-    with_places.close()
-    store = Directory(directory, rows_per_segment=100)  # the maps there are keep theirs
-    assert [record.id for record in store.records(None, 10)[0]] == ["hall", "lab"]
-    assert all(found._opened is None for found in store._maps.values())
-    assert (store.find("hall").record.id, store.find("hall").count_places()) == ("hall", 6)
-    lab = store.get("lab")
-    assert store._maps["hall"]._opened is None
-    assert lab.count_places() == 6
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
+    store.close()
+    again = open_store()
+    assert [record.id for record in again.records(None, 10)[0]] == ["hall", "lab"]
+    assert again.open_maps == 0
+    hall = again.find("hall")
+    assert (hall.record.id, hall.count_places(), hall.is_open) == ("hall", 6, False)
+    lab = again.get("lab")
+    assert lab.is_open and again.opened("lab") is lab and again.opened("hall") is None and again.open_maps == 1
     lab.enrol([frame(f"more{i}") for i in range(6)])
     assert [len(segment) for segment in lab.snapshot().segments] == [4, 4, 4]
-    assert store.get("hall").verify().ok
-    store.close()
+    assert again.get("hall").verify().ok
 
 
 def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
@@ -135,13 +132,11 @@ def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
     maps = directory / "maps"
     shutil.copytree(maps / "lab", maps / ".making-hall-0123")
     shutil.copytree(maps / "lab", maps / ".removing-lab-4567")
-    (maps / "lab" / "index-000001.faiss.tmp").write_bytes(b"half")
     (maps / "README").write_text("somebody's note")
     store = Directory(directory)
     assert names(maps) == ["README", "lab"]
     assert [record.id for record in store.records(None, 10)[0]] == ["lab"]
     store.get("lab").enrol([frame("p")])
-    assert not list((maps / "lab").glob("*.tmp"))
     store.close()
 
 
@@ -157,12 +152,12 @@ def test_one_process_at_a_time(directory: Path) -> None:
     Directory(directory).close()
 
 
-def test_a_second_atlas_in_this_process_is_refused_too(store: Directory, directory: Path) -> None:
+def test_a_second_one_in_this_process_is_refused_too(store: Directory, directory: Path) -> None:
     with pytest.raises(DataDirectoryLocked):
         Directory(directory)
 
 
-def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
+def test_a_closed_one_answers_no_more(directory: Path) -> None:
     store = Directory(directory)
     lab = store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     store.close()
@@ -178,12 +173,25 @@ def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
     assert names(directory / "maps" / "lab") == ["map.sqlite"]
 
 
+@pytest.mark.parametrize("earlier", ["placerec data 1\n", "placerec data 2\n"])
+def test_a_directory_of_an_earlier_version_is_refused_and_not_touched(directory: Path, earlier: str) -> None:
+    (directory / "maps" / "lab").mkdir(parents=True)
+    (directory / "FORMAT").write_text(earlier)
+    (directory / "maps" / "lab" / "descriptors-000001.seg").write_bytes(b"as it was")
+    with pytest.raises(DataDirectoryTooOld) as error:
+        Directory(directory)
+    assert str(error.value) == (
+        f"{directory} was written by placerec 1: export its maps with that version, and import the files into a new"
+        " data directory."
+    )
+    left = {path.name: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    assert left == {"FORMAT": earlier.encode(), "LOCK": b"", "descriptors-000001.seg": b"as it was"}
+
+
 def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
     Directory(directory).close()
-    (directory / "FORMAT").write_text("placerec data 1\n")
-    Directory(directory).close()
-    assert (directory / "FORMAT").read_text() == "placerec data 2\n"
-    (directory / "FORMAT").write_text("placerec data 3\n")
+    assert (directory / "FORMAT").read_text() == "placerec data 3\n"
+    (directory / "FORMAT").write_text("placerec data 4\n")
     with pytest.raises(DataDirectoryTooNew):
         Directory(directory)
     (directory / "FORMAT").write_text("something else")
@@ -206,13 +214,12 @@ def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: 
     for name in ("hall", "lab"):
         store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     store.close()
-    edit(directory, "ALTER TABLE maps DROP COLUMN collection")
-    edit(directory, "PRAGMA user_version = 9")
+    edit(directory, "ALTER TABLE maps DROP COLUMN recall")
+    edit(directory, "PRAGMA user_version = 13")
     before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
     with pytest.raises(DataDirectoryTooOld) as error:
         Directory(directory)
     assert str(error.value).startswith(f"{directory / 'maps' / 'lab' / 'map.sqlite'} was written before the first")
-    assert "enrol again in a new data directory" in str(error.value)
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
@@ -274,10 +281,6 @@ def with_a_senseless_record(folder: Path) -> None:
     written_anew(folder, keep="everything")
 
 
-def with_another_layout(folder: Path) -> None:
-    edit(folder.parents[1], "UPDATE layout SET rows_per_segment = 5")
-
-
 def without_a_table(folder: Path) -> None:
     edit(folder.parents[1], "DROP TABLE pictures")
 
@@ -301,7 +304,6 @@ def somebody_elses(folder: Path) -> None:
         with_a_changed_record,
         with_a_changed_name,
         with_a_senseless_record,
-        with_another_layout,
         without_a_table,
         of_another_name,
         somebody_elses,
@@ -338,16 +340,14 @@ def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
 
 def test_a_database_damaged_in_use_takes_its_map_out_of_service(store: Directory, lab: Map, directory: Path) -> None:
     lab.enrol([frame(f"p{i}", metadata={"text": "x" * 3000}) for i in range(200)])
-    opened = lab._opened
-    assert opened is not None
-    opened.database.empty_log()
+    file_of(lab).rest()
     with (directory / "maps" / "lab" / "map.sqlite").open("r+b") as file:
-        file.seek(4096)
-        file.write(os.urandom(400_000))
+        file.seek(2 * 32_768)
+        file.write(os.urandom(600_000))
     with pytest.raises(MapQuarantined):
         for i in range(200):
             lab.place(f"p{i}")
-    assert list(store.quarantined()) == ["lab"]
+    assert list(store.quarantined()) == ["lab"] and store.opened("lab") is None
     for call in (lab.snapshot, lambda: lab.enrol([frame("q")]), lambda: store.get("lab")):
         with pytest.raises(MapQuarantined):
             call()

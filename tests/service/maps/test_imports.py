@@ -19,7 +19,7 @@ from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
 from service.maps import imports
 from service.maps.imports import ReceivedFile
-from tests.core.storage.archives.files import exported
+from tests.core.store.archives.files import exported
 from tests.service.engines import ENCODER, enrolments, runtime_at
 
 

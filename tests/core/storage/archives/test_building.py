@@ -10,17 +10,17 @@ from unicodedata import normalize
 
 import numpy as np
 import pytest
+from core.storage.archives import unpacking
+from core.storage.archives.building import build
+from core.storage.files import segment_files as descriptors
 
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
 from core.maps.archives.manifest import Manifest
 from core.maps.archives.reading import Archive
+from core.maps.archives.unpacking import layout_of
 from core.places import look_address
 from core.store import Directory
-from core.storage.archives import unpacking
-from core.storage.archives.building import build
-from core.maps.archives.unpacking import layout_of
-from core.storage.files import segment_files as descriptors
-from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
+from tests.core.store.archives.files import Parts, changed, imported, line_changed, parts_of
 from tests.core.store.frames import DIMENSION, ENCODER, digest_of, frame
 
 Made = Callable[[bytes], bytes]

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core.storage.archives import exporter
+from core.storage.archives.exporter import Exporter
+from core.storage.database.schema import driver_of
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.ledger.maps.connection import MapConnection
 from core.maps import MapSettings, ReviewSetting
 from core.maps.archives import writing
+from core.maps.forms import COMPRESSED, HALF
 from core.places import Neighborhood
 from core.store import Directory, Map
-from core.storage.archives import exporter
-from core.storage.archives.exporter import Exporter
-from core.storage.database.schema import driver_of
-from core.maps.forms import COMPRESSED, HALF
-from tests.core.storage.archives.files import exported, imported, parts_of
-from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 from tests.core.storage.test_opening import flip
+from tests.core.store.archives.files import exported, imported, parts_of
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 
 
 def listed(map_: Map) -> list[object]:

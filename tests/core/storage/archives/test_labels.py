@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from core.storage.database.schema import driver_of
 
 from core.errors import InvalidArchive
 from core.judgement.verdict import Verdict
 from core.maps import ReviewSetting
 from core.maps.archives.manifest import LABELLED, LABELS, VERSION, WITHOUT_LABELS
 from core.store import Directory, Map
-from core.storage.database.schema import driver_of
-from tests.core.storage.archives.files import Parts, changed, exported, imported, line_changed, parts_of
+from tests.core.store.archives.files import Parts, changed, exported, imported, line_changed, parts_of
 from tests.core.store.frames import frame
 
 SETTING = ReviewSetting(verdicts=("unknown",), most_frames=20)

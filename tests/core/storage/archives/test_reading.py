@@ -19,7 +19,7 @@ from core.maps.archives.lines import CameraLine, PlaceLine, read_line
 from core.maps.archives.manifest import MOST_MANIFEST_BYTES, VERSION, group_names, read_manifest
 from core.maps.archives.reading import Archive, check
 from core.maps.archives.tar_layout import BLOCK, header
-from tests.core.storage.archives.files import Parts, grown, named, parts_of, sealed, taped
+from tests.core.store.archives.files import Parts, grown, named, parts_of, sealed, taped
 
 Made = Callable[[bytes], bytes]
 PLACES = "places-000001.jsonl"

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from core.storage.files.array_files import StaleArrays, check_arrays, read_arrays, write_arrays
 
 ARRAYS = {

@@ -13,13 +13,13 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import StorageFailure, StorageFull
 from core.maps import Enrolment, MapSettings
 from core.store import Directory, Map
-from core.storage.files.segment_files import HEADER_BYTES
-from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.storage.worker import LARGE
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[4]
 LOCAL_BYTES = LOCAL_SHAPE[0] * LOCAL_SHAPE[1]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core.storage.files.row_reader import RowReader
+from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
 from numpy.typing import NDArray
 
 from core.disk.files import Damage
 from core.maps.records import Precision
-from core.storage.files.row_reader import RowReader
-from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
 from tests.core.store.frames import descriptor_of, local_of, packed
 
 SHAPE, ROWS = (3, 5), 10

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-from core.disk.files import Damage
 from core.storage.files.segment_files import (
     HEADER_BYTES,
     Layout,
@@ -21,6 +18,9 @@ from core.storage.files.segment_files import (
     segment_checksum,
     segment_name,
 )
+from numpy.typing import NDArray
+
+from core.disk.files import Damage
 from tests.core.store.frames import descriptor_of, local_of, packed, stored_of
 
 LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4, local_shape=(3, 5))

@@ -10,7 +10,7 @@ from core.maps import Correspondence, Enrolment, MapSettings
 from core.places import PlaceFields, Pose, PoseAccuracy
 from core.store import Directory, Map
 from tests.core.maps.mixed import both_kinds
-from tests.core.storage.archives.files import exported
+from tests.core.store.archives.files import exported
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 ACCURACY = PoseAccuracy(metres=0.5, degrees=2.0)

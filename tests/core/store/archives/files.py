@@ -10,19 +10,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from core import maps
 from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.manifest import seal_of
 from core.maps.archives.reading import Archive
 from core.maps.archives.tar_layout import header, padded
-from core.store import Map
-from core.storage.archives.building import build
-from core.store.directory import Directory
+from core.maps.status import no_progress
+from core.store import Map, Store
 
 Parts = dict[str, bytes]
 
 
-def exported(map_: maps.Map, path: Path) -> bytes:
+def exported(map_: Map, path: Path) -> bytes:
     """The whole file of a map, which is written to ``path`` and removed."""
     map_.exporter.write(path)
     try:
@@ -95,9 +93,15 @@ def _peak() -> int:
 
 
 def imported(
-    atlas: Directory, path: Path, map_id: str, rows_per_segment: int = 4, most_picture_bytes: int = MOST_PICTURE_BYTES
+    store: Store,
+    path: Path,
+    map_id: str,
+    advance: Callable[[int, int], None] = no_progress,
+    check_picture: Callable[[bytes], None] = lambda _: None,
+    most_picture_bytes: int = MOST_PICTURE_BYTES,
+    before_listing: Callable[[int], None] = lambda _: None,
 ) -> Map:
     """The map of a file, listed."""
-    with Archive(path) as archive, atlas.building(map_id) as folder:
-        build(archive, folder, map_id, rows_per_segment, most_picture_bytes=most_picture_bytes)
-    return atlas.get(map_id)
+    with Archive(path) as archive:
+        store.import_map(archive, map_id, advance, check_picture, most_picture_bytes, before_listing)
+    return store.get(map_id)
