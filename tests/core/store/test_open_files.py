@@ -69,13 +69,13 @@ def test_those_used_least_are_closed_and_all_of_them_answer(store: Directory, di
 def test_files_in_use_stay_open_and_are_closed_later(store: Directory, directory: Path) -> None:
     maps = directory / "maps"
     m0, m1, m2 = (store.get(name) for name in NAMES[:3])
-    with m0.viewing() as (connection, state), m1.paused_writes():
+    with m0.viewing() as (connection, state), m1._writing() as write:
         for name in NAMES[2:]:
             assert finds(store.get(name), f"{name}-1")
-        assert {"m0", "m1"} <= set(descriptors_of(maps)), "one is being read, in the other writes are paused"
+        assert {"m0", "m1"} <= set(descriptors_of(maps)), "one is being read, the other written to"
         assert state.places == len(places.listed(connection, -1, 10)) == 6
-        m1.enrol([frame("while paused")])
-    assert m0.count_places() == 6 and finds(m1, "while paused")
+        write.enrol(frame("late"))
+    assert m0.count_places() == 6 and finds(m1, "late")
     for name in ("m3", "m4"):
         assert finds(store.get(name), f"{name}-1")
     assert set(descriptors_of(maps)) == {"m3", "m4"} and len(m2.snapshot()) == 6
