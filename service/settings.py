@@ -98,29 +98,6 @@ class Settings(BaseSettings):
     milvus_database: str = Field(
         default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
     )
-    objects: str | None = Field(
-        default=None,
-        pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?$",
-        description="Bucket of an S3-compatible object store, and prefix in it, to which new pictures and thumbnails "
-        "of maps in a database are put, such as s3://pictures/placerec; default: they are in it.",
-    )
-    objects_endpoint: str | None = Field(
-        default=None,
-        pattern=r"^https?://[^\s/@]+/?$",
-        description="Address of the object store, such as http://minio:9000; https for TLS. Default: AWS's.",
-    )
-    objects_region: str = Field(
-        default="us-east-1", min_length=1, max_length=64, description="Region of the object store."
-    )
-    objects_access_key: str = Field(
-        default="", description="Access key of the object store; by default what the machine's role is given."
-    )
-    objects_secret_key: SecretStr = Field(default=SecretStr(""), description="Secret key that belongs to it.")
-    objects_certificate: Path | None = Field(
-        default=None,
-        description="File with the certificate of the authority that the object store's certificate is checked by, "
-        "besides those of the system.",
-    )
     backup_dir: Path | None = Field(
         default=None,
         description="Folder in which the service itself saves all maps, at intervals that an operator chooses; on "
@@ -253,6 +230,14 @@ class Settings(BaseSettings):
     )
     max_stream_fragments: int = Field(
         default=1024, ge=1, le=1_000_000, description="Most fragments of one WebSocket message."
+    )
+    open_maps: int | None = Field(
+        default=None,
+        ge=1,
+        le=100_000,
+        description="Maps that are open at the same time; the one used least makes room, and is opened again when it "
+        "is used. Each takes 5 file descriptors and 0.7 MB besides what it holds for searching. Default: at most 256, "
+        "as many as the descriptors of the process and a 64th of the memory suffice for.",
     )
     max_maps: int = Field(default=1000, ge=1, le=100_000, description="Most maps of the data directory; then 409.")
     max_places: int = Field(default=10_000_000, ge=1, description="Most places of one map; then 409.")
@@ -397,10 +382,6 @@ class Settings(BaseSettings):
             raise ValueError(f"{PREFIX}VECTORS is {self.vectors}, which needs {PREFIX}DATABASE")
         if self.vectors == "milvus" and self.milvus is None:
             raise ValueError(f"{PREFIX}VECTORS is milvus, which needs {PREFIX}MILVUS")
-        if self.objects is not None and self.engine == "files":
-            raise ValueError(f"{PREFIX}OBJECTS is for maps in a database: it needs {PREFIX}DATABASE")
-        if bool(self.objects_access_key) != bool(self.objects_secret_key.get_secret_value()):
-            raise ValueError(f"{PREFIX}OBJECTS_ACCESS_KEY and {PREFIX}OBJECTS_SECRET_KEY need each other")
         return self
 
     @property

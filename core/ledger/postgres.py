@@ -378,26 +378,23 @@ class PostgresLedger(Postgres):
                     connection.execute("ROLLBACK")
 
     @contextmanager
-    def locked(
-        self, action: str, kind: int, number: int, wait: bool = True, shared: bool = False
-    ) -> Iterator[PostgresConnection | None]:
+    def locked(self, action: str, kind: int, number: int, wait: bool = True) -> Iterator[PostgresConnection | None]:
         """Hold a lock of the database on a connection of its own; None if another has it and ``wait`` is not set.
 
-        Others may hold a ``shared`` one as well, if theirs is shared too.  The lock is gone when the connection is
-        lost, and then the connection takes no further statement.
+        The lock is gone when the connection is lost, and then the connection takes no further statement.
         """
-        key, how = (kind, number % 2**31), "_shared" if shared else ""
+        key = (kind, number % 2**31)
         with self.connection(action, LONG_SECONDS) as connection:
             if wait:
-                connection.execute(f"SELECT pg_advisory_lock{how}(%s::int, %s::int)", key)
-            elif connection.execute(f"SELECT pg_try_advisory_lock{how}(%s::int, %s::int)", key).fetchone() != (True,):
+                connection.execute("SELECT pg_advisory_lock(%s::int, %s::int)", key)
+            elif connection.execute("SELECT pg_try_advisory_lock(%s::int, %s::int)", key).fetchone() != (True,):
                 yield None
                 return
             try:
                 yield PostgresConnection(connection)
             finally:
                 with suppress(psycopg.Error):  # a lost connection has no lock
-                    connection.execute(f"SELECT pg_advisory_unlock{how}(%s::int, %s::int)", key)
+                    connection.execute("SELECT pg_advisory_unlock(%s::int, %s::int)", key)
 
     def check(self) -> None:
         """Ask it whether it takes writes.

@@ -30,15 +30,15 @@ from core.store.database import Closed
 
 FILE = "map.sqlite"
 
-_IDLE_READERS = 8
+_IDLE_READERS = 4
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 _SETTINGS = {
-    "page_size": 1 << 15,
     **DURABLE,
     "secure_delete": "ON",
     "temp_store": "MEMORY",
     "journal_size_limit": _LOG_BYTES,
 }
+_NEW = {"page_size": 8192, "auto_vacuum": "INCREMENTAL", **_SETTINGS}  # fixed when a file gets its first table
 _SCHEMA = Schema(TABLES.application_id, TABLES.version, TABLES.create("sqlite"))
 
 
@@ -54,7 +54,7 @@ def create(folder: Path, made: MapRecord) -> None:
         OSError, sqlite3.Error: the disk refuses.
     """
     folder.mkdir(PRIVATE_FOLDER)
-    driver = sqlite_file.connect(folder / FILE, "rwc", _SETTINGS)
+    driver = sqlite_file.connect(folder / FILE, "rwc", _NEW)
     try:
         _SCHEMA.prepare(driver, create=True)
         with transaction(driver):
@@ -149,8 +149,6 @@ class MapFile:
             driver = sqlite_file.connect(self.path, settings=_SETTINGS)
             try:
                 prepare(driver, str(self.path))
-                sqlite_file.expect_writable(driver)
-                sync_folder(self.folder)  # the name of SQLite's log
             except BaseException:
                 driver.close()
                 raise
@@ -219,6 +217,8 @@ class MapFile:
         with self._lock, self._used(), disk_errors(f"write to map {self.folder.name!r}", FILE):
             if self._writer is None:
                 self._writer = self._connected()
+                sqlite_file.expect_writable(self._writer)
+                sync_folder(self.folder)  # the name of SQLite's log
             driver, committing = self._writer, False
             if self._doubtful:
                 self._empty_log(driver)
@@ -353,18 +353,23 @@ def prepare(driver: sqlite3.Connection, file: str = FILE) -> None:
         raise error.refusal(file) from error
     found = _columns(driver)
     for table, columns in _expected().items():
-        if missing := columns - found.get(table, frozenset()):
+        if missing := columns - found.get(table, set()):
             raise Damage(f"{FILE} lacks {', '.join(sorted(missing))} of its table {table!r}")
 
 
-def _columns(driver: sqlite3.Connection) -> dict[str, frozenset[str]]:
-    tables = driver.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
-    query = "SELECT name FROM pragma_table_info(?)"
-    return {name: frozenset(one for (one,) in driver.execute(query, (name,))) for (name,) in tables.fetchall()}
+def _columns(driver: sqlite3.Connection) -> dict[str, set[str]]:
+    query = (
+        "SELECT tables.name, columns.name FROM sqlite_schema AS tables, pragma_table_info(tables.name) AS columns"
+        " WHERE tables.type = 'table'"
+    )
+    found: dict[str, set[str]] = {}
+    for table, column in driver.execute(query).fetchall():
+        found.setdefault(table, set()).add(column)
+    return found
 
 
 @cache
-def _expected() -> dict[str, frozenset[str]]:
+def _expected() -> dict[str, set[str]]:
     driver = sqlite3.connect(":memory:", isolation_level=None)
     try:
         _SCHEMA.prepare(driver, create=True)

@@ -9,17 +9,19 @@ cached rows included, and reads it anew.
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import StorageFailure
 from core.index import Coder, Codes, CodeTable
-from core.index.flat import flat_index, vectors
+from core.index.flat import Vectors, flat_index, vectors
 from core.ledger.maps import rows
 from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.columns import Columns, read_columns
@@ -76,6 +78,15 @@ class FollowedMap:
         self._lock = threading.RLock()
         self._joining = threading.Lock()
         self._held: Followed | None = None
+        self._given = WeakSet[Snapshot]()
+
+    @property
+    def has_older_readers(self) -> bool:
+        """Whether a snapshot is in use that shows another state of the map than the last one."""
+        now = None if self._held is None else self._held.snapshot
+        if any(one is not now for one in self._given):
+            gc.collect()  # one in a circle of objects, as a traceback makes it, is in use by nobody
+        return any(one is not now for one in self._given)
 
     @property
     def held(self) -> Followed | None:
@@ -111,6 +122,7 @@ class FollowedMap:
             snapshot = self._read(connection, state, source)
         else:
             source, snapshot = held.source, self._with_changes(connection, state, held)
+        self._given.add(snapshot)
         self._held = now = Followed(snapshot, state.revision, state.stamp, source)
         if snapshot.table is not None and snapshot.table.is_loose:
             threading.Thread(target=self._join, name="index", daemon=True).start()
@@ -254,6 +266,7 @@ class FollowedMap:
                     if now is None or now.source is not held.source or now.snapshot.table is None:
                         return
                     self._held = replace(now, snapshot=now.snapshot.with_block(block))
+                    self._given.add(self._held.snapshot)
         except Exception:
             log.exception("The codes of a map could not be joined; searches read all of them")
         finally:
@@ -274,7 +287,7 @@ def _columns(connection: MapConnection, state: MapState, after: int | None = Non
 
 def _both(
     connection: MapConnection, record: MapRecord, first: int, offsets: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int8]]]:
+) -> Iterator[tuple[NDArray[np.int64], Vectors, NDArray[np.int8]]]:
     """Descriptors and local descriptors of rows, some at a time; rows that are gone are left out.
 
     Args:
@@ -288,7 +301,7 @@ def _both(
         if there:
             yield (
                 np.array(there, np.int64) - first,
-                form.descriptors([descriptors[row] for row in there]),
+                form.vectors([descriptors[row] for row in there]),
                 form.locals([local[row] for row in there]),
             )
 

@@ -319,8 +319,8 @@ class Map(LedgerMap):
         """Overwrite or remove what places that were deleted, and former frames, have left where the map is stored.
 
         Afterwards the file of the map has no byte of their pictures, descriptors or keypoints.  In PostgreSQL the rows
-        are gone, and it is its to use their room again.  A query may need them for a minute after a place died, so this
-        takes as long.
+        are gone, and it is its to use their room again.  A query of another service may need them for a minute after a
+        place died, so that this takes as long.
 
         Args:
             progress: called with the number of rows done and of all; its exceptions end the work, which can be done
@@ -330,12 +330,15 @@ class Map(LedgerMap):
             MapBusy: what was deleted is still being read; try again.
         """
         end, total = time.monotonic() + rows.LEFT_SECONDS + 60, self._uncleared()
+        if self.is_open:
+            self.snapshot()  # older ones, which may need what was deleted, are then known
         while left := self._uncleared():
             progress(total - min(left, total), total)
             if time.monotonic() > end:
                 raise MapBusy("What was deleted is still being read: erase it later.")
-            if not self._tidy():
-                threading.Event().wait(1)
+            known = not self.database.shared and not self._followed.has_older_readers
+            if not self._tidy(at_once=known):
+                threading.Event().wait(0.05 if not self.database.shared else 1)
         with self._guarded():
             freed = self.database.erase()
         self._followed.forget()  # what is in memory still has them
@@ -403,7 +406,7 @@ class Map(LedgerMap):
 
     writing = _writing
 
-    def _tidy(self) -> int:
+    def _tidy(self, at_once: bool = False) -> int:
         """Delete what no place names any more; what cannot be deleted now is deleted after another write."""
         with self._transaction() as connection:
-            return rows.clear(connection)
+            return rows.clear(connection, at_once)

@@ -5,8 +5,8 @@ shares descriptors and codes with the one before: rows are added after those tha
 bytes per row that say where a place is and whether it is alive are copied, for the segments that the write touches.
 
 In a map of a few places every place is compared (the tier ``exact``).  A larger map has codes of its descriptors
-(``compact``), which choose the few places that are compared exactly; their descriptors are in memory or, in larger maps,
-read when they are needed.  Rows without a code are compared exactly, so that the whole map is always searched.
+(``compact``), which choose the few places that are compared exactly; their descriptors are in memory or, in larger
+maps, read when they are needed.  Rows without a code are compared exactly, so that the whole map is always searched.
 """
 
 from __future__ import annotations

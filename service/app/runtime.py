@@ -56,13 +56,13 @@ if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
     from service.shared.state import SharedState
 
-CHECK_SECONDS, PICTURES_CHECK_SECONDS = 1.0, 5.0
-"""The disk, the database and the object store are checked at most this often."""
+CHECK_SECONDS = 1.0
+"""The disk and the database are checked at most this often."""
 
 log = logging.getLogger("placerec.runtime")
 
 
-DISPENSABLE = frozenset({"pictures", "others"})
+DISPENSABLE = frozenset({"others"})
 """Checks that a service answers queries without."""
 
 
@@ -155,8 +155,6 @@ class Runtime:
         own = settings.engine == "files"
         self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
         self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
-        silent = "The object store does not answer."
-        self._pictures = Probe(maps.check_pictures, PICTURES_CHECK_SECONDS, silent)
         rooms = erasure.Rooms(self.engine, self.statistics, self.sessions, self.explanation_pictures, self.recordings)
         self._register_jobs(rooms)
         self.sessions.on_run = self._learn
@@ -275,8 +273,6 @@ class Runtime:
             checks["keys"] = Finding.of("ok" if self._keyring is None else self._keyring.state, KeysUnreadable.public)
         if self.stopping:
             checks["service"] = Finding("it is stopping", "it is stopping")
-        if self.settings.objects is not None:
-            checks["pictures"] = await self._pictures.finding()
         if self.shared is not None:
             others = self.shared.differences
             checks["others"] = Finding.of(others.state, others.public_state)

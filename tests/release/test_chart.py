@@ -23,9 +23,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "defaults": {},
     "without Ray": {"ray": NO},
     "without Milvus": {"milvus": NO},
-    "pictures in PostgreSQL": {"objects": NO},
     "stores elsewhere": {"stores": NO, "network": {"to": [{"cidr": "192.0.2.7/32", "port": 5432}]}},
-    "PostgreSQL alone": {"ray": NO, "milvus": NO, "objects": NO},
+    "PostgreSQL alone": {"ray": NO, "milvus": NO},
     "no ingress, rules or backup": {"ingress": NO, "network": NO, "backup": NO},
     "all given": {
         "image": "registry.example.org/placerec:1",
@@ -110,8 +109,7 @@ def test_the_notes_make_the_secrets_that_pods_wait_for(variant: str) -> None:
         ("without Ray", "RAY_AUTH"),
         ("without Milvus", "etcd:2379"),
         ("without Milvus", "PLACEREC_MILVUS"),
-        ("pictures in PostgreSQL", "PLACEREC_OBJECTS"),
-        ("PostgreSQL alone", "kind: StatefulSet metadata: name: seaweedfs"),
+        ("PostgreSQL alone", "serviceName: etcd"),
         ("stores elsewhere", "kind: StatefulSet"),
         ("no ingress, rules or backup", "kind: Ingress "),
         ("no ingress, rules or backup", "kind: NetworkPolicy"),
@@ -123,8 +121,7 @@ def test_what_is_left_out_is_nowhere(variant: str, word: str) -> None:
         texts = (yaml.safe_dump(one) for one in objects_of(variant) if one["kind"] != "NetworkPolicy" or "kind" in word)
         return " ".join(" ".join(texts).split()) + " "
 
-    shown = word if "metadata" not in word else "serviceName: seaweedfs"
-    assert shown in words("defaults") and shown not in words(variant)
+    assert word in words("defaults") and word not in words(variant)
 
 
 def test_without_ray_the_service_is_the_image_s_own_program() -> None:
@@ -144,7 +141,7 @@ def test_values_reach_what_they_name() -> None:
     claims = [
         one["spec"]["volumeClaimTemplates"][0]["spec"] for (kind, _), one in by_name.items() if kind == "StatefulSet"
     ]
-    assert len(claims) == 4 and {claim["storageClassName"] for claim in claims} == {"fast"}
+    assert len(claims) == 3 and {claim["storageClassName"] for claim in claims} == {"fast"}
     assert by_name["PersistentVolumeClaim", "backups"]["spec"]["storageClassName"] == "slow"
     assert by_name["HorizontalPodAutoscaler", "placerec"]["spec"]["minReplicas"] == 3
     assert by_name["Ingress", "placerec"]["spec"]["ingressClassName"] == "nginx"

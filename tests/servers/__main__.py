@@ -1,7 +1,7 @@
 """Servers for trials, until Ctrl+C; ``scripts/cluster`` runs this.
 
     python -m tests.servers            # a PostgreSQL
-    python -m tests.servers --milvus   # with a Milvus and an object store
+    python -m tests.servers --milvus   # with a Milvus
 
 It prints the settings of a service that uses them, as lines for a shell.
 """
@@ -30,22 +30,17 @@ def _all_servers() -> Iterator[Mapping[str, str]]:
     from tests.servers.milvus import running_servers  # needs Milvus's client
 
     with running_servers() as servers:
-        bucket = servers.bucket
         yield {
             "DATABASE": servers.postgres_address,
             "VECTORS": "milvus",
             "MILVUS": servers.milvus_address,
-            "OBJECTS": bucket.address,
-            "OBJECTS_ENDPOINT": bucket.endpoint or "",
-            "OBJECTS_ACCESS_KEY": bucket.access_key,
-            "OBJECTS_SECRET_KEY": bucket.secret_key,
         }
 
 
 def main() -> int:
     """Run the servers until Ctrl+C; the exit status is 1 if one is missing or does not start."""
     parser = argparse.ArgumentParser(prog="scripts/cluster", description="Start a PostgreSQL for trials.")
-    parser.add_argument("--milvus", action="store_true", help="start a Milvus and an object store as well")
+    parser.add_argument("--milvus", action="store_true", help="start a Milvus as well")
     started = _all_servers if parser.parse_args().milvus else _postgres
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl+C does, with the servers
     try:

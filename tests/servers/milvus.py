@@ -1,7 +1,6 @@
-"""A real PostgreSQL, Milvus and object store on this machine, in folders of their own.
+"""A real PostgreSQL and Milvus on this machine, in folders of their own.
 
-Milvus is the server of the package ``milvus`` in .venv-cluster, an old release; the object store is SeaweedFS, there as
-well.
+Milvus is the server of the package ``milvus`` in .venv-cluster, an old release.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from pathlib import Path
 import psycopg
 
 from core.milvus.collection import MilvusConnection
-from tests.servers.object_store import PORTS, object_store
 from tests.servers.postgres import postgres_server
 from tests.servers.process import Missing, Server, fixed_ports
 
@@ -68,17 +66,15 @@ class Servers:
     def __init__(self, folder: Path, milvus_settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
         if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
-        ports = fixed_ports(2 + PORTS)
+        ports = fixed_ports(2)
         self.postgres_address = f"postgresql://placerec@127.0.0.1:{ports[0]}/postgres"
         self.milvus_address = f"http://127.0.0.1:{ports[1]}"
-        data = [folder / "postgres", folder / "milvus", folder / "objects"]
+        data = [folder / "postgres", folder / "milvus"]
         for path in data:
             path.mkdir(parents=True)
         folder.chmod(0o755)
         self.postgres = postgres_server(data[0], ports[0], self._ask_postgres)
         self.milvus = _milvus(data[1], ports[1], milvus_settings, self._ask_milvus)
-        keep_objects, self.bucket, ask_objects = object_store(data[2], ports[2:])
-        self.objects = Server(keep_objects, data[2], ask_objects)
 
     def _ask_postgres(self) -> None:
         psycopg.connect(self.postgres_address, connect_timeout=5).close()
@@ -122,11 +118,10 @@ def running_servers() -> Iterator[Servers]:
     try:
         servers = Servers(folder)
         with ThreadPoolExecutor() as starting:
-            list(starting.map(Server.start, (servers.postgres, servers.milvus, servers.objects)))
+            list(starting.map(Server.start, (servers.postgres, servers.milvus)))
         yield servers
     finally:
         if servers is not None:
-            servers.objects.end(signal.SIGKILL)  # it would take its time
             servers.milvus.end()
             servers.postgres.end(signal.SIGINT)
         shutil.rmtree(folder, ignore_errors=True)

@@ -69,6 +69,14 @@ _OF_NO_PLACE = Statement(
         )
     )
 )
+_UNCODED = Statement(
+    select(DESCRIPTORS.c.row)
+    .where(
+        _of_map(DESCRIPTORS),
+        ~exists().where(CODES.c.map == DESCRIPTORS.c.map, CODES.c.row == DESCRIPTORS.c.row),
+    )
+    .order_by(DESCRIPTORS.c.row)
+)
 _LEAVE = Statement(
     lambda insert: (
         insert(DEAD_ROWS)
@@ -153,6 +161,11 @@ def _sound(
             damaged.add(row)
 
 
+def uncoded(connection: MapConnection) -> list[int]:
+    """The rows that have a descriptor and no code."""
+    return [row for (row,) in connection.execute(_UNCODED)]
+
+
 def of_no_place(connection: MapConnection) -> list[int]:
     """Rows of which something is stored, and that no place has or had."""
     return [row for (row,) in connection.execute(_OF_NO_PLACE)]
@@ -166,9 +179,14 @@ def leave(connection: MapConnection, row: int, revision: int) -> None:
     connection.execute(_LEAVE, number=row, revision=revision)
 
 
-def clear(connection: MapConnection, most: int = CLEARED_AT_ONCE) -> int:
-    """Delete what is stored of up to ``most`` rows that died a while ago; returns how many of them there were."""
-    rows = [row for (row,) in connection.execute(_OLD, age=LEFT_SECONDS, most=most)]
+def clear(connection: MapConnection, at_once: bool = False) -> int:
+    """Delete what is stored of some rows that died a while ago; returns how many of them there were.
+
+    Args:
+        at_once: also of those that died a moment ago.
+    """
+    age = -1 if at_once else LEFT_SECONDS
+    rows = [row for (row,) in connection.execute(_OLD, age=age, most=CLEARED_AT_ONCE)]
     if rows:
         for statement in _DELETE.values():
             connection.execute(statement, rows=rows)

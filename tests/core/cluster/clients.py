@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from core.milvus import open_store
-from core.postgres import Bucket, open_database
+from core.postgres import open_database
 from core.postgres.map import PostgresMap
 from core.postgres.store import PostgresStore
 
@@ -33,13 +33,12 @@ class Addresses:
 
     postgres: str
     milvus: str | None = None
-    bucket: Bucket | None = None
 
     def open(self) -> PostgresStore[Any]:
         """The store of all its maps."""
         if self.milvus is None:
-            return open_database(self.postgres, self.bucket)
-        return open_store(self.milvus, self.postgres, bucket=self.bucket)
+            return open_database(self.postgres)
+        return open_store(self.milvus, self.postgres)
 
     def written(self) -> str:
         """As one word of a command line."""
@@ -48,9 +47,7 @@ class Addresses:
     @classmethod
     def read(cls, written: str) -> Addresses:
         """The addresses that were written as one word."""
-        values = json.loads(written)
-        bucket = values.pop("bucket")
-        return cls(**values, bucket=None if bucket is None else Bucket(**bucket))
+        return cls(**json.loads(written))
 
 
 class StoreClient:

@@ -113,7 +113,7 @@ class ClusterKills(Generic[ServersT]):
             time.sleep(draw.uniform(0.2, 2.0))
             killed = self.parts[part]
             time.sleep(max(0.0, self._served.get(part, 0.0) + killed.lives - time.monotonic()))
-            self._store.sweep_objects()  # must not take anything that counts
+            self._store.sweep()  # must not take anything that counts
             killed.kill(draw)
             began = time.monotonic()
             killed.start()
@@ -185,7 +185,7 @@ def cluster_of(vectors: str) -> KillableCluster[Any]:
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
     engine = argparse.ArgumentParser(prog="scripts/soak cluster", add_help=False)
-    told = "what searches the maps; milvus: with an object store besides (default: %(default)s)"
+    told = "what searches the maps (default: %(default)s)"
     engine.add_argument("--vectors", choices=("postgres", "milvus"), default="postgres", help=told)
     cluster = cluster_of(engine.parse_known_args(arguments)[0].vectors)
     chosen = read_arguments(arguments, "cluster", __doc__, cluster.parts, kills=100, others=engine)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownMap, UnknownPlace
 from core.index import Coder, Codes, table
-from core.ledger.maps import rows
+from core.ledger.maps import rows, writing
 from core.maps import MapSettings
 from core.maps.forms import COMPRESSED
 from core.store import Map, Snapshot, Store, following, recall, snapshot, tiers
@@ -104,7 +104,8 @@ def test_a_map_becomes_compact_and_exact_again(store: Store) -> None:
 
 @on_both
 def test_a_map_grows_into_its_tier_and_shrinks(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
+    for module in (tiers, writing):
+        monkeypatch.setattr(module, "COMPACT_FROM", 60)
     monkeypatch.setattr(tiers, "ON_DISK_FROM", 120)
     lab = make(store, 59)
 

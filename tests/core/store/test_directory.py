@@ -342,7 +342,7 @@ def test_a_database_damaged_in_use_takes_its_map_out_of_service(store: Directory
     lab.enrol([frame(f"p{i}", metadata={"text": "x" * 3000}) for i in range(200)])
     file_of(lab).rest()
     with (directory / "maps" / "lab" / "map.sqlite").open("r+b") as file:
-        file.seek(2 * 32_768)
+        file.seek(8 * 8192)
         file.write(os.urandom(600_000))
     with pytest.raises(MapQuarantined):
         for i in range(200):

@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 import psycopg
 import pytest
-from core.postgres.search.map import Map
 
 from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
+from core.store import Map
 from core.store.cluster import Cluster
 from tests.servers.postgres import Postgres
 from tests.service.wire import eventually
