@@ -302,14 +302,19 @@ class Directory(Store):
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
         """
-        found = self.find(map_id)
+        found = self._touched(self.find(map_id))
         found.open()
+        return found
+
+    def _touched(self, found: Map) -> Map:
+        assert isinstance(found.database, MapFile)
+        found.database.touch()
         return found
 
     def opened(self, map_id: str) -> Map | None:
         """A map that is in service and was read from disk before; None otherwise.  This never waits."""
         found = self._maps.get(map_id)
-        return found if found is not None and found.is_open else None
+        return self._touched(found) if found is not None and found.is_open else None
 
     def find(self, map_id: str) -> Map:
         """A map whose record and number of places can be used without reading it from disk.

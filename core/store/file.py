@@ -19,7 +19,7 @@ from core.disk.files import Damage, disk_errors, is_full, sync_file, sync_folder
 from core.disk.permissions import PRIVATE_FOLDER
 from core.disk.sqlite_file import DURABLE, NotOurs, Schema, UnreadVersion, rewrite, transaction
 from core.disk.write_ahead_log import check_log
-from core.errors import MapBusy
+from core.errors import MapBusy, UnknownMap
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -94,6 +94,12 @@ class OpenFiles:
         with self._lock:
             for other in in_use:
                 self._files.setdefault(other)
+
+    def touch(self, file: MapFile) -> None:
+        """Note the use of what is in memory of a file, if it is open."""
+        with self._lock:
+            if file in self._files:
+                self._files.move_to_end(file)
 
     def drop(self, file: MapFile) -> None:
         """Note that a file is closed."""
@@ -247,6 +253,10 @@ class MapFile:
         sync_file(self.path.with_name(f"{FILE}-wal"))  # or a power cut could restore its former content
         self._doubtful = False
 
+    def touch(self) -> None:
+        """Note that the map is used, whether or not that needs its file."""
+        self._open_files.touch(self)
+
     def rest(self) -> bool:
         """Close the file until its next use; False if it is in use."""
         if not self._lock.acquire(blocking=False):
@@ -256,6 +266,7 @@ class MapFile:
                 if self._using:
                     return False
                 self._close_connections()
+                self._open_files.drop(self)
         finally:
             self._lock.release()
         self.rested()
@@ -287,8 +298,11 @@ class MapFile:
         Raises:
             Damage: it is not a map, or another one than its folder says.
         """
-        with self.glancing() as connection:
-            return record.state_of(connection, self.folder.name)
+        try:
+            with self.glancing() as connection:
+                return record.state_of(connection, self.folder.name)
+        except UnknownMap as error:
+            raise Damage(f"{FILE} has no record of a map") from error
 
     def room(self) -> int:
         """The bytes of the file and its log."""

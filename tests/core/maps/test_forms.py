@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.maps.records import Precision
 from core.maps.forms import (
     BLOCK,
     inner_products,
@@ -14,6 +13,7 @@ from core.maps.forms import (
     unpack_descriptors,
     unpack_local,
 )
+from core.maps.records import Precision
 from tests.core.store.frames import descriptor_of, local_of
 
 PRECISIONS: tuple[Precision, ...] = ("half", "compressed")

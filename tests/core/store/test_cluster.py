@@ -1,4 +1,4 @@
-"""What the contract of all stores leaves open: several clients at the same time, versions, servers that are gone."""
+"""What the contract of all stores leaves open of PostgreSQL: several services at the same time, versions, restores."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from core.errors import MapExists, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
-from core.ledger.maps import frames
-from core.maps import MapSettings
+from core.errors import MapExists, StorageFailure, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
+from core.ledger.maps import frames, rows
+from core.maps import MapSettings, ReviewSetting
 from core.maps.archives.reading import Archive
-from core.postgres import rows
-from core.postgres.map import PostgresMap
+from core.maps.forms import COMPRESSED
+from core.store import Directory, Map
 from core.store.cluster import Cluster
-from core.store import Directory
 from tests.core.maps.mixed import check_one_kind_wins
-from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
+from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing, check_moves
+from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.maps.writers import check_writers_lose_nothing
 from tests.core.store.archives.conftest import filled
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
@@ -32,13 +32,13 @@ pytestmark = [pytest.mark.postgres, pytest.mark.timeout(300)]
 @pytest.fixture
 def store(postgres: Postgres) -> Iterator[Cluster]:
     store = Cluster(postgres.address)
+    store.check_writable()  # makes the tables
     yield store
-    for one in store.records(None, 100)[0]:
-        store.delete(one.id)
     store.close()
+    execute(postgres, "DELETE FROM maps")
 
 
-def made(store: Cluster) -> PostgresMap:
+def made(store: Cluster) -> Map:
     return store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
 
 
@@ -61,6 +61,76 @@ def test_of_two_writers_of_both_kinds_of_coordinates_one_wins(postgres: Postgres
     other = Cluster(postgres.address)
     check_one_kind_wins(store.get("lab"), other.get("lab"))
     other.close()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("precision", ["half", COMPRESSED])
+def test_a_map_moves_from_and_to_a_data_directory(store: Cluster, tmp_path: Path, precision: str) -> None:
+    check_moves(store, tmp_path, precision)
+
+
+def test_a_page_for_review_is_of_one_moment(store: Cluster) -> None:
+    check_pages_are_of_one_moment(made(store).review, store.get("lab").review)
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        ("DELETE FROM pictures WHERE row = 1", "is recorded to keep image, which is not true"),
+        ("UPDATE pictures SET bytes = 'image of B' WHERE row = 1", "has a stored image that does not match its digest"),
+        (
+            "UPDATE pictures SET bytes = 'image of B', digest = sha256('image of B') WHERE row = 1",
+            "has an image that does not match its digest",
+        ),
+    ],
+    ids=["lost", "damaged", "another"],
+)
+def test_a_wrong_picture_is_reported(postgres: Postgres, store: Cluster, damage: str, problem: str) -> None:
+    lab = store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
+    lab.enrol([frame("a"), frame("b")])
+    assert store.verify("lab").ok
+    execute(postgres, damage)
+    report = store.verify("lab")
+    assert not report.ok and report.problems == [f"PostgreSQL: place 'b' {problem}"]
+    assert lab.picture("a") == b"image of a" and store.quarantined() == {}
+
+
+@pytest.mark.parametrize("damage", ["DELETE FROM review_pictures", "UPDATE review_pictures SET bytes = 'another'"])
+def test_a_wrong_picture_for_review_is_not_shown(postgres: Postgres, store: Cluster, damage: str) -> None:
+    review, setting = made(store).review, ReviewSetting(most_frames=2)
+    assert [review.keep(one, {}, setting) for one in (b"one", b"one", b"two", b"three")] == [True, False, True, True]
+    shown = [review.picture(one.number) for one in review.page(None, 10).frames]
+    assert shown == [b"three", b"two"]
+    execute(postgres, damage)
+    for one in review.page(None, 10).frames:
+        with pytest.raises(StorageFailure, match="damaged"):
+            review.picture(one.number)
+
+
+def test_damage_is_a_failure_of_each_use_and_not_of_the_map(postgres: Postgres, store: Cluster) -> None:
+    lab = made(store)
+    lab.enrol([frame("a"), frame("b")])
+    store.close()
+    later = Cluster(postgres.address)
+    execute(postgres, "UPDATE descriptors SET bytes = set_byte(bytes, 0, get_byte(bytes, 0) # 1) WHERE row = 1")
+    for _ in range(2):
+        with pytest.raises(StorageFailure, match="Map 'lab' is damaged: row 1 of descriptors does not match"):
+            later.get("lab").snapshot()
+    assert later.quarantined() == {} and later.get("lab").place("b").id == "b"
+    later.get("lab").forget("b")
+    assert len(later.get("lab").snapshot()) == 1
+    later.close()
+
+
+def test_a_closed_store_refuses_the_maps_that_are_held(store: Cluster) -> None:
+    lab = made(store)
+    lab.enrol([frame("a")])
+    held = lab.snapshot()
+    store.close()
+    for use in (lab.snapshot, lambda: lab.enrol([frame("b")]), lambda: lab.place("a"), lambda: store.get("lab")):
+        with pytest.raises(StorageFailure, match="closed"):
+            use()
+    assert len(held) == 1
 
 
 def test_a_refused_import_leaves_nothing(store: Cluster, tmp_path: Path) -> None:
@@ -121,10 +191,10 @@ def test_rows_that_no_place_has_are_deleted_a_while_later(store: Cluster, monkey
 
     def stored() -> tuple[set[int], set[int]]:
         with lab.viewing() as (connection, _):
-            return set(rows.both_at(connection, range(9))), set(frames.pictures_at(connection, range(9)))
+            return set(rows.at(connection, "descriptors", range(9))), set(frames.pictures_at(connection, range(9)))
 
     assert stored() == ({0, 1, 2}, {0, 1, 2})  # a query that is under way may read them
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     lab.enrol([frame("c")])
     assert stored() == ({2, 3}, {2, 3})
 
@@ -160,7 +230,7 @@ def test_erased_places_leave_no_row(postgres: Postgres, store: Cluster, monkeypa
     lab.forget_sequence("monday")
     left = "SELECT count(*) FROM descriptors UNION ALL SELECT count(*) FROM pictures"
     assert execute(postgres, left) == [(6,), (6,)]  # a query may still need them
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     report = lab.erase()
     assert (report.rows, execute(postgres, left)) == (3, [(3,), (3,)])
     assert lab.erase().rows == 0 and lab.count_places() == 3
@@ -174,7 +244,7 @@ def test_erased_looks_leave_no_row(postgres: Postgres, store: Cluster, monkeypat
     assert follower.get("lab").snapshot().alive.sum() == 4 and follower.get("lab").thumbnail(f"p1/{'0' * 16}")
     lab.forget("p1")
     assert lab.forget_looks([f"p2/{'1' * 16}", "p2", f"p1/{'0' * 16}"]) == 1
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     left = " UNION ALL ".join(f"SELECT count(*) FROM {table}" for table in ("descriptors", "pictures", "keypoints"))
     assert (lab.erase().rows, execute(postgres, left)) == (3, [(1,), (1,), (1,)])
     # Another service neither finds nor shows them any more.

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core.storage.files import segment_files
+from core.storage.files.segment_files import ERASING, HEADER_BYTES
+from core.storage.opening import open_map
 
 from core.disk.files import write_at
 from core.errors import MapBusy
 from core.maps import MapSettings, PlaceFilter, ReviewSetting
+from core.maps.forms import pack_descriptors, pack_local
 from core.maps.records import Enrolment
 from core.store import Directory, Map, erasing
-from core.storage.files import segment_files
-from core.maps.forms import pack_descriptors, pack_local
-from core.storage.files.segment_files import ERASING, HEADER_BYTES
-from core.storage.opening import open_map
-from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.core.storage.search.test_tier_memory import become
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 
 SETTING = ReviewSetting(most_frames=100, most_bytes=1 << 24)
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from core.storage.database.connections import Database, DatabaseClosed, connect
+from core.storage.database.schema import driver_of, prepare
 
 from core.disk.files import Damage
 from core.ledger.maps.connection import MapConnection
-from core.storage.database.connections import Database, DatabaseClosed, connect
-from core.storage.database.schema import driver_of, prepare
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any, TypeVar
@@ -11,16 +10,15 @@ from typing import Any, TypeVar
 import numpy as np
 import psycopg
 import pytest
-from core.postgres.search import following
-from core.postgres.search.cache import RowCache
-from core.postgres.search.map import CodedMap
 
 from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
+from core.store import Map
 from core.store.cluster import Cluster
 from tests.servers.postgres import Postgres
+from tests.service.wire import eventually
 
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
 
@@ -54,17 +52,17 @@ def stores(empty: Postgres) -> Iterator[list[Cluster]]:
         store.close()
 
 
-def maps_of(stores: list[Cluster]) -> list[CodedMap]:
+def maps_of(stores: list[Cluster]) -> list[Map]:
     return [store.get("lab") for store in stores]
 
 
-def expect_alike(one: CodedMap, address: str) -> None:
+def expect_alike(one: Map, address: str) -> None:
     """A map is what a service that has just started reads."""
     fresh = Cluster(address)
     try:
         (other,) = maps_of([fresh])
         held = one.snapshot()
-        assert other.index_status().state == ("ready" if len(held) < COMPACT_FROM else "unopened")
+        assert other.index_status().state == "unopened"
         read = other.snapshot()
         assert (len(held), held.rows) == (len(read), read.rows) and (held.alive == read.alive).all()
         rows = np.flatnonzero(read.alive)
@@ -128,7 +126,7 @@ def test_commits_of_two_services_that_take_turns_as_they_like(stores: list[Clust
     first.enrol([frame(f"p{number}", number + 1, sequence="walk") for number in range(300)])
     failures: list[BaseException] = []
 
-    def work(map_: CodedMap, seed: int) -> None:
+    def work(map_: Map, seed: int) -> None:
         random = np.random.default_rng(seed)
         try:
             for step in range(40):
@@ -174,11 +172,15 @@ def test_a_reading_that_began_earlier_does_not_set_back_what_is_held(stores: lis
 
 def sent_again(request: Callable[[], Answered]) -> Answered:
     """The result of a request that is sent again as long as it is refused because a connection was lost."""
-    while True:
-        try:
-            return request()
-        except StoreUnavailable:
-            time.sleep(0.1)
+    answers: list[Answered] = []
+
+    def answered() -> bool:
+        with suppress(StoreUnavailable):
+            answers.append(request())
+        return bool(answers)
+
+    assert eventually(answered, 60)
+    return answers[0]
 
 
 def swap_databases(server: Postgres, away: str, back: str) -> None:
@@ -218,61 +220,3 @@ def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(stores: list[C
     finally:
         with psycopg.connect(empty.address.replace("/postgres", "/template1"), autocommit=True) as connection:
             connection.execute("DROP DATABASE later")
-
-
-def test_codes_are_read_and_not_computed_and_rebuilt_where_they_are_damaged(
-    stores: list[Cluster], empty: Postgres, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, there = maps_of(stores)
-    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
-    with psycopg.connect(empty.address) as connection:
-        connection.execute("UPDATE descriptors SET code = set_byte(code, 0, get_byte(code, 0) # 255) WHERE row = 7")
-        connection.execute("UPDATE descriptors SET code = NULL WHERE row = 8")  # as an engine without codes stores it
-    snapshot = there.snapshot()
-    assert snapshot.table is not None
-    codes = snapshot.table.codes(0, 300)
-    right = snapshot.table.coder.encode(snapshot.descriptors_at(np.arange(300)))
-    assert np.flatnonzero((codes != right).any(axis=1)).tolist() == [7]
-    report = stores[0].verify("lab")
-    assert not report.ok and "p7" in report.problems[0] and "rebuild the index" in report.problems[0]
-    there.rebuild_index()
-    assert stores[0].verify("lab").ok
-    expect_alike(there, empty.address)
-
-
-def test_rows_are_read_once_and_the_cache_stays_within_its_bytes(stores: list[Cluster]) -> None:
-    here, there = maps_of(stores)
-    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
-    snapshot = there.snapshot()
-    cache = stores[1].cache
-    snapshot.locals_at(np.arange(50))
-    misses = cache.misses
-    assert misses == 50
-    snapshot.locals_at(np.arange(50))
-    assert (cache.misses, cache.hits) == (misses, 50)
-    small = RowCache(1000)
-    for number in range(100):
-        small.put({number: bytes(100)})
-        assert small.size <= 1000
-    assert 0 < len(small) < 10 and not small.get([0]) and small.get([99])
-
-
-def test_blocks_of_codes_are_joined_in_the_background(
-    stores: list[Cluster], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("core.index.table.LOOSE_ROWS", 256)
-    here, there = maps_of(stores)
-    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
-    done = threading.Event()
-    join = following.FollowedMap._join
-
-    def joined(self: following.FollowedMap) -> None:
-        join(self)
-        done.set()
-
-    monkeypatch.setattr(following.FollowedMap, "_join", joined)
-    there.snapshot()
-    assert not there.snapshot().table.is_loose or done.wait(60)  # type: ignore[union-attr]
-    query = frame("q", 5).descriptor[np.newaxis]
-    ((rows, _),) = there.scope().search(query)
-    assert rows[0] == 4

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 
 import pytest
+from core.storage.database.schema import driver_of
 
 from core.maps import SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.maps.selection import Conditions, RecentFrames, Selection
 from core.places import PlaceFields
 from core.store import Map
-from core.storage.database.schema import driver_of
 from tests.core.store.frames import frame
 
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
+from core.storage.database.schema import SCHEMA, check_schema, prepare
 
 from core.disk.files import Damage
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 from core.ledger.maps.schema import METADATA
-from core.storage.database.schema import SCHEMA, check_schema, prepare
 
 
 @pytest.fixture

@@ -6,16 +6,16 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from core.storage.database.schema import driver_of
+from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import MapQuarantined
 from core.index.flat import vectors
 from core.ledger.maps import frames
 from core.maps import MapSettings
 from core.store import Directory, Map
-from core.storage.database.schema import driver_of
-from core.storage.files.segment_files import HEADER_BYTES
-from tests.core.store.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
+from tests.core.store.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 
 
 @pytest.fixture

@@ -9,8 +9,11 @@ import pytest
 
 from core.maps import Correspondence, History, MapSettings
 from core.places import Neighborhood
-from core.store import Directory, Map
+from core.store import Map, Store
+from tests.core.store.conftest import OpenStore, on_both
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+
+pytestmark = on_both
 
 
 def row(map_: Map, place_id: str) -> int:
@@ -53,18 +56,19 @@ EXPECTED = {
 }
 
 
-def test_places_at_one_station_are_the_same_also_after_a_restart(atlas: Directory, aligned: Map) -> None:
+def test_places_at_one_station_are_the_same_also_after_a_restart(
+    open_store: OpenStore, store: Store, aligned: Map
+) -> None:
     assert {name: same_place(aligned, name) for name in EXPECTED} == EXPECTED
     assert aligned.verify().ok
-    atlas.close()
-    again = Directory(atlas._directory)
-    assert {name: same_place(again.get("lab"), name) for name in EXPECTED} == EXPECTED
-    again.close()
+    store.close()
+    again = open_store().get("lab")
+    assert {name: same_place(again, name) for name in EXPECTED} == EXPECTED
 
 
 @pytest.fixture
-def hall(atlas: Directory) -> Map:
-    return atlas.create("hall", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
+def hall(store: Store) -> Map:
+    return store.create("hall", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
 
 
 def copy(source: Map, target: Map, without: str = "", prefix: str = "") -> None:

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from core.maps import Enrolment, History, MapSettings
-from core.maps.records import MOST_LOOKS, Outline
+from core.maps.records import MOST_LOOKS
 from core.places import PlaceFields, look_address
-from core.store import Directory, Map
+from core.store import Map, Store
+from tests.core.store.conftest import OpenStore, on_both
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
 EARLIER = datetime(2026, 1, 2, 3, 4, 5, 678, tzinfo=UTC)
 LATER = datetime(2026, 2, 3, tzinfo=UTC)
 
 
+pytestmark = on_both
+
+
 @pytest.fixture
-def hall(atlas: Directory) -> Map:
-    return atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
+def hall(store: Store) -> Map:
+    return store.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
 
 
 def history(ordinal: int | None = None, picture: str = "none") -> History:
@@ -46,17 +48,15 @@ def test_a_place_comes_with_its_history(lab: Map, hall: Map) -> None:
     assert hall.verify().ok
 
 
-def test_what_is_searched_is_what_is_stored(atlas: Directory, directory: Path, hall: Map) -> None:
+def test_what_is_searched_is_what_is_stored(open_store: OpenStore, store: Store, hall: Map) -> None:
     items = [(frame(name, x=float(n), sequence="monday"), history(n * 10)) for n, name in enumerate("abcdefg")]
     hall.transfer.adopt(items)
     before = hall.snapshot().whereabouts
     assert before.ordinal.tolist() == [0, 10, 20, 30, 40, 50, 60]
     assert hall.verify().ok
-    atlas.close()
-    again = Directory(directory)
-    after = again.get("hall").snapshot().whereabouts
+    store.close()
+    after = open_store().get("hall").snapshot().whereabouts
     assert np.array_equal(after.ordinal, before.ordinal) and np.array_equal(after.position, before.position)
-    again.close()
 
 
 def test_the_same_frame_again_only_takes_fields_and_history(hall: Map) -> None:
@@ -101,19 +101,6 @@ def test_all_or_none(hall: Map) -> None:
     assert hall.verify().ok
 
 
-def test_two_states_of_a_place_are_distinguished() -> None:
-    one = Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2026")
-    assert one.same_as(Outline(9, "a", 7, b"d", "none", None, "monday", 3, "2026")), "numbers and rows are a map's own"
-    for other in (
-        Outline(1, "a", 0, b"e", "image", None, "monday", 3, "2026"),
-        Outline(1, "a", 0, b"d", "image", "front", "monday", 3, "2026"),
-        Outline(1, "a", 0, b"d", "image", None, "tuesday", 3, "2026"),
-        Outline(1, "a", 0, b"d", "image", None, "monday", 4, "2026"),
-        Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2027"),
-    ):
-        assert not one.same_as(other)
-
-
 def test_many_are_forgotten_at_once_but_not_what_changed(lab: Map) -> None:
     lab.enrol([frame(name, sequence="monday") for name in "abcde"])
     listed = {place.id: place.digest for place in lab.transfer.outline()}
@@ -136,20 +123,3 @@ def test_what_a_map_can_tell(lab: Map) -> None:
     assert lab.picture("a") == content and lab.picture("none") is None
     found = lab.transfer.find(["a", "none", "b"])
     assert {name: row for name, (_, row) in found.items()} == {"a": 0, "b": 1}
-
-
-def test_nobody_else_writes_while_writes_are_paused(lab: Map) -> None:
-    done = threading.Event()
-
-    def write() -> None:
-        lab.enrol([frame("b")])
-        done.set()
-
-    with lab.transfer.paused_writes():
-        writer = threading.Thread(target=write)
-        writer.start()
-        assert not done.wait(0.2)
-        lab.enrol([frame("a")])  # but the one who asked for it
-    assert done.wait(10)
-    writer.join()
-    assert [place.id for place in lab.transfer.outline()] == ["a", "b"]

@@ -1,14 +1,14 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
+from core.index import Coder
 from core.maps.records import COMPACT_FROM, TierSetting
 from core.maps.status import Tier
-from core.store import Directory, Map
+from core.store import Map, Store
 from core.store.tiers import ON_DISK_FROM, holds_for, tier_for
-from tests.core.store.frames import ENCODER, frame
+from tests.core.store.conftest import OpenStore, on_both
+from tests.core.store.frames import DIMENSION, LOCAL_SHAPE, frame
 
 
 @pytest.mark.parametrize(
@@ -48,23 +48,26 @@ def test_what_is_in_memory_follows_setting_and_size(
     assert holds_for(setting, places, present) == wanted
 
 
-def test_what_a_map_takes_on_disk(lab: Map, directory: Path) -> None:
-    assert lab.storage_status().bytes_per_place == 0
+@on_both
+def test_what_a_map_takes(store: Store, lab: Map) -> None:
+    assert lab.storage_status().bytes_per_place == 0 or not lab.database.shared
     lab.enrol([frame(f"p{i}") for i in range(5)])
     status = lab.storage_status()
-    files = {path.name: path.stat().st_size for path in (directory / "maps" / "lab").iterdir()}
-    assert status.precision == "half"
-    assert status.descriptors == sum(size for name, size in files.items() if name.endswith(".seg"))
-    assert status.database == sum(size for name, size in files.items() if name.startswith("map.sqlite"))
-    assert status.index == 0
-    assert status.bytes_per_place == round(sum(files.values()) / 5)
+    assert (status.precision, status.descriptors) == ("half", 5 * (2 * DIMENSION + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]))
+    assert status.index == 5 * Coder.of(DIMENSION).bytes_per_place
+    assert status.database >= status.keypoints.bytes > 0
+    whole = status.descriptors + status.index + status.database
+    assert status.bytes_per_place == round((lab.database.room() or whole) / 5)
 
 
-def test_a_map_that_was_not_used_yet_says_so(atlas: Directory, directory: Path) -> None:
-    atlas.create("big", ENCODER, 16, local_shape=(0, 0)).enrol([frame("p", local_shape=(0, 0))])
-    atlas.close()
-    again = Directory(directory)
-    status = again.find("big").index_status()
+@on_both
+def test_a_map_that_was_not_used_yet_says_so(open_store: OpenStore, store: Store, lab: Map) -> None:
+    lab.enrol([frame("p")])
+    store.close()
+    again = open_store()
+    status = again.find("lab").index_status()
     assert (status.state, status.tier, status.wanted, status.setting) == ("unopened", "exact", "exact", "auto")
-    assert again.get("big").index_status().state == "ready"
-    again.close()
+    assert again.opened("lab") is None and again.open_maps == 0
+    found = again.get("lab")
+    found.open()
+    assert found.index_status().state == "ready" and again.open_maps == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,11 @@ import pytest
 from core.errors import LookNameTaken, TooManyLooks
 from core.maps import Enrolment
 from core.places import look_address
-from core.store import Directory, Map
+from core.store import Map, Store
+from tests.core.store.conftest import OpenStore, on_both
 from tests.core.store.frames import digest_of, frame
+
+pytestmark = on_both
 
 
 def learnt(place_id: str, run: str = "s-1", least: float | None = 0.25) -> Enrolment:
@@ -31,15 +33,13 @@ def test_they_go_with_their_run(lab: Map) -> None:
     assert lab.verify().ok
 
 
-def test_their_score_is_searched_with_and_survives(atlas: Directory, directory: Path, lab: Map) -> None:
+def test_their_score_is_searched_with_and_survives(open_store: OpenStore, store: Store, lab: Map) -> None:
     lab.enrol([frame("a"), learnt("b")])
     assert lab.snapshot().whereabouts.least.tolist() == [-np.inf, 0.25]
-    atlas.close()
-    again = Directory(directory)
-    found = again.get("lab")
+    store.close()
+    found = open_store().get("lab")
     assert found.snapshot().whereabouts.least.tolist() == [-np.inf, 0.25] and found.verify().ok
     assert found.forget_new_ground("s-1") == 1
-    again.close()
 
 
 def test_another_frame_makes_them_an_operators(lab: Map) -> None:

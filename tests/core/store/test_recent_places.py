@@ -13,7 +13,7 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import StoredPlace
 from core.places import PlaceFields, Pose
 from core.store import Map
-from core.storage.map import LONGEST_METADATA, MOST_RECENT, RecentPlaces
+from core.store.map import LONGEST_METADATA, MOST_RECENT, RecentPlaces
 from tests.core.store.frames import frame
 
 

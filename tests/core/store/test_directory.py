@@ -25,6 +25,7 @@ from core.errors import (
 from core.ledger.maps.checksums import checksum_of
 from core.maps import MapSettings
 from core.store import Directory, Map
+from tests.core.store.conftest import OpenStore, file_of
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[3]
@@ -36,113 +37,107 @@ def names(folder: Path) -> list[str]:
 
 def test_the_directory_is_made_with_all_above_it(tmp_path: Path) -> None:
     directory = tmp_path / "a" / "b" / "data"
-    atlas = Directory(directory)
+    store = Directory(directory)
     assert names(directory) == ["FORMAT", "LOCK", "maps"]
-    assert atlas.records(None, 10) == ([], None)
-    atlas.close()
-    atlas.close()
+    assert store.records(None, 10) == ([], None)
+    store.close()
+    store.close()
 
 
-def test_a_map_is_made_whole(atlas: Directory, directory: Path) -> None:
+def test_a_map_is_made_whole(store: Directory, directory: Path) -> None:
     settings = MapSettings(description="the lab", keep="none", same_place_radius=2.5, same_place_frames=0)
-    lab = atlas.create("lab", ENCODER, DIMENSION, settings, local_shape=LOCAL_SHAPE)
-    assert atlas.get("lab") is lab
+    lab = store.create("lab", ENCODER, DIMENSION, settings, local_shape=LOCAL_SHAPE)
+    assert store.get("lab") is lab
     assert lab.record.settings() == settings
     assert (lab.record.id, lab.record.encoder, lab.record.dimension) == ("lab", ENCODER, DIMENSION)
     assert names(directory / "maps") == ["lab"]
     assert lab.verify().ok
     with pytest.raises(MapExists):
-        atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
 
 
 def test_the_shape_of_the_local_descriptors_is_the_maps_for_life(directory: Path) -> None:
-    atlas = Directory(directory)
-    atlas.create("lab", ENCODER, DIMENSION, local_shape=(7, 2)).enrol([frame("p", local_shape=(7, 2))])
-    atlas.create("hall", ENCODER, DIMENSION).enrol([frame("p", local_shape=(0, 0))])
+    store = Directory(directory)
+    store.create("lab", ENCODER, DIMENSION, local_shape=(7, 2)).enrol([frame("p", local_shape=(7, 2))])
+    store.create("hall", ENCODER, DIMENSION).enrol([frame("p", local_shape=(0, 0))])
     with pytest.raises(ValueError, match="cannot have"):
-        atlas.create("none", ENCODER, DIMENSION, local_shape=(7, 0))
-    atlas.close()
-    atlas = Directory(directory)
-    assert [atlas.get(name).record.local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
-    assert [atlas.get(name).snapshot().local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
+        store.create("none", ENCODER, DIMENSION, local_shape=(7, 0))
+    store.close()
+    store = Directory(directory)
+    assert [store.get(name).record.local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
+    assert [store.get(name).snapshot().local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
     for name in ("lab", "hall"):
         with pytest.raises(ValueError, match="local descriptors"):
-            atlas.get(name).enrol([frame("q", local_shape=(2, 7))])
-        assert atlas.get(name).verify().ok
+            store.get(name).enrol([frame("q", local_shape=(2, 7))])
+        assert store.get(name).verify().ok
     assert names(directory / "maps") == ["hall", "lab"]
-    atlas.close()
+    store.close()
 
 
 @pytest.mark.parametrize("name", ["import", "Lab", "", "../lab", ".making-x", "a/b", "x" * 65])
-def test_what_cannot_name_a_map(atlas: Directory, directory: Path, name: str) -> None:
+def test_what_cannot_name_a_map(store: Directory, directory: Path, name: str) -> None:
     with pytest.raises(InvalidIdentifier):
-        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     assert names(directory / "maps") == []
-    for call in (atlas.get, atlas.delete, atlas.verify):
+    for call in (store.get, store.delete, store.verify):
         with pytest.raises(UnknownMap):
             call(name)
 
 
-def test_maps_are_listed_page_by_page(atlas: Directory) -> None:
+def test_maps_are_listed_page_by_page(store: Directory) -> None:
     for name in ("b", "a", "d", "c"):
-        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-    first, cursor = atlas.records(None, 3)
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    first, cursor = store.records(None, 3)
     assert [record.id for record in first] == ["a", "b", "c"]
-    second, last = atlas.records(cursor, 3)
+    second, last = store.records(cursor, 3)
     assert ([record.id for record in second], last) == (["d"], None)
     with pytest.raises(InvalidCursor):
-        atlas.records("nonsense", 3)
+        store.records("nonsense", 3)
     with pytest.raises(ValueError, match="at least one"):
-        atlas.records(None, 0)
+        store.records(None, 0)
 
 
-def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Directory, directory: Path) -> None:
-    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
-    atlas.delete("lab")
+def test_a_deleted_map_is_gone_and_its_name_is_free(store: Directory, directory: Path) -> None:
+    store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
+    store.delete("lab")
     assert names(directory / "maps") == []
-    for call in (atlas.get, atlas.delete):
+    for call in (store.get, store.delete):
         with pytest.raises(UnknownMap):
             call("lab")
-    again = atlas.create("lab", ENCODER, DIMENSION + 1, local_shape=LOCAL_SHAPE)
+    again = store.create("lab", ENCODER, DIMENSION + 1, local_shape=LOCAL_SHAPE)
     again.enrol([frame("q", dimension=DIMENSION + 1)])
     assert (again.count_places(), again.verify().ok) == (1, True)
 
 
-def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path) -> None:
-    with_places = Directory(directory, rows_per_segment=4)
+def test_maps_are_found_at_the_next_start_and_read_on_first_use(open_store: OpenStore, store: Directory) -> None:
     for name in ("hall", "lab"):
-        with_places.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
-            [frame(f"{name}{i}") for i in range(6)]
-        )
-    with_places.close()
-    atlas = Directory(directory, rows_per_segment=100)  # the maps there are keep theirs
-    assert [record.id for record in atlas.records(None, 10)[0]] == ["hall", "lab"]
-    assert all(found._opened is None for found in atlas._maps.values())
-    assert (atlas.find("hall").record.id, atlas.find("hall").count_places()) == ("hall", 6)
-    lab = atlas.get("lab")
-    assert atlas._maps["hall"]._opened is None
-    assert lab.count_places() == 6
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
+    store.close()
+    again = open_store()
+    assert [record.id for record in again.records(None, 10)[0]] == ["hall", "lab"]
+    assert again.open_maps == 0
+    hall = again.find("hall")
+    assert (hall.record.id, hall.count_places(), hall.is_open) == ("hall", 6, False)
+    lab = again.get("lab")
+    assert lab.is_open and again.opened("lab") is lab and again.opened("hall") is None and again.open_maps == 1
     lab.enrol([frame(f"more{i}") for i in range(6)])
     assert [len(segment) for segment in lab.snapshot().segments] == [4, 4, 4]
-    assert atlas.get("hall").verify().ok
-    atlas.close()
+    assert again.get("hall").verify().ok
 
 
 def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
-    atlas = Directory(directory)
-    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-    atlas.close()
+    store = Directory(directory)
+    store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    store.close()
     maps = directory / "maps"
     shutil.copytree(maps / "lab", maps / ".making-hall-0123")
     shutil.copytree(maps / "lab", maps / ".removing-lab-4567")
-    (maps / "lab" / "index-000001.faiss.tmp").write_bytes(b"half")
     (maps / "README").write_text("somebody's note")
-    atlas = Directory(directory)
+    store = Directory(directory)
     assert names(maps) == ["README", "lab"]
-    assert [record.id for record in atlas.records(None, 10)[0]] == ["lab"]
-    atlas.get("lab").enrol([frame("p")])
-    assert not list((maps / "lab").glob("*.tmp"))
-    atlas.close()
+    assert [record.id for record in store.records(None, 10)[0]] == ["lab"]
+    store.get("lab").enrol([frame("p")])
+    store.close()
 
 
 def test_one_process_at_a_time(directory: Path) -> None:
@@ -157,19 +152,19 @@ def test_one_process_at_a_time(directory: Path) -> None:
     Directory(directory).close()
 
 
-def test_a_second_atlas_in_this_process_is_refused_too(atlas: Directory, directory: Path) -> None:
+def test_a_second_one_in_this_process_is_refused_too(store: Directory, directory: Path) -> None:
     with pytest.raises(DataDirectoryLocked):
         Directory(directory)
 
 
-def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
-    atlas = Directory(directory)
-    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-    atlas.close()
+def test_a_closed_one_answers_no_more(directory: Path) -> None:
+    store = Directory(directory)
+    lab = store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    store.close()
     for call in (
-        lambda: atlas.get("lab"),
-        lambda: atlas.create("x", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE),
-        atlas.check_writable,
+        lambda: store.get("lab"),
+        lambda: store.create("x", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE),
+        store.check_writable,
     ):
         with pytest.raises(StorageFailure, match="closed"):
             call()
@@ -178,21 +173,34 @@ def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
     assert names(directory / "maps" / "lab") == ["map.sqlite"]
 
 
+@pytest.mark.parametrize("earlier", ["placerec data 1\n", "placerec data 2\n"])
+def test_a_directory_of_an_earlier_version_is_refused_and_not_touched(directory: Path, earlier: str) -> None:
+    (directory / "maps" / "lab").mkdir(parents=True)
+    (directory / "FORMAT").write_text(earlier)
+    (directory / "maps" / "lab" / "descriptors-000001.seg").write_bytes(b"as it was")
+    with pytest.raises(DataDirectoryTooOld) as error:
+        Directory(directory)
+    assert str(error.value) == (
+        f"{directory} was written by placerec 1: export its maps with that version, and import the files into a new"
+        " data directory."
+    )
+    left = {path.name: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    assert left == {"FORMAT": earlier.encode(), "LOCK": b"", "descriptors-000001.seg": b"as it was"}
+
+
 def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
     Directory(directory).close()
-    (directory / "FORMAT").write_text("placerec data 1\n")
-    Directory(directory).close()
-    assert (directory / "FORMAT").read_text() == "placerec data 2\n"
-    (directory / "FORMAT").write_text("placerec data 3\n")
+    assert (directory / "FORMAT").read_text() == "placerec data 3\n"
+    (directory / "FORMAT").write_text("placerec data 4\n")
     with pytest.raises(DataDirectoryTooNew):
         Directory(directory)
     (directory / "FORMAT").write_text("something else")
     with pytest.raises(StorageFailure, match="right directory"):
         Directory(directory)
     (directory / "FORMAT").unlink()
-    atlas = Directory(directory)
-    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-    atlas.close()
+    store = Directory(directory)
+    store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    store.close()
     edit(directory, "PRAGMA user_version = 99")
     edit(directory, "ALTER TABLE places ADD COLUMN floor INTEGER")
     with pytest.raises(DataDirectoryTooNew, match="schema 99"):
@@ -202,27 +210,26 @@ def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
 
 
 def test_a_map_of_an_older_schema_is_refused_by_name_and_not_touched(directory: Path) -> None:
-    atlas = Directory(directory)
+    store = Directory(directory)
     for name in ("hall", "lab"):
-        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-    atlas.close()
-    edit(directory, "ALTER TABLE maps DROP COLUMN collection")
-    edit(directory, "PRAGMA user_version = 9")
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    store.close()
+    edit(directory, "ALTER TABLE maps DROP COLUMN recall")
+    edit(directory, "PRAGMA user_version = 13")
     before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
     with pytest.raises(DataDirectoryTooOld) as error:
         Directory(directory)
     assert str(error.value).startswith(f"{directory / 'maps' / 'lab' / 'map.sqlite'} was written before the first")
-    assert "enrol again in a new data directory" in str(error.value)
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
-def test_the_disk_can_be_written_or_not(atlas: Directory, directory: Path) -> None:
+def test_the_disk_can_be_written_or_not(store: Directory, directory: Path) -> None:
     before = names(directory)
-    atlas.check_writable()
+    store.check_writable()
     assert names(directory) == before
     shutil.rmtree(directory)
     with pytest.raises(StorageFailure):
-        atlas.check_writable()
+        store.check_writable()
 
 
 def edit(directory: Path, *statements: str) -> None:
@@ -274,10 +281,6 @@ def with_a_senseless_record(folder: Path) -> None:
     written_anew(folder, keep="everything")
 
 
-def with_another_layout(folder: Path) -> None:
-    edit(folder.parents[1], "UPDATE layout SET rows_per_segment = 5")
-
-
 def without_a_table(folder: Path) -> None:
     edit(folder.parents[1], "DROP TABLE pictures")
 
@@ -301,7 +304,6 @@ def somebody_elses(folder: Path) -> None:
         with_a_changed_record,
         with_a_changed_name,
         with_a_senseless_record,
-        with_another_layout,
         without_a_table,
         of_another_name,
         somebody_elses,
@@ -311,46 +313,44 @@ def somebody_elses(folder: Path) -> None:
 def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
     directory: Path, spoil: Callable[[Path], None]
 ) -> None:
-    atlas = Directory(directory, rows_per_segment=4)
+    store = Directory(directory, rows_per_segment=4)
     for name in ("hall", "lab"):
-        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
-    atlas.close()
+        store.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
+    store.close()
     spoil(directory / "maps" / "lab")
-    atlas = Directory(directory)
+    store = Directory(directory)
     try:
         with pytest.raises(MapQuarantined, match="damaged and out of service"):
-            atlas.get("lab")
-        assert list(atlas.quarantined()) == ["lab"]
-        assert atlas.quarantined()["lab"]
-        assert [record.id for record in atlas.records(None, 10)[0]] == ["hall"]
-        assert atlas.get("hall").snapshot().search(descriptor_of("hall3"))[0][0] == 3
+            store.get("lab")
+        assert list(store.quarantined()) == ["lab"]
+        assert store.quarantined()["lab"]
+        assert [record.id for record in store.records(None, 10)[0]] == ["hall"]
+        assert store.get("hall").snapshot().search(descriptor_of("hall3"))[0][0] == 3
         with pytest.raises(MapExists):
-            atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-        report = atlas.verify("lab")
+            store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        report = store.verify("lab")
         assert not report.ok
-        assert report.problems[0] == f"out of service: {atlas.quarantined()['lab']}"
-        atlas.delete("lab")
-        assert atlas.quarantined() == {}
-        assert atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).count_places() == 0
+        assert report.problems[0] == f"out of service: {store.quarantined()['lab']}"
+        store.delete("lab")
+        assert store.quarantined() == {}
+        assert store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).count_places() == 0
     finally:
-        atlas.close()
+        store.close()
 
 
-def test_a_database_damaged_in_use_takes_its_map_out_of_service(atlas: Directory, lab: Map, directory: Path) -> None:
+def test_a_database_damaged_in_use_takes_its_map_out_of_service(store: Directory, lab: Map, directory: Path) -> None:
     lab.enrol([frame(f"p{i}", metadata={"text": "x" * 3000}) for i in range(200)])
-    opened = lab._opened
-    assert opened is not None
-    opened.database.empty_log()
+    file_of(lab).rest()
     with (directory / "maps" / "lab" / "map.sqlite").open("r+b") as file:
-        file.seek(4096)
-        file.write(os.urandom(400_000))
+        file.seek(8 * 8192)
+        file.write(os.urandom(600_000))
     with pytest.raises(MapQuarantined):
         for i in range(200):
             lab.place(f"p{i}")
-    assert list(atlas.quarantined()) == ["lab"]
-    for call in (lab.snapshot, lambda: lab.enrol([frame("q")]), lambda: atlas.get("lab")):
+    assert list(store.quarantined()) == ["lab"] and store.opened("lab") is None
+    for call in (lab.snapshot, lambda: lab.enrol([frame("q")]), lambda: store.get("lab")):
         with pytest.raises(MapQuarantined):
             call()
-    assert not atlas.verify("lab").ok
-    atlas.delete("lab")
+    assert not store.verify("lab").ok
+    store.delete("lab")
     assert names(directory / "maps") == []

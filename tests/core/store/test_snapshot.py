@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.index.flat import flat_index, vectors
 from core.store import Snapshot
-from core.storage.search import snapshot as module
+from core.store import snapshot as module
 from core.store.segment import Location
 from tests.core.store.frames import descriptor_of, local_of
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 
@@ -14,13 +13,15 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.writing import Write
-from core.store import Directory, Map
+from core.store import Map, Store
+from tests.core.store.conftest import OpenStore, on_both
 
 MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
 INTRINSICS = Intrinsics(width=64, height=48, fx=50.1, fy=50.2, cx=31.5, cy=23.5)
 SECONDS = 30.0
 
 
+@on_both
 def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -> None:
     assert lab.cameras.all() == []
     assert lab.cameras.put("front", None)[1]
@@ -32,37 +33,36 @@ def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -
         lab.cameras.mask("front")
 
 
-def test_intrinsics_are_stored_beside_the_mask(directory: Path, atlas: Directory, lab: Map) -> None:
+@on_both
+def test_intrinsics_are_stored_beside_the_mask(open_store: OpenStore, store: Store, lab: Map) -> None:
     lab.cameras.put("front", MASK, INTRINSICS)
     lab.cameras.put("back", None)
-    atlas.close()
-    opened = Directory(directory)
-    again = opened.get(lab.record.id).cameras
+    store.close()
+    again = open_store().get("lab").cameras
     assert again.find("front").intrinsics == again.intrinsics("front") == INTRINSICS
     assert again.intrinsics("back") is again.intrinsics("gone") is again.intrinsics(None) is None
     again.put("front", None)
     assert again.find("front").intrinsics is None
-    opened.close()
 
 
 @pytest.mark.parametrize("mask", [None, MASK])
 def test_a_range_of_values_goes_with_the_mask_of_frames(
-    mask: Mask | None, directory: Path, atlas: Directory, lab: Map
+    mask: Mask | None, open_store: OpenStore, store: Store, lab: Map
 ) -> None:
     lab.cameras.put("front", mask, None, (0, 1023))
     before = lab.cameras.mask("front")
     lab.cameras.put("front", mask, None, (0, 4095))
-    atlas.close()
-    with closing(Directory(directory)) as opened:
-        cameras = opened.get(lab.record.id).cameras
-        assert cameras.find("front").settings() == (mask, None, (0, 4095))
-        used = cameras.mask("front")
-        assert used is not None and before is not None and used.digest != before.digest
-        assert used.covered(8, 8).any() == (mask is not None)
-        cameras.put("front", mask)
-        assert cameras.mask("front") == mask
+    store.close()
+    cameras = open_store().get("lab").cameras
+    assert cameras.find("front").settings() == (mask, None, (0, 4095))
+    used = cameras.mask("front")
+    assert used is not None and before is not None and used.digest != before.digest
+    assert used.covered(8, 8).any() == (mask is not None)
+    cameras.put("front", mask)
+    assert cameras.mask("front") == mask
 
 
+@on_both
 def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one who keeps others from writing asks for them; neither may wait for the other."""
     lab.cameras.put("front", None)

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from core.maps import History, MapSettings
-from core.store import Directory, Map
-from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
-
-
-@pytest.fixture
-def lab(tmp_path: Path) -> Map:
-    return Directory(tmp_path, rows_per_segment=4).create("lab", ENCODER, DIMENSION, MapSettings(keep="none"), LOCAL_SHAPE)
+from core.maps import History
+from core.store import Map
+from tests.core.store.frames import digest_of, frame
 
 
 def ordinals(lab: Map) -> dict[str, int]:
