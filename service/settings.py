@@ -70,30 +70,24 @@ class Settings(BaseSettings):
         "any number of services, such as postgresql://placerec:password@db/placerec; default: they are in the data "
         "directory of this one.",
     )
-    vectors: Literal["auto", "files", "postgres", "milvus"] = Field(
-        default="auto",
-        description="The engine that keeps the maps' descriptors and searches them: files in the data directory, "
-        "PostgreSQL with an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a "
-        "database, else postgres.",
-    )
     row_cache_bytes: int = Field(
         default=256 << 20,
         ge=1 << 20,
-        description="With vectors in PostgreSQL: most bytes of descriptors, local descriptors and keypoints that were "
-        "read and are kept in memory.",
+        description="With a database: most bytes of descriptors, local descriptors and keypoints that were read and "
+        "are kept in memory.",
     )
     milvus: str | None = Field(
         default=None,
         pattern=r"^https?://[^\s/@]+/?$",
-        description="Address of Milvus, such as http://milvus:19530; https for TLS.",
+        description="Address of a Milvus that has an index of maps whose codes outgrow the memory of a service, such "
+        "as http://milvus:19530; https for TLS. Default: codes are in memory.",
     )
     milvus_token: SecretStr = Field(
         default=SecretStr(""), description="Token of Milvus, such as user:password; none by default."
     )
     milvus_certificate: Path | None = Field(
         default=None,
-        description="File with the certificate of the authority that Milvus's certificate is checked by; by default "
-        "by those that gRPC comes with.",
+        description="File with the certificate of the authority of Milvus's; default: those that gRPC comes with.",
     )
     milvus_database: str = Field(
         default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
@@ -367,21 +361,6 @@ class Settings(BaseSettings):
         if self.database is not None and not re.match(r"postgres(ql)?://|\w+ *=", self.database.get_secret_value()):
             raise ValueError(f"{PREFIX}DATABASE is not an address such as postgresql://placerec:password@db/placerec")
         return self
-
-    @model_validator(mode="after")
-    def _vectors_have_addresses(self) -> Settings:
-        if self.vectors in ("postgres", "milvus") and self.database is None:
-            raise ValueError(f"{PREFIX}VECTORS is {self.vectors}, which needs {PREFIX}DATABASE")
-        if self.vectors == "milvus" and self.milvus is None:
-            raise ValueError(f"{PREFIX}VECTORS is milvus, which needs {PREFIX}MILVUS")
-        return self
-
-    @property
-    def engine(self) -> Literal["files", "postgres", "milvus"]:
-        """The engine that keeps the maps' descriptors and searches them."""
-        if self.vectors != "auto":
-            return self.vectors
-        return "files" if self.database is None else "postgres"
 
     @property
     def models_directory(self) -> Path:

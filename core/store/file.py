@@ -30,10 +30,11 @@ from core.store.database import Closed
 
 FILE = "map.sqlite"
 
-_IDLE_READERS = 8
+_IDLE_READERS = 4
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 _SETTINGS = {
-    "page_size": 1 << 15,
+    "page_size": 8192,
+    "auto_vacuum": "INCREMENTAL",
     **DURABLE,
     "secure_delete": "ON",
     "temp_store": "MEMORY",

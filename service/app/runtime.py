@@ -152,7 +152,7 @@ class Runtime:
         """Whether it has no room to write, as of the latest look."""
         self._noted = "the service is ready"
         maps, folder = self.engine.maps, partial(check_writable, settings.data_dir)
-        own = settings.engine == "files"
+        own = settings.database is None
         self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
         self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
         rooms = erasure.Rooms(self.engine, self.statistics, self.sessions, self.explanation_pictures, self.recordings)
@@ -314,4 +314,4 @@ def _jobs(settings: Settings, engine: Engine) -> Jobs:
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database, shared_maps=settings.engine != "files")
+    return SharedState(settings, database, shared_maps=True)

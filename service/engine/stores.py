@@ -25,13 +25,12 @@ class OpenStore:
         with disk_errors(f"open the data directory {settings.data_dir}"):
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
-        if settings.engine == "files":
+        if settings.database is None:
             self.maps = Directory(settings.data_dir)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            assert settings.database is not None  # the settings were checked
             cluster = open_cluster(settings.database.get_secret_value(), settings.row_cache_bytes)
         except BaseException:
             self._lock.release()

@@ -199,7 +199,7 @@ def test_head_and_worker_find_each_other_by_the_token_and_strangers_do_not(ray_f
 def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
     replica, told = compose()["services"]["placerec-1"], objects("ConfigMap")["placerec"]["data"]
     given = replica["environment"]
-    for name in ("PLACEREC_VECTORS", "PLACEREC_MILVUS", "PLACEREC_RAY", "PLACEREC_RAY_ADDRESS"):
+    for name in ("PLACEREC_MILVUS", "PLACEREC_RAY", "PLACEREC_RAY_ADDRESS"):
         assert given[name] == told[name]
     own = yaml.safe_load((DOCKER / "milvus.yaml").read_text())
     assert own == yaml.safe_load(objects("ConfigMap")["milvus"]["data"]["user.yaml"])

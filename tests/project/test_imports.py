@@ -53,7 +53,7 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"
 EXTRAS = {
     "core/ledger/postgres": {"cluster"},
     "core/maps/formats/mcap": {"bags"},
-    "core/milvus": {"milvus"},
+    "core/index/milvus": {"milvus"},
     "core/postgres": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},

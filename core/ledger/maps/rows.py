@@ -69,6 +69,14 @@ _OF_NO_PLACE = Statement(
         )
     )
 )
+_UNCODED = Statement(
+    select(DESCRIPTORS.c.row)
+    .where(
+        _of_map(DESCRIPTORS),
+        ~exists().where(CODES.c.map == DESCRIPTORS.c.map, CODES.c.row == DESCRIPTORS.c.row),
+    )
+    .order_by(DESCRIPTORS.c.row)
+)
 _LEAVE = Statement(
     lambda insert: (
         insert(DEAD_ROWS)
@@ -151,6 +159,11 @@ def _sound(
             raise DamagedRow(f"row {row} of {kind} does not match its checksum")
         else:
             damaged.add(row)
+
+
+def uncoded(connection: MapConnection) -> list[int]:
+    """The rows that have a descriptor and no code."""
+    return [row for (row,) in connection.execute(_UNCODED)]
 
 
 def of_no_place(connection: MapConnection) -> list[int]:

@@ -10,7 +10,7 @@ import pytest
 
 from core.disk.files import disk_errors
 from core.errors import InvalidModel, PlacerecError, StorageFailure, StorageFull
-from core.ledger.outage import Unreachable
+from core.outage import Unreachable
 from service.access.roles import ANONYMOUS, NOBODY, OWNER, Principal
 from service.app.probe import Finding, Probe
 from service.app.runtime import Condition
