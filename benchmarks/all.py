@@ -117,9 +117,6 @@ PARTS = {
     "engines": Part("benchmarks.cluster.engines", "--service", "PostgreSQL"),
     "sizing": Part("benchmarks.cluster.sizing", needs="PostgreSQL"),
     "kills": Part("tests.core.cluster.kills", "--kills 100", "PostgreSQL"),
-    "ray": Part("benchmarks.ray_serve.overhead", "--places 400 --robots 1 --robots 16", "placerec[ray]"),
-    "scaling": Part("benchmarks.ray_serve.scaling", "", "placerec[ray]"),
-    "ray-kills": Part("tests.service.ray_serve.kills", "--kills 12", "placerec[ray]"),
 }
 """The parts by name, accuracy first, then speed, then robustness and clusters."""
 

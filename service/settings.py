@@ -121,41 +121,6 @@ class Settings(BaseSettings):
         description="Before the service is ready, do once what requests do, so that no robot waits at its first frame. "
         "Without it a start is a second shorter.",
     )
-    ray: bool = Field(
-        default=False,
-        description="Encode in processes of a Ray cluster, deployed with Ray Serve; needs the extra placerec[ray].",
-    )
-    ray_address: str = Field(
-        default="",
-        description="Address (host:port) of the Ray cluster to join; without one, a Ray is started on this machine, "
-        "for this service alone.",
-    )
-    ray_replicas: int = Field(default=1, ge=1, le=10_000, description="Fewest processes that encode.")
-    ray_max_replicas: int = Field(
-        default=0,
-        ge=0,
-        le=10_000,
-        description="Most processes that encode, while frames wait for those that run; 0: as many as the cluster has "
-        "room for when they are deployed.",
-    )
-    ray_replica_cpus: float = Field(
-        default=1.0, ge=0, le=1024, allow_inf_nan=False, description="Processors of one process that encodes."
-    )
-    ray_replica_gpus: float = Field(
-        default=0.0,
-        ge=0,
-        le=64,
-        allow_inf_nan=False,
-        description="GPUs of one process that encodes, or a share of one; it uses it if the device is cuda.",
-    )
-    ray_batch: int = Field(
-        default=8, ge=1, le=256, description="Most frames that are sent to such a process in one call."
-    )
-    ray_scale_seconds: Seconds = Field(
-        default=10.0,
-        description="Seconds for which frames have to wait before more processes are started; they are stopped after "
-        "twenty times as long.",
-    )
     storage_threads: int = Field(
         default=8, ge=1, le=256, description="Searches, reads and writes of maps that run at the same time."
     )
@@ -224,6 +189,14 @@ class Settings(BaseSettings):
     )
     max_stream_fragments: int = Field(
         default=1024, ge=1, le=1_000_000, description="Most fragments of one WebSocket message."
+    )
+    open_maps: int | None = Field(
+        default=None,
+        ge=1,
+        le=100_000,
+        description="Maps that are open at the same time; the one used least makes room, and is opened again when it "
+        "is used. Each takes 5 file descriptors and 0.7 MB besides what it holds for searching. Default: at most 256, "
+        "as many as the descriptors of the process and a 64th of the memory suffice for.",
     )
     max_maps: int = Field(default=1000, ge=1, le=100_000, description="Most maps of the data directory; then 409.")
     max_places: int = Field(default=10_000_000, ge=1, description="Most places of one map; then 409.")
