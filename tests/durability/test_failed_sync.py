@@ -1,4 +1,4 @@
-"""A log that cannot be synced for a while: what was refused does not come true, though its file is closed for others."""
+"""A log that cannot be synced for a while: what was refused does not come true, though others need its descriptors."""
 
 from __future__ import annotations
 
