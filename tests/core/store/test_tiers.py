@@ -55,7 +55,7 @@ def test_what_a_map_takes(store: Store, lab: Map) -> None:
     status = lab.storage_status()
     assert (status.precision, status.descriptors) == ("half", 5 * (2 * DIMENSION + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]))
     assert status.index == 5 * Coder.of(DIMENSION).bytes_per_place
-    assert status.database >= status.keypoints.bytes > 0
+    assert status.keypoints is not None and status.database >= status.keypoints.bytes > 0
     whole = status.descriptors + status.index + status.database
     assert status.bytes_per_place == round((lab.database.room() or whole) / 5)
 
