@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -164,8 +163,6 @@ def fill(atlas: Directory, name: str, encoder: Encoder, shots: Sequence[tuple[in
     ]
     for start in range(0, len(items), 64):
         made.enrol(items[start : start + 64])
-    while made.index_status().state == "building":
-        time.sleep(0.05)
     return made
 
 

@@ -16,7 +16,7 @@ class OpenStore:
     Servers are not waited for: without one that can be reached the service starts and is not ready.
 
     Raises:
-        DataDirectoryLocked, DataDirectoryTooNew, StorageFull, StorageFailure: the data directory cannot be opened.
+        DataDirectoryLocked, DataDirectoryTooNew, DataDirectoryTooOld, StorageFull, StorageFailure: the data directory cannot be opened.
         MissingExtra: the client of the servers is not installed.
     """
 
@@ -29,13 +29,12 @@ class OpenStore:
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
         self.most_open = most_open_maps(settings)
-        if settings.engine == "files":
-            self.maps = Directory(settings.data_dir)
+        if settings.database is None:
+            self.maps = Directory(settings.data_dir, self.most_open)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            assert settings.database is not None  # the settings were checked
             cluster = open_cluster(settings.database.get_secret_value(), settings.row_cache_bytes)
         except BaseException:
             self._lock.release()

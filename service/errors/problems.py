@@ -311,8 +311,7 @@ def problem_of(
     if isinstance(error, faults.InvalidRequest) and error.errors:
         extras["errors"] = error.errors
     if isinstance(error, faults.NotReady):
-        hidden = error.public is not None and not confided
-        extras["checks"] = {name: detail if hidden and found != "ok" else found for name, found in error.checks.items()}
+        extras["checks"] = error.checks
     return Problem(
         type=kind.type,
         title=kind.title,

@@ -92,7 +92,7 @@ def serve_application(
             # these handlers the process would end there, before the application is closed.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: None)
-            server = DrainingServer(config, settings.drain_seconds, on_signal, on_stop, keeps_handlers=settings.ray)
+            server = DrainingServer(config, settings.drain_seconds, on_signal, on_stop)
             await server.serve(sockets=[listener])
 
     with asyncio.Runner(loop_factory=config.get_loop_factory()) as runner, listener:
@@ -105,10 +105,6 @@ class DrainingServer(uvicorn.Server):
     At the first SIGTERM or SIGINT ``on_signal`` is called, and for ``drain_seconds`` every request is still answered.
     Then ``on_stop`` is called, nothing new is accepted, and the requests under way have the configured time to end.
     A second signal ends the waiting.
-
-    Args:
-        keeps_handlers: set the handlers of the signals again and again, since a library that is loaded meanwhile, as
-            Ray, sets others, which end the process at once.
     """
 
     def __init__(
@@ -117,10 +113,8 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         on_signal: Callable[[], None],
         on_stop: Callable[[], None],
-        keeps_handlers: bool = False,
     ) -> None:
         super().__init__(config)
-        self._keeps_handlers = keeps_handlers
         self._drain_seconds, self._on_signal, self._on_stop = drain_seconds, on_signal, on_stop
         self._stop_at: float | None = None
 
@@ -136,9 +130,6 @@ class DrainingServer(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Whether to stop now; uvicorn calls it several times a second."""
-        if self._keeps_handlers:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, self.handle_exit)
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)

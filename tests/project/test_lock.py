@@ -59,8 +59,8 @@ def test_the_packages_of_ros_are_locked_within_their_ranges() -> None:
     [
         ("service", []),
         ("lab", ["lab"]),
-        ("replica", ["milvus", "ray"]),
-        ("development", ["dev", "lab", "milvus", "ray"]),
+        ("replica", ["milvus"]),
+        ("development", ["dev", "lab", "milvus"]),
     ],
 )
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:
@@ -99,10 +99,7 @@ def test_opencv_still_reads_caffe() -> None:
     assert version(locked("service")["opencv-python-headless"]).startswith("4.")
 
 
-OWN = {
-    f"http://{host}"
-    for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "placerec")
-}
+OWN = {f"http://{host}" for host in ("0.0.0.0", "127.0.0.1", "etcd", "localhost", "milvus", "placerec")}
 OWN |= {"https://the-host", "postgresql://placerec"}
 """Addresses of this machine and of parts of a cluster."""
 

@@ -21,9 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from core.ledger import Tables
-from core.store import review
+from core.ledger.maps import schema
 from core.store.directory import FORMAT
-from core.storage.database import schema
 from placerec_client import Client, Map, NewPlace
 from service.access import key_table
 from service.access.keys import Keys
@@ -42,7 +41,6 @@ SURFACE, INTERFACE = "surface.json", "openapi.json.xz"
 
 TABLES: dict[str, Tables] = {
     "map": schema.TABLES,
-    "review": review.TABLES,
     "jobs": rows.TABLES,
     "keys": key_table.TABLES,
     "sessions": table.TABLES,
@@ -193,9 +191,9 @@ def pack(data: Path, target: Path) -> None:
         archive.add(data, "data", filter=anonymous)
 
 
-def write(version: str) -> Path:
+def write(version: str, fixtures: Path = FIXTURES) -> Path:
     """Write the fixtures of a version anew; their folder."""
-    release = FIXTURES / version
+    release = fixtures / version
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         data, made = folder / "data", folder / "made"

@@ -83,7 +83,6 @@ def test_the_soft_limit_is_raised_and_readiness_shows_what_is_open(small: Server
     assert small.client.delete("/v1/maps/shown").status_code == 204
 
 
-@pytest.mark.xfail(strict=False, reason="the store does not close maps yet")
 def test_more_maps_than_may_be_open_are_queried_at_once_and_newcomers_are_answered(small: Server) -> None:
     names = [f"m{number}" for number in range(MAPS)]
     for number, name in enumerate(names):

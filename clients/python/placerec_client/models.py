@@ -1113,12 +1113,10 @@ class IndexStatus(Model):
     setting: Known[Literal["auto", "exact", "compact"]]
     tier: Known[Literal["exact", "compact"]]
     wanted: Known[Literal["exact", "compact"]]
-    state: Known[Literal["ready", "building", "unopened"]]
-    progress: float
+    state: Known[Literal["ready", "unopened"]]
     rows_indexed: int
     recall: Recall | None = None
     bytes_in_memory: int
-    problem: str | None = None
 
 
 class Progress(Model):
@@ -1455,14 +1453,14 @@ class ReviewSetting(Model):
 
 
 class StorageStatus(Model):
-    """The size of a map on disk."""
+    """The size of what is stored of a map."""
 
     precision: str
     bytes_per_place: int
     descriptors: int
     index: int
     database: int
-    keypoints: KeypointsStatus | None = None
+    keypoints: KeypointsStatus
 
 
 class VerdictCounts(Model):

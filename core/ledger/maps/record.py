@@ -177,10 +177,10 @@ def state_of(connection: MapConnection, map_id: str, locked: bool = False) -> Ma
 
     Raises:
         UnknownMap: it is gone.
-        DamagedRow: its row does not match its checksum, or is invalid, or is missing in the file of the map.
+        DamagedRow: its row does not match its checksum, or is invalid, or is missing in a file, which has one map.
     """
     found = connection.execute(_OF_NUMBER_LOCKED if locked else _OF_NUMBER)
-    if not found and connection.whole.dialect == "sqlite":  # nobody deletes it
+    if not found and connection.whole.dialect == "sqlite":
         raise DamagedRow("the map's own record is missing")
     return _expect(found, map_id)
 

@@ -337,7 +337,7 @@ def test_killed_at_every_stage(apart: Path) -> None:
         assert connection.recv(100).startswith(b"HTTP/1.1 413")
     job = import_file(server, content, "by-job", background="true").headers["location"]
     making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
-    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
+    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/map.sqlite-wal")))
     arriving = begun(server, "/v1/maps/import?id=arriving", len(content), content[: len(content) // 2])
     wait_until(lambda: any(server.data_dir.glob("imports/.*")))
     wait_until(lambda: server.client.get(job).json()["progress"]["done"] > 200)

@@ -56,9 +56,9 @@ def full(lab: Map) -> Map:
 def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The file of such a map."""
     folder = tmp_path_factory.mktemp("content")
-    atlas = Directory(folder / "data", rows_per_segment=4)
-    lab = filled(atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE))
+    directory = Directory(folder / "data", rows_per_segment=4)
+    lab = filled(directory.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE))
     try:
         return exported(lab, folder / "kept")
     finally:
-        atlas.close()
+        directory.close()

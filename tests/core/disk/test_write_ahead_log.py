@@ -13,6 +13,7 @@ from core.storage.database.connections import FILE
 from core.disk.files import Damage
 from core.disk.write_ahead_log import check_log
 
+FILE = "map.sqlite"
 FRAME = 24 + 4096
 
 

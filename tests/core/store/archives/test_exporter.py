@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import threading
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from core.storage.archives import exporter
-from core.storage.archives.exporter import Exporter
-from core.storage.database.schema import driver_of
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.ledger.maps import archiving, places
 from core.ledger.maps.connection import MapConnection
+from core.ledger.sqlite import SqliteConnection
 from core.maps import MapSettings, ReviewSetting
 from core.maps.archives import writing
 from core.maps.forms import COMPRESSED, HALF
 from core.places import Neighborhood
 from core.store import Directory, Map
-from tests.core.storage.test_opening import flip
 from tests.core.store.archives.files import exported, imported, parts_of
+from tests.core.store.edits import edit
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 
 
@@ -57,7 +55,7 @@ def test_what_comes_back_is_what_was_there(
     path = tmp_path / "lab.tar"
     path.write_bytes(exported(source, tmp_path / "kept"))
     other = Directory(tmp_path / "other")
-    copy = imported(other, path, "lab", rows_per_segment=3)
+    copy = imported(other, path, "lab")
     assert copy.record == source.record and listed(copy) == listed(source)
     for place in source.places(None, 100)[0]:
         ours, theirs = (map_.snapshot() for map_ in (source, copy))
@@ -81,8 +79,7 @@ def test_what_comes_back_is_what_was_there(
 
 
 def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
-    with full._writing() as write:
-        driver_of(write.connection).execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE row = 0")
+    edit(full, "UPDATE keypoints SET record = zeroblob(length(record)) WHERE row = 0")
     with pytest.raises(StorageFailure, match="The stored keypoints of place 'p0' do not match their checksum"):
         full.exporter.write(tmp_path / "kept.tar")
     assert not (tmp_path / "kept.tar").exists()
@@ -103,30 +100,6 @@ def test_rows_of_forgotten_places_are_left_behind(content: bytes) -> None:
     assert manifest["places"] == 9
     assert stored_of("gone").astype("<f2").tobytes() not in content
     assert len(parts["descriptors-000001.bin"]) == 9 * (2 * DIMENSION + 15)
-
-
-def test_segments_of_which_nothing_lives_any_more(
-    full: Map, directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their files go: one that is being exported finishes with them, later ones do without."""
-    monkeypatch.setattr(writing, "PLACES_PER_GROUP", 1)
-    whole = exported(full, tmp_path / "before")
-
-    def forget(written: int) -> None:
-        if written == 1:
-            for name in ("p0", "p1", "p2"):  # the fourth of the first segment was replaced
-                full.forget(name)
-
-    meanwhile = full.exporter.write(tmp_path / "meanwhile.tar", forget)
-    assert meanwhile.path.read_bytes() == whole
-    full.enrol([frame("next")])
-    assert not (directory / "maps" / "lab" / "descriptors-000001.seg").exists()
-    path = tmp_path / "after.tar"
-    path.write_bytes(exported(full, tmp_path / "after"))
-    other = Directory(tmp_path / "other")
-    copy = imported(other, path, "lab")
-    assert listed(copy) == listed(full) and copy.verify().ok
-    other.close()
 
 
 def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,7 +187,7 @@ def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pyte
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(exporter._Source, "pictures", refuse)
+    monkeypatch.setattr(archiving._Source, "pictures", refuse)
     with pytest.raises(StorageFull):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []
@@ -238,31 +211,42 @@ def test_the_size_is_known_before_anything_is_written(full: Map, tmp_path: Path)
     assert list(tmp_path.glob("*.tar")) == []
 
 
-def test_damage_is_found_and_not_exported(full: Map, directory: Path, tmp_path: Path) -> None:
-    flip(directory / "maps" / "lab" / "descriptors-000001.seg", 4096 + 3)
-    with pytest.raises(MapQuarantined, match="row 0 does not match its checksum"):
+@pytest.mark.parametrize(
+    ("statement", "problem"),
+    [
+        ("UPDATE descriptors SET bytes = zeroblob(36) WHERE row = 0", "row 0 of descriptors does not match"),
+        ("DELETE FROM locals WHERE row = 0", "a place has no descriptors"),
+        ("UPDATE places SET regions = 7 WHERE id = 'p0'", "'p0' of places does not match its checksum"),
+    ],
+)
+def test_damage_is_found_and_not_exported(full: Map, tmp_path: Path, statement: str, problem: str) -> None:
+    edit(full, statement)
+    with pytest.raises(MapQuarantined, match=problem):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []
 
 
-def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, atlas: Directory, tmp_path: Path) -> None:
+def test_a_map_that_is_not_open_can_be_exported(
+    directory: Path, full: Map, atlas: Directory, tmp_path: Path
+) -> None:
+    state = full.exporter.state()
     atlas.close()
     again = Directory(directory)
     found = again.find("lab")
-    assert found.exporter.state() is None
-    assert exported(found, tmp_path / "kept") and isinstance(found.exporter, Exporter)
+    assert found.exporter.state() == state and not found.is_open
+    assert exported(found, tmp_path / "kept")
     again.close()
-    shutil.rmtree(directory)
 
 
 def test_the_first_error_is_reported(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite ends some transactions by itself, when the disk fails."""
 
-    def ended(connection: MapConnection, map_id: str) -> None:
-        driver_of(connection).execute("ROLLBACK")
+    def ended(connection: MapConnection) -> None:
+        assert isinstance(connection.whole, SqliteConnection)
+        connection.whole.driver.execute("ROLLBACK")
         raise RuntimeError("the first of it")
 
-    monkeypatch.setattr(exporter, "read_layout", ended)
+    monkeypatch.setattr(places, "unsound", ended)
     with pytest.raises(RuntimeError, match="the first of it"):
         full.exporter.write(tmp_path / "kept.tar")
 

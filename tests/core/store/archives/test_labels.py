@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from core.storage.database.schema import driver_of
 
 from core.errors import InvalidArchive
 from core.judgement.verdict import Verdict
@@ -16,6 +15,7 @@ from core.maps import ReviewSetting
 from core.maps.archives.manifest import LABELLED, LABELS, VERSION, WITHOUT_LABELS
 from core.store import Directory, Map
 from tests.core.store.archives.files import Parts, changed, exported, imported, line_changed, parts_of
+from tests.core.store.edits import edit
 from tests.core.store.frames import frame
 
 SETTING = ReviewSetting(verdicts=("unknown",), most_frames=20)
@@ -55,7 +55,7 @@ def copied(content: bytes, folder: Path) -> Map:
     folder.mkdir()
     path = folder / "sent.tar"
     path.write_bytes(content)
-    return imported(Directory(folder / "data"), path, "copy", rows_per_segment=4)
+    return imported(Directory(folder / "data"), path, "copy")
 
 
 def test_labels_and_the_setting_come_back(reviewed: Map, tmp_path: Path) -> None:
@@ -97,8 +97,7 @@ def test_a_file_without_labels_is_what_it_was(lab: Map, tmp_path: Path) -> None:
 
 
 def test_a_damaged_frame_harms_no_export(reviewed: Map, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with reviewed.review._writing() as connection:
-        driver_of(connection).execute("UPDATE review_pictures SET bytes = x'00' WHERE number = 2")
+    edit(reviewed, "UPDATE review_pictures SET bytes = x'00' WHERE number = 2")
     _, parts = parts_of(exported(reviewed, tmp_path / "kept"))
     assert parts[LABELLED] == b"file 1file 3file 4" and "left out" in caplog.text
 

@@ -19,7 +19,7 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     if strace() is None:
         pytest.skip("strace is not installed, or may not trace here")
     folder = tmp_path_factory.mktemp("synced").resolve()
-    command = [sys.executable, "-m", "tests.core.storage.worker", "everything", str(folder / "data")]
+    command = [sys.executable, "-m", "tests.core.store.worker", "everything", str(folder / "data")]
     traced = [*strace_arguments(folder / "trace"), *command]
     subprocess.run(traced, cwd=REPOSITORY, check=True, capture_output=True, timeout=300)
     return (folder / "trace").read_text(), folder / "data"

@@ -10,14 +10,11 @@ from unicodedata import normalize
 
 import numpy as np
 import pytest
-from core.storage.archives import unpacking
-from core.storage.archives.building import build
-from core.storage.files import segment_files as descriptors
 
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
+from core.ledger.maps.writing import Write
+from core.maps.archives import unpacking
 from core.maps.archives.manifest import Manifest
-from core.maps.archives.reading import Archive
-from core.maps.archives.unpacking import layout_of
 from core.places import look_address
 from core.store import Directory
 from tests.core.store.archives.files import Parts, changed, imported, line_changed, parts_of
@@ -212,24 +209,16 @@ def test_pictures_can_be_looked_at(content: bytes, library: Directory, tmp_path:
 
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
-    with (
-        pytest.raises(InvalidArchive, match="no picture at all"),
-        Archive(path) as archive,
-        library.building("lab") as folder,
-    ):
-        build(archive, folder, "lab", check_picture=refuse)
+    with pytest.raises(InvalidArchive, match="no picture at all"):
+        imported(library, path, "lab", check_picture=refuse)
     assert left_behind(library._directory) == []
 
 
 def test_large_pictures_are_not_even_read(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
-    with (
-        pytest.raises(InvalidArchive, match=r"cannot be taken: it has .* at most 3"),
-        Archive(path) as archive,
-        library.building("lab") as folder,
-    ):
-        build(archive, folder, "lab", most_picture_bytes=3)
+    with pytest.raises(InvalidArchive, match=r"cannot be taken: it has .* at most 3"):
+        imported(library, path, "lab", most_picture_bytes=3)
     assert left_behind(library._directory) == []
 
 
@@ -238,7 +227,6 @@ def test_large_pictures_are_not_even_read(content: bytes, library: Directory, tm
     [
         {"dimension": 1 << 24, "local_cells": 1 << 20, "local_values": 1 << 16},
         {"dimension": 1 << 24, "local_cells": 1 << 15, "local_values": (1 << 16) - 1},  # numpy counts it below zero
-        {"encoder": "ü" * 1000},
         {"local_cells": 1, "local_values": 0},
     ],
 )
@@ -247,7 +235,7 @@ def test_places_that_nothing_could_hold(content: bytes, values: dict[str, Any], 
     manifest = parts_of(content)[0]
     manifest["map"] |= {**values, "precision": precision}
     with pytest.raises(InvalidArchive, match="is impossible"):
-        layout_of(Manifest.model_validate(manifest))
+        unpacking.check_sizes(Manifest.model_validate(manifest))
 
 
 def test_it_can_be_broken_off_among_the_sequences(
@@ -259,8 +247,8 @@ def test_it_can_be_broken_off_among_the_sequences(
     monkeypatch.setattr(unpacking, "LINES_BETWEEN", 2)
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
-    with pytest.raises(KeyboardInterrupt, match="0 of 9"), Archive(path) as archive, library.building("lab") as folder:
-        build(archive, folder, "lab", advance=advance)
+    with pytest.raises(KeyboardInterrupt, match="0 of 9"):
+        imported(library, path, "lab", advance)
     assert left_behind(library._directory) == []
 
 
@@ -272,22 +260,25 @@ def test_few_long_lines_are_held_at_a_time(
     for number in (2, 5):
         content = line_changed(content, PLACES, number, metadata={"a": "x" * 4400})
     path.write_bytes(content)
-    with Archive(path) as archive, library.building("long") as folder:
-        build(archive, folder, "long", advance=lambda done, _: seen.append(done))
-    assert seen == [3, 6, 9] and library.get("long").verify().ok
+    made = imported(library, path, "long", advance=lambda done, _: seen.append(done))
+    assert seen == [3, 6, 9] and made.verify().ok
     library.delete("long")
 
 
 def test_the_id_is_taken_while_it_is_built(content: bytes, library: Directory, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
-    gives_up = RuntimeError("no more of this")
-    with pytest.raises(RuntimeError, match="no more"), library.building("lab"):
+
+    def give_up(places: int) -> None:
+        assert places == 9
         with pytest.raises(MapExists, match="being made"):
             library.create("lab", ENCODER, DIMENSION)
         with pytest.raises(MapExists, match="being made"):
             imported(library, path, "lab")
-        raise gives_up
+        raise RuntimeError("no more of this")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        imported(library, path, "lab", before_listing=give_up)
     imported(library, path, "lab")
     with pytest.raises(MapExists, match="already"):
         imported(library, path, "lab")
@@ -318,8 +309,8 @@ def test_nothing_of_it_is_seen_before_it_is_whole(
             again.close()
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), Archive(path) as archive, atlas.building("lab") as folder:
-        build(archive, folder, "lab", advance=advance)
+    with pytest.raises(KeyboardInterrupt):
+        imported(atlas, path, "lab", advance)
     assert seen == [1, 2, 3, 4, 5]
 
 
@@ -331,7 +322,7 @@ def test_a_full_disk_leaves_nothing(content: bytes, tmp_path: Path, monkeypatch:
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(descriptors, "append", refuse)
+    monkeypatch.setattr(Write, "add_stored", refuse)
     with pytest.raises(StorageFull):
         imported(atlas, path, "lab")
     assert left_behind(tmp_path / "data") == []

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(strace() is None, reason="strace is not installe
 def run(action: str, directory: Path, call: str, error: str, when: str) -> subprocess.CompletedProcess[bytes]:
     """The worker, whose calls fail as strace lets them fail."""
     inject = ["-e", f"trace={call}", "-e", f"inject={call}:error={error}:when={when}"]
-    command = [sys.executable, "-m", "tests.core.storage.worker", action, str(directory)]
+    command = [sys.executable, "-m", "tests.core.store.worker", action, str(directory)]
     traced = [strace() or "", "-f", "--seccomp-bpf", "-o", "/dev/null", *inject, *command]
     return subprocess.run(traced, cwd=REPOSITORY, capture_output=True, timeout=300, check=False)
 

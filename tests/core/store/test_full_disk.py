@@ -13,13 +13,13 @@ from itertools import count
 from pathlib import Path
 
 import pytest
-from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import StorageFailure, StorageFull
 from core.maps import Enrolment, MapSettings
 from core.store import Directory, Map
-from tests.core.storage.worker import LARGE
+from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.core.store.worker import LARGE
 
 REPOSITORY = Path(__file__).parents[4]
 LOCAL_BYTES = LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
@@ -168,7 +168,7 @@ def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Pa
 @pytest.mark.thorough
 def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
     """By the limit that a process can set on itself, so that it runs everywhere."""
-    command = [sys.executable, "-m", "tests.core.storage.worker", "fill", str(directory)]
+    command = [sys.executable, "-m", "tests.core.store.worker", "fill", str(directory)]
     finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True, timeout=300)
     answer = json.loads(finished.stdout)
     assert answer["error"] == "StorageFull"
