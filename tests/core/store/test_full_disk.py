@@ -13,11 +13,11 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import StorageFailure, StorageFull
 from core.maps import Enrolment, MapSettings
 from core.store import Directory, Map
-from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.store.worker import LARGE
 
