@@ -19,6 +19,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from core.storage.archives.building import build
 
 from benchmarks.process import peak_memory
 from benchmarks.report import report
@@ -26,7 +27,6 @@ from core.maps import Enrolment, MapSettings
 from core.maps.archives.reading import Archive, check
 from core.places import PlaceFields, Pose
 from core.store import Directory, Map
-from core.storage.archives.building import build
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
 BATCH = 64

@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
 from benchmarks.frames import camera_frames
 from benchmarks.report import report, verdict
-from core.store import Map, Store
 from core.maps.records import Enrolment, MapSettings
 from core.places import PlaceFields
+from core.store import Directory, Map, Store
 from core.store.cluster import Cluster
-from core.store import Directory
 from core.threads import cores, share_cores
 from tests.servers.postgres import running_postgres
 

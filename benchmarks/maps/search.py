@@ -29,6 +29,7 @@ import faiss
 import numpy as np
 import torch
 import typer
+from core.storage.files.segment_files import Layout
 from numpy.typing import NDArray
 from rich.progress import Progress
 
@@ -40,7 +41,6 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields
 from core.store import Directory, Map
-from core.storage.files.segment_files import Layout
 from core.store.snapshot import Snapshot
 from core.threads import cores, share_cores
 

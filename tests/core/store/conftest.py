@@ -69,6 +69,13 @@ def store(open_store: OpenStore) -> Store:
 
 
 @pytest.fixture
+def atlas(store: Store) -> Directory:
+    """The store of a test that is about a data directory."""
+    assert isinstance(store, Directory)
+    return store
+
+
+@pytest.fixture
 def lab(store: Store) -> Map:
     return store.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
 
