@@ -19,7 +19,7 @@ from core.disk.files import Damage, disk_errors, is_full, sync_file, sync_folder
 from core.disk.permissions import PRIVATE_FOLDER
 from core.disk.sqlite_file import DURABLE, NotOurs, Schema, UnreadVersion, rewrite, transaction
 from core.disk.write_ahead_log import check_log
-from core.errors import MapBusy, UnknownMap
+from core.errors import MapBusy
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -298,11 +298,8 @@ class MapFile:
         Raises:
             Damage: it is not a map, or another one than its folder says.
         """
-        try:
-            with self.glancing() as connection:
-                return record.state_of(connection, self.folder.name)
-        except UnknownMap as error:
-            raise Damage(f"{FILE} has no record of a map") from error
+        with self.glancing() as connection:
+            return record.state_of(connection, self.folder.name)
 
     def room(self) -> int:
         """The bytes of the file and its log."""
