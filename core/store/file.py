@@ -32,9 +32,8 @@ FILE = "map.sqlite"
 
 _IDLE_READERS = 4
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
+_NEW_FILE = {"page_size": 8192, "auto_vacuum": "INCREMENTAL"}  # a file keeps them; setting them again would write to it
 _SETTINGS = {
-    "page_size": 8192,
-    "auto_vacuum": "INCREMENTAL",
     **DURABLE,
     "secure_delete": "ON",
     "temp_store": "MEMORY",
@@ -55,7 +54,7 @@ def create(folder: Path, made: MapRecord) -> None:
         OSError, sqlite3.Error: the disk refuses.
     """
     folder.mkdir(PRIVATE_FOLDER)
-    driver = sqlite_file.connect(folder / FILE, "rwc", _SETTINGS)
+    driver = sqlite_file.connect(folder / FILE, "rwc", {**_NEW_FILE, **_SETTINGS})
     try:
         _SCHEMA.prepare(driver, create=True)
         with transaction(driver):
